@@ -17,85 +17,84 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ethbrake_marl.doors import names_behind
-from ethbrake_marl.envs import register_environments
+from ethbrake_marl.env.registration import register_environments
 from ethbrake_marl.errors import naming_extras
 
 if TYPE_CHECKING:
     # Environments
-    from ethbrake_marl.engine import Engine as Engine
-    from ethbrake_marl.envs import (
+    from ethbrake_marl.env.engine import Engine as Engine
+    from ethbrake_marl.env.making import make_engine as make_engine
+    from ethbrake_marl.env.pettingzoo import (
         EthBrakeParallelEnv as EthBrakeParallelEnv,
         env as env,
-        make_engine as make_engine,
         parallel_env as parallel_env,
         raw_env as raw_env,
     )
-    from ethbrake_marl.envs import EthBrakeVecEnv as EthBrakeVecEnv, make_sb3_vec_env as make_sb3_vec_env
-    from ethbrake_marl.envs import (
-        CostEnv as CostEnv,
-        EthBrakeEnv as EthBrakeEnv,
-        EthBrakeVectorEnv as EthBrakeVectorEnv,
-    )
+    from ethbrake_marl.env.sb3 import EthBrakeVecEnv as EthBrakeVecEnv, make_sb3_vec_env as make_sb3_vec_env
+    from ethbrake_marl.env.gymnasium import EthBrakeEnv as EthBrakeEnv
+    from ethbrake_marl.env.vector import CostEnv as CostEnv, EthBrakeVectorEnv as EthBrakeVectorEnv
 
     # Scenarios, and the worlds drawn from them
-    from ethbrake_marl.scenario import (
-        Sample as Sample,
-        Scenario as Scenario,
-        list_scenarios as list_scenarios,
-        load_scenario as load_scenario,
-    )
-    from ethbrake_marl.physics import Worlds as Worlds, advance as advance, make_worlds as make_worlds
+    from ethbrake_marl.scenario.catalogue import list_scenarios as list_scenarios, load_scenario as load_scenario
+    from ethbrake_marl.scenario.sample import Sample as Sample
+    from ethbrake_marl.scenario.schema import Scenario as Scenario
+    from ethbrake_marl.physics.advance import advance as advance
+    from ethbrake_marl.physics.state import Worlds as Worlds, make_worlds as make_worlds
 
     # Observations and rewards
-    from ethbrake_marl.observations import ObservationSpec as ObservationSpec, choose_observation as choose_observation
-    from ethbrake_marl.scenario import observation_for as observation_for
-    from ethbrake_marl.rewards import RewardParams as RewardParams
+    from ethbrake_marl.env.observations import (
+        ObservationSpec as ObservationSpec,
+        choose_observation as choose_observation,
+    )
+    from ethbrake_marl.scenario.observed import observation_for as observation_for
+    from ethbrake_marl.env.rewards import RewardParams as RewardParams
 
     # Agents, teams and policies
-    from ethbrake_marl.agents import LearnedAgent as LearnedAgent, policy_agent as policy_agent
-    from ethbrake_marl.agents import Agent as Agent, Team as Team
-    from ethbrake_marl.agents import (
+    from ethbrake_marl.agents.foreign import policy_agent as policy_agent
+    from ethbrake_marl.agents.learned import LearnedAgent as LearnedAgent
+    from ethbrake_marl.agents.protocol import Agent as Agent, Team as Team
+    from ethbrake_marl.agents.registry import (
         AgentSettings as AgentSettings,
         agent_names as agent_names,
         make_agent as make_agent,
     )
-    from ethbrake_marl.policies import Policy as Policy, load_policy as load_policy, load_shipped as load_shipped
+    from ethbrake_marl.policies.network import Policy as Policy, load_policy as load_policy
+    from ethbrake_marl.policies.shipped import load_shipped as load_shipped
 
     # Shields: for any interface, and one for each
-    from ethbrake_marl.shield import shield as shield
-    from ethbrake_marl.shield import (
+    from ethbrake_marl.shield.wrappers import shield as shield
+    from ethbrake_marl.shield.members import ShieldReason as ShieldReason
+    from ethbrake_marl.shield.options import ShieldMode as ShieldMode, ShieldOptions as ShieldOptions
+    from ethbrake_marl.shield.wrappers import (
         HybridShield as HybridShield,
         ShieldedEnv as ShieldedEnv,
         ShieldedVectorEnv as ShieldedVectorEnv,
-        ShieldMode as ShieldMode,
-        ShieldOptions as ShieldOptions,
-        ShieldReason as ShieldReason,
         shielded_aec as shielded_aec,
     )
-    from ethbrake_marl.shield import ShieldedVecEnv as ShieldedVecEnv
+    from ethbrake_marl.shield.sb3 import ShieldedVecEnv as ShieldedVecEnv
 
     # Training
-    from ethbrake_marl.learning import TrainingRecipe as TrainingRecipe, load_recipe as load_recipe
-    from ethbrake_marl.learning import TrainResult as TrainResult, resume as resume, train as train
+    from ethbrake_marl.training.recipe import TrainingRecipe as TrainingRecipe, load_recipe as load_recipe
+    from ethbrake_marl.training.train import TrainResult as TrainResult, resume as resume, train as train
     from ethbrake_marl.errors import Progress as Progress
 
     # Evaluation
-    from ethbrake_marl.evaluation import (
-        EpisodeRecord as EpisodeRecord,
-        Evaluation as Evaluation,
-        Outcome as Outcome,
+    from ethbrake_marl.evaluation.evaluation import Evaluation as Evaluation
+    from ethbrake_marl.evaluation.outcome import Outcome as Outcome
+    from ethbrake_marl.evaluation.record import EpisodeRecord as EpisodeRecord, record_episode as record_episode
+    from ethbrake_marl.evaluation.rollout import evaluate as evaluate
+    from ethbrake_marl.evaluation.summary import (
         SummaryRow as SummaryRow,
         SummaryTable as SummaryTable,
-        evaluate as evaluate,
-        record_episode as record_episode,
         summarise as summarise,
     )
-    from ethbrake_marl.evaluation import compare_results as compare_results, read_result as read_result
-    from ethbrake_marl.evaluation import write_dataset as write_dataset
-    from ethbrake_marl.evaluation import summarise_by as summarise_by
+    from ethbrake_marl.evaluation.comparison import compare_results as compare_results
+    from ethbrake_marl.evaluation.per_world import read_result as read_result
+    from ethbrake_marl.extensions.datasets.minari import write_dataset as write_dataset
+    from ethbrake_marl.evaluation.groups import summarise_by as summarise_by
 
     # Somebody else's simulator
-    from ethbrake_marl.hosts import (
+    from ethbrake_marl.extensions.hosts.protocol import (
         Host as Host,
         HostCommand as HostCommand,
         HostFailed as HostFailed,
@@ -104,23 +103,21 @@ if TYPE_CHECKING:
     )
 
     # Figures: matplotlib's, which a notebook shows
-    from ethbrake_marl.evaluation import deceleration_curve as deceleration_curve
-    from ethbrake_marl.figures import (
-        deceleration_figure as deceleration_figure,
-        trajectories as trajectories,
-        harm_against_total_gap as harm_against_total_gap,
-        write_picture as write_picture,
-    )
+    from ethbrake_marl.extensions.report.deceleration_curve import deceleration_curve as deceleration_curve
+    from ethbrake_marl.extensions.report.deceleration_figure import deceleration_figure as deceleration_figure
+    from ethbrake_marl.extensions.report.style import write_picture as write_picture
+    from ethbrake_marl.extensions.report.trajectories import trajectories as trajectories
+    from ethbrake_marl.extensions.reproduction.figures import harm_against_total_gap as harm_against_total_gap
 
     # Your own parts
-    from ethbrake_marl.agents import register_agent as register_agent
-    from ethbrake_marl.evaluation import register_measure as register_measure
-    from ethbrake_marl.learning import register_algorithm as register_algorithm
-    from ethbrake_marl.harm import register_objective as register_objective
-    from ethbrake_marl.observations import register_feature as register_feature
-    from ethbrake_marl.rewards import register_term as register_term
-    from ethbrake_marl.scenario import register_scenarios as register_scenarios
-    from ethbrake_marl.scenario import register_preset as register_preset
+    from ethbrake_marl.agents.registry import register_agent as register_agent
+    from ethbrake_marl.evaluation.own_measures import register_measure as register_measure
+    from ethbrake_marl.training.recipe import register_algorithm as register_algorithm
+    from ethbrake_marl.env.objectives import register_objective as register_objective
+    from ethbrake_marl.env.features import register_feature as register_feature
+    from ethbrake_marl.env.rewards import register_term as register_term
+    from ethbrake_marl.scenario.catalogue import register_scenarios as register_scenarios
+    from ethbrake_marl.scenario.channel import register_preset as register_preset
     from ethbrake_marl.registry import Part as Part
 
     # Errors

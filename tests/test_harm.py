@@ -10,11 +10,15 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import ethbrake_marl as eb
-from ethbrake_marl.actions import action_to_command, checked_action, command_to_action
-from ethbrake_marl.envs.interfaces import make_engine
-from ethbrake_marl.harm import STANDARD, Ledger, empty_ledger, objective_harm, objectives_of, scored, split
-from ethbrake_marl.physics import Floats, Impacts, Worlds, advance, forecast, make_worlds
-from ethbrake_marl.rewards import REWARDS, RewardParams, StepOutcome, WithoutEffect, reward_params
+from ethbrake_marl.env.actions import action_to_command, checked_action, command_to_action
+from ethbrake_marl.env.harm import Ledger, empty_ledger, split
+from ethbrake_marl.env.making import make_engine
+from ethbrake_marl.env.objectives import STANDARD, objective_harm, objectives_of, scored
+from ethbrake_marl.env.rewards import REWARDS, RewardParams, StepOutcome, WithoutEffect, reward_params
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.forecast import forecast
+from ethbrake_marl.physics.left_out import Impacts
+from ethbrake_marl.physics.state import Floats, Worlds, make_worlds
 from tests.contract.interfaces import CRASH, REST
 from tests.physics.random_worlds import driving_lines, line
 from tests.reference.tolerances import EPS

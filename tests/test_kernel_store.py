@@ -20,8 +20,8 @@ import pytest
 import ethbrake_marl
 from ethbrake_marl import kernel_store
 from ethbrake_marl.kernel_store import cache_folder
-from ethbrake_marl.physics import compiling as compiled
-from ethbrake_marl.physics.compiling import digest_of_sources, keep_kernel, kernel_sources, load_kernel
+from ethbrake_marl.physics import jit
+from ethbrake_marl.physics.jit import digest_of_sources, keep_kernel, kernel_sources, load_kernel
 
 needs_compiler = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="compilation is switched off")
 PACKAGE = Path(ethbrake_marl.__file__).parent
@@ -36,7 +36,7 @@ def _own_folder(monkeypatch, tmp_path):
 
 
 def forget() -> None:
-    for remembered in (cache_folder, digest_of_sources, compiled._imports):
+    for remembered in (cache_folder, digest_of_sources, jit._imports):
         remembered.cache_clear()
 
 
@@ -115,13 +115,13 @@ def test_load_kernel__of_another_users_file_is_nothing(monkeypatch, user, loaded
         found[4] = user
         return os.stat_result(found)
 
-    monkeypatch.setattr(compiled.os, "fstat", owned)
-    monkeypatch.setattr(compiled.os, "getuid", lambda: 1001)
+    monkeypatch.setattr(jit.os, "fstat", owned)
+    monkeypatch.setattr(jit.os, "getuid", lambda: 1001)
     assert (load_kernel("one-1") is not None) == loaded
 
 
 def test_keep_kernel__on_a_full_disk_costs_a_warning(monkeypatch):
-    monkeypatch.setattr(compiled.os, "replace", Mock(side_effect=OSError("No space left on device")))
+    monkeypatch.setattr(jit.os, "replace", Mock(side_effect=OSError("No space left on device")))
     with pytest.warns(UserWarning, match="could not be kept: No space left"):
         keep_kernel("one-1", b"machine code")
     assert list(cache_folder().iterdir()) == []
@@ -134,7 +134,7 @@ def test_keep_kernel__on_a_full_disk_costs_a_warning(monkeypatch):
 def copied(monkeypatch, tmp_path) -> Path:
     package = tmp_path / "copied" / "ethbrake_marl"
     shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
-    monkeypatch.setattr(compiled, "_PACKAGE", package)
+    monkeypatch.setattr(jit, "_PACKAGE", package)
     return package
 
 
@@ -156,7 +156,7 @@ def digest_in(package: Path, name: str) -> str:
     ],
 )
 def test_digest_of_sources__changes_with_what_its_kernels_are_made_of(copied, monkeypatch, kernel, edited, moves):
-    monkeypatch.setattr(compiled, "_IMPORTED_S", float("inf"))
+    monkeypatch.setattr(jit, "_IMPORTED_S", float("inf"))
     before = digest_in(copied, kernel)
     assert digest_in(copied, kernel) == before and len(before) == 64
     source = copied / edited
@@ -168,7 +168,7 @@ def test_digest_of_sources__is_not_known_of_code_in_no_file_edited_since_or_from
     assert digest_of_sources(Path("<stdin>")) == ""
     assert digest_in(copied, "physics/batch.py")
     now = time.time()
-    for date in ((compiled._IMPORTED_S + now) / 2, now + 3600.0):
+    for date in ((jit._IMPORTED_S + now) / 2, now + 3600.0):
         os.utime(copied / "physics" / "kernel.py", (date, date))
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
@@ -359,13 +359,13 @@ def test_kernels__raise_and_print_inside_of_what_they_call_also_when_they_were_l
 def test_kernels__are_compiled_once_for_all_numbers_or_as_numba_does_where_it_is_not_known(
     monkeypatch, known, linked, overloads
 ):
-    monkeypatch.setattr(compiled, "_KNOWN", compiled._KNOWN and known)
+    monkeypatch.setattr(jit, "_KNOWN", jit._KNOWN and known)
 
-    @compiled.compiled(apart=True)
+    @jit.compiled(apart=True)
     def twice(k: int) -> int:
         return 2 * k
 
-    @compiled.compiled(apart=True)
+    @jit.compiled(apart=True)
     def outer(k: int) -> int:
         return twice(k) if not known else twice(1) + twice(2) + twice(k)
 

@@ -8,16 +8,20 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
-from ethbrake_marl.agents.registry import drive, make_agent
-from ethbrake_marl.evaluation.results import write_per_world
-from ethbrake_marl.harm import empty_ledger
-from ethbrake_marl.limits.limits import best_harm, task_problem
-from ethbrake_marl.limits.lower_bound import avoidability, lower_bound
-from ethbrake_marl.policies import ObservationSchema
-from ethbrake_marl.scenario import Scenario, Task, load_scenario
-from ethbrake_marl.search import profile_problem
-from ethbrake_marl.shield.guard import ShieldedDriver
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.env.harm import empty_ledger
+from ethbrake_marl.env.profiles import profile_problem
+from ethbrake_marl.evaluation.per_world import write_per_world
+from ethbrake_marl.extensions.proofs.avoidability import avoidability
+from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
+from ethbrake_marl.extensions.search.best_harm import best_harm, task_problem
+from ethbrake_marl.policies.manifest import ObservationSchema
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.shield.drivers import ShieldedDriver
 from tests.refused import refused
 
 ALL = load_scenario("cooperation-4-all")

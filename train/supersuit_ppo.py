@@ -22,12 +22,13 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 
 import ethbrake_marl as eb
+from ethbrake_marl.env.rewards import reward_params
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.files.store import new_folder
-from ethbrake_marl.learning.algorithms import tensors_of
-from ethbrake_marl.learning.training import Training
-from ethbrake_marl.policies import NetworkSpec, Policy
-from ethbrake_marl.rewards import reward_params
+from ethbrake_marl.policies.manifest import NetworkSpec
+from ethbrake_marl.policies.network import Policy
+from ethbrake_marl.training.networks import tensors_of
+from ethbrake_marl.training.run_folder import Training
 
 # 1. What to train: the same settings as train/ppo.yaml, in smaller networks.
 

@@ -9,18 +9,22 @@ from pathlib import Path
 from typing import Any
 
 from ethbrake_marl import ethbrake_v0
-from ethbrake_marl.agents.registry import Source, agent_entries
+from ethbrake_marl.agents.protocol import Source
+from ethbrake_marl.agents.registry import agent_entries
 from ethbrake_marl.cli.app import whole_command
+from ethbrake_marl.env.features import Feature
+from ethbrake_marl.env.objectives import OBJECTIVES
+from ethbrake_marl.env.observations import ObservationSpec, choose_observation
+from ethbrake_marl.env.rewards import REWARDS, TERMS, RewardParams
 from ethbrake_marl.evaluation.measures import measures
-from ethbrake_marl.harm import OBJECTIVES
-from ethbrake_marl.learning import TrainingRecipe
-from ethbrake_marl.learning.training import MEANINGS
-from ethbrake_marl.observations import Feature, ObservationSpec, choose_observation
-from ethbrake_marl.policies import load_shipped, shipped_policies
-from ethbrake_marl.rewards import REWARDS, TERMS, RewardParams
-from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario, scenario_json_schema, state_features
-from ethbrake_marl.scenario.sampling import QUANTITY
-from ethbrake_marl.scenario.v2x import CHANNELS, V2X
+from ethbrake_marl.policies.shipped import load_shipped, shipped_policies
+from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
+from ethbrake_marl.scenario.channel import CHANNELS, V2X
+from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.observed import state_features
+from ethbrake_marl.scenario.schema import Scenario, scenario_json_schema
+from ethbrake_marl.training.recipe import TrainingRecipe
+from ethbrake_marl.training.recipe_text import MEANINGS
 
 CARDS = Path(__file__).resolve().parents[2] / "ethbrake_marl" / "_policies"
 ON_EVERY_COMMAND = ("--help",)

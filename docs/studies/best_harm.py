@@ -19,26 +19,22 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents import split_specs
+from ethbrake_marl.agents.registry import split_specs
+from ethbrake_marl.env.harm import HARM_COUNTS
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation import load_runnable, make_agents, result_identity
-from ethbrake_marl.evaluation.measures import Between
+from ethbrake_marl.evaluation.identity import result_identity
+from ethbrake_marl.evaluation.named_worlds import load_runnable, make_agents
+from ethbrake_marl.extensions.search.best_harm import fold_episodes, search_list, task_problem
+from ethbrake_marl.extensions.search.regret import Between
+from ethbrake_marl.extensions.search.shipped import Unproven, prove, shipped_tables, unproven_because
+from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.files.store import check_target
-from ethbrake_marl.harm import HARM_COUNTS
-from ethbrake_marl.learning import read_settings
-from ethbrake_marl.limits import (
-    BestHarmTable,
-    Unproven,
-    fold_episodes,
-    prove,
-    search_list,
-    shipped_tables,
-    task_problem,
-    unproven_because,
-)
-from ethbrake_marl.physics import Ints, Worlds, leaving_out_failed
-from ethbrake_marl.scenario import Task, load_scenario
+from ethbrake_marl.physics.left_out import leaving_out_failed
+from ethbrake_marl.physics.state import Ints, Worlds
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.training.settings import read_settings
 
 
 def main(words: list[str]) -> None:

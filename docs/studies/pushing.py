@@ -15,8 +15,8 @@ import torch
 from stable_baselines3 import PPO
 
 import ethbrake_marl as eb
-from ethbrake_marl.physics import Floats
-from ethbrake_marl.rewards import StepOutcome
+from ethbrake_marl.env.rewards import StepOutcome
+from ethbrake_marl.physics.state import Floats
 
 SHAPED = {"harm": 0.05, "shaping": 0.05, "shaping_discount": 0.99}
 BLOCKS = {  # scenario, worlds at once, reward

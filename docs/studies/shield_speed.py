@@ -11,12 +11,13 @@ import time
 
 import numpy as np
 
-from ethbrake_marl.agents.registry import episode_engine
-from ethbrake_marl.evaluation.inputs import make_agents
-from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.shield import ShieldedDriver
-from ethbrake_marl.shield.step_shield import StepShield, certify
-from ethbrake_marl.shield.uncertainty import parse_uncertainty
+from ethbrake_marl.agents.driving import episode_engine
+from ethbrake_marl.evaluation.named_worlds import make_agents
+from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shield.members import certify
+from ethbrake_marl.shield.step import StepShield
 
 SCENARIO = load_scenario("paper-random")
 

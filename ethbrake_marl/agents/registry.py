@@ -9,250 +9,23 @@ from __future__ import annotations
 import inspect
 import os
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
-from enum import StrEnum
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.engine import Engine, Guard, Memory, Script, ask_script, begin_script, is_state_free
-from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, PhysicsError, describe_error, unknown_name
+from ethbrake_marl.agents.protocol import Agent, Driver, Source, Team, check_agent
+from ethbrake_marl.env.harm import HarmCount, check_harm_count
+from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, describe_error, unknown_name
 from ethbrake_marl.files.python_file import load_from_file
-from ethbrake_marl.harm import HarmCount, Ledger, check_harm_count
-from ethbrake_marl.physics import Bools, Floats, Worlds
 from ethbrake_marl.registry import Registry
-from ethbrake_marl.scenario import Scenario, ScriptSpec, load_scenario
-
-# The vocabulary in which every agent states what it knows of the line while it drives.
-#
-# An agent says it with an attribute ``knows``: one ``Source``, its name, or several where parts of it know different
-# things (a shield around a policy). A channel (``v2x``) hides things from the first three sources only.
-
-
-class Source(StrEnum):
-    """Where knowledge comes from, least first; each has what stands before it as well."""
-
-    SENSORS = "own sensors"  # its own vehicle, and the neighbours that its sensors see
-    MESSAGES = "messages"  # the messages that have reached it
-    BELIEFS = "believed model"  # also what the scenario says of all lines: ranges, scripts, physics; nothing hidden
-    STATE = "true state"  # the others' states, capacities and latencies as they are, received or not
-    MODEL = "true model"  # also masses, restitution, every script: enough to roll the line forward in the same physics
-    UNSTATED = "not stated"  # of an agent that does not say
-
-
-class Knowledge(tuple[Source, ...]):
-    """Sources in the order of the vocabulary, each once."""
-
-    @classmethod
-    def of(cls, *agents: object, also: Source | None = None) -> Knowledge:
-        """What agents or teams say they know between them, and what a wrapper around them knows ``also``.
-
-        ``UNSTATED`` of one that says nothing. Raises ``InvalidInput`` for a word that is not in the vocabulary.
-        """
-        known = set() if also is None else {also}
-        for agent in agents:
-            stated = getattr(agent, "knows", None)
-            words = (Source.UNSTATED,) if stated is None else (stated,) if isinstance(stated, str) else stated
-            try:
-                known |= {Source(word) for word in words}
-            except (TypeError, ValueError):
-                name = getattr(agent, "name", type(agent).__name__)
-                right = ", ".join(repr(source.value) for source in Source)
-                raise InvalidInput(
-                    f"agent {name!r}: knows = {stated!r:.200}: must be one or several of {right}"
-                ) from None
-        return cls(source for source in Source if source in known)
-
-    @property
-    def text(self) -> str:
-        """``messages + true model``; a dash for nothing, which is what a team of nobody knows."""
-        return " + ".join(self) or "–"
-
-    @property
-    def sees_through(self) -> bool:
-        """Whether it reads of the line what no channel brought."""
-        return Source.STATE in self or Source.MODEL in self
-
-
-@runtime_checkable
-class Agent(Script, Protocol):
-    """A ``Script`` with a name: it drives one vehicle in every world of a batch of ``n``.
-
-    It says with ``knows`` what it knows of the line (``agents.registry.Source``); without it tables say "not stated".
-    One that remembers nothing has ``act(worlds, vehicle)`` alone:
-
-    >>> import ethbrake_marl as eb
-    >>> class HalfBrake:
-    ...     name = "half_brake"
-    ...     def act(self, worlds, vehicle):
-    ...         return -0.5 * worlds.vehicles.braking_capacity_mps2[:, vehicle]
-    >>> isinstance(HalfBrake(), eb.Agent)
-    True
-
-    What one remembers of its episodes is a value that it is given and gives back, never an attribute:
-
-    >>> class OnceHit:
-    ...     name = "once_hit"
-    ...     def begin(self, alert, vehicle, scripts):
-    ...         return alert.pair_hit.any(axis=1)
-    ...     def act(self, worlds, memory, vehicle):
-    ...         memory = memory | worlds.pair_hit.any(axis=1)
-    ...         return -1.0 * memory * worlds.vehicles.braking_capacity_mps2[:, vehicle], memory
-    >>> scenario = eb.load_scenario("paper-random")
-    >>> eb.evaluate(scenario.sample(5, 7), {"hit": OnceHit()}, scenario=scenario).worlds.n
-    5
-
-    """
-
-    name: str
-
-
-def check_agent(agent: object, where: str, *, alone: bool = True) -> None:
-    """Raise ``InvalidInput`` for what is not an agent; unless ``alone``, what drives several vehicles will do, too."""
-    if not isinstance(agent, Agent) and (alone or not isinstance(agent, Team | Shielding)):
-        missing = [what for what in ("name", "act") if not hasattr(agent, what)]
-        raise InvalidInput(
-            f"{where}: {type(agent).__name__!r} is no agent: it has no {' and no '.join(missing)};"
-            " make_agent(name) makes one, policy_agent(policy) one of a function or a model, and"
-            " LearnedAgent(load_policy(path)) one of a policy bundle"
-        )
-
-
-ADVICE = "; looking ahead needs full_brake, coast or constant:a"
-
-
-def fixed_commands(
-    scripts: Mapping[int, Script],
-    worlds: Worlds,
-    who: str,
-    *,
-    vehicle: int | None = None,
-    is_fixed: Callable[[Script], bool] = is_state_free,
-    advice: str = ADVICE,
-) -> Floats:
-    """The command of every vehicle from the alert on, [n, N] m/s2; those without an entry in ``scripts`` brake fully.
-
-    ``worlds`` are at the alert. ``who`` looks ahead and drives ``vehicle``, which is left out. Raises ``InvalidInput``
-    (first ``who``, at its end ``advice``) for a script whose command is not fixed at the alert, as ``is_fixed`` says.
-    """
-    command = -worlds.vehicles.braking_capacity_mps2
-    for i, script in scripts.items():
-        if i == vehicle:
-            continue
-        if not is_fixed(script):
-            name = getattr(script, "name", type(script).__name__)
-            raise InvalidInput(
-                f"{who}: vehicle_{i + 1} is driven by {name!r}, whose command is not fixed at the alert{advice}"
-            )
-        command[:, i], _ = ask_script(script, worlds, begin_script(script, worlds, i, scripts), i)
-    told = {i: getattr(script, "braking_pieces", ()) for i, script in scripts.items() if i != vehicle}
-    if not np.array_equal(worlds.play_pieces(told).vehicles.pieces, worlds.vehicles.pieces):
-        raise InvalidInput(
-            f"{who}: a profile: the pieces in which vehicles brake in these worlds are not those of its scripts; draw"
-            " or read the worlds with the same scenario"
-        )
-    return command
-
-
-class AgentAround:
-    """Base of agents that are put around a ``policy``, which is any agent: each says only what it does differently.
-
-    ``adds`` is what it knows beside what the policy knows. Without a memory of its own it has that of the policy.
-    """
-
-    adds: ClassVar[Source | None] = None
-
-    def __init__(self, policy: Agent, name: str | None = None) -> None:
-        self.policy = policy
-        self.name = policy.name if name is None else name
-
-    @property
-    def knows(self) -> Knowledge:
-        """What the policy knows, and what this adds."""
-        return Knowledge.of(self.policy, also=self.adds)
-
-    @property
-    def time_step_s(self) -> float | None:
-        """The policy's, s; None: it goes by any."""
-        return getattr(self.policy, "time_step_s", None)
-
-    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """As the policy."""
-        return begin_script(self.policy, alert, vehicle, scripts)
-
-    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """As the policy, [n] m/s2."""
-        return ask_script(self.policy, worlds, memory, vehicle)
-
-
-# Teams: one agent for each of several vehicles.
-
-
-@runtime_checkable
-class Shielding(Protocol):
-    """A driver behind a shield, on no vehicle yet."""
-
-    name: str
-
-    @property
-    def knows(self) -> Knowledge:
-        """What it knows, the shield included."""
-
-    def on(self, vehicles: Collection[int]) -> Team:
-        """The team that drives these vehicles."""
-
-    def guard(self, engine: Engine, policies: Mapping[int, Agent]) -> Guard:
-        """The shield in an engine in which these vehicles learn, who proposes for them, by vehicle."""
-
-
-class Team:
-    """One agent for each driven vehicle (index, 0 = front). Each decides for its own vehicle, from what that one knows.
-
-    Behind a ``shield`` they only propose. One agent may drive several vehicles: what it remembers of each is apart.
-    Raises ``InvalidInput`` for what is not an agent, or an index that is no whole number from 0.
-
-    >>> import ethbrake_marl as eb
-    >>> team = eb.Team({1: eb.make_agent("full_brake"), 2: eb.make_agent("coast")}, "mixed")
-    >>> sorted(team.drivers)
-    [1, 2]
-
-    """
-
-    def __init__(self, drivers: Mapping[int, Agent], name: str, shield: Shielding | None = None) -> None:
-        for vehicle, agent in drivers.items():
-            if isinstance(vehicle, bool) or not isinstance(vehicle, int | np.integer) or not vehicle >= 0:
-                raise InvalidInput(f"team {name!r}: {vehicle!r}: must be the index of a vehicle, 0 or more")
-            if not isinstance(agent, Agent):
-                raise InvalidInput(f"team {name!r}: vehicle_{vehicle + 1} is driven by {agent!r}, which is no agent")
-        self.drivers = {int(vehicle): drivers[vehicle] for vehicle in sorted(drivers)}
-        self.name, self.shield = name, shield
-
-    @property
-    def knows(self) -> Knowledge:
-        """What its drivers know between them, behind its shield; nothing where nobody is driven."""
-        return Knowledge.of(*self.drivers.values(), *(() if self.shield is None else (self.shield,)))
-
-    @staticmethod
-    def of(driver: Driver, vehicles: Collection[int]) -> Team:
-        """Who drives each of the ``vehicles``, an agent alone all of them; raises ``InvalidInput`` for another team."""
-        if isinstance(driver, Shielding):
-            return driver.on(vehicles)
-        if not isinstance(driver, Team):
-            return Team(dict.fromkeys(vehicles, driver), driver.name)
-        if set(driver.drivers) != set(vehicles):
-            theirs, wanted = (
-                ", ".join(f"vehicle_{i + 1}" for i in sorted(each)) or "none" for each in (driver.drivers, vehicles)
-            )
-            raise InvalidInput(f"team {driver.name!r} drives {theirs}; the vehicles to drive are {wanted}")
-        return driver
-
-
-Driver = Team | Agent | Shielding  # an agent alone drives every learner
-
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.roles import ScriptSpec
+from ethbrake_marl.scenario.schema import Scenario
 
 # The grammar of agents: ``name[:argument][@policy]``, and behind it what is put around that agent.
 #
@@ -262,6 +35,7 @@ Driver = Team | Agent | Shielding  # an agent alone drives every learner
 # Each of ``, + @ :`` may stand in a path, too. A path that exists wins: what stands in it separates nothing.
 
 _IN_FILE = re.compile(r":(?P<function>[A-Za-z_]\w*)(:(?P<argument>[^\s@]+))?(@(?P<policy>.+))?")
+
 _BEGINS_WITH_FILE = re.compile(r"[^:@]+\.py(:.*)?")
 
 
@@ -683,9 +457,13 @@ def register_shield(
 
 
 _PLAIN = re.compile(r"[a-z][a-z0-9_.-]*")
+
 _PROFILE = "profile"  # a role of scenarios alone
+
 _SEVERAL = ("ladder", "field")  # stand for several agents in ``--agents``
+
 _AGENTS: Registry[Entry] = Registry("agent", "agents", register_agent)
+
 _SHIELDS: Registry[Entry] = Registry("shield or search", "shields", register_shield)
 
 
@@ -724,135 +502,3 @@ def make_from_file(argument: str | None, settings: AgentSettings) -> Driver:
         raise InvalidInput(f"agent {settings.spec!r}: {named[1]} has no parameters, so it takes no argument")
     made: Driver = function(*given)
     return made
-
-
-# Letting agents drive through whole episodes: the loop of every evaluation and of every prediction.
-
-
-@dataclass(frozen=True, slots=True)
-class Episodes:
-    """How the episodes of a batch went."""
-
-    ledger: Ledger
-    final: Worlds  # each world as its episode left it
-    at_rest: Bools  # [n] the line came to rest; else the horizon cut the episode off
-    guarded: Any  # what the shield remembers at their end; None without one
-    memories: Mapping[int, Memory]  # by driven vehicle, what its agent remembers at their end
-
-    @classmethod
-    def of(cls, engine: Engine, worlds: Worlds, watched_by: Sequence[Watch] = ()) -> Episodes:
-        """Those of an ``episode_engine``, still at the first decision in ``worlds``; raises ``PhysicsError``."""
-        at_rest = np.zeros(worlds.n, np.bool_)
-        now = _show(watched_by, worlds, engine, engine.worlds.command_mps2)
-        while not engine.ended.all():
-            at_rest |= engine.step({}).terminated
-            now = _show(watched_by, now, engine, engine.wanted_mps2.copy())
-        if engine.roster.failed:
-            raise PhysicsError(engine.roster.failed)
-        memories = {i: memory for i, memory in engine.memories.items() if i in engine.deciders}
-        return cls(engine.ledger, engine.worlds, at_rest, engine.guarded, memories)
-
-
-class Watch(Protocol):
-    """Sees every step of a batch of episodes."""
-
-    def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """``before`` moved to the times ``until_s`` [n] under ``command_mps2`` [n, N]; ended worlds stay at theirs.
-
-        The first step is from the alert to the first decision; where a script decides on the way, a step is seen in
-        parts. Nothing of what is given may be changed.
-        """
-        ...
-
-
-def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | None = None) -> dict[int, Agent]:
-    """Agents for the scenario's scripts, by vehicle."""
-    left_out = (except_for,) if isinstance(except_for, int) else except_for or ()
-    return {i: make_role(scenario, i) for i in scenario.scripts if i not in left_out}
-
-
-def episode_engine(worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None) -> Engine:
-    """An engine over ``worlds`` in which ``agent`` drives ``vehicle``, or a team its vehicles; the others are scripted.
-
-    They decide when their first vehicle's latency has elapsed and every time step from then on, as learners do; their
-    commands are applied unrounded. Behind a shield they propose, and learn as far as the engine knows. One that looks
-    ahead knows the scripts, and takes the other driven vehicles to
-    brake fully. Raises ``InvalidInput`` for a learner that nobody drives.
-    """
-    team = agent if isinstance(agent, Team) else Team.of(agent, () if vehicle is None else (vehicle,))
-    drivers = team.drivers
-    undriven = [scenario.vehicle_names[i] for i in scenario.learners if i not in drivers]
-    if undriven:
-        raise InvalidInput(
-            f"agent {team.name!r} drives {', '.join(scenario.vehicle_names[i] for i in drivers) or 'nobody'}, but"
-            f" {', '.join(undriven)} of scenario {scenario.name!r} must be driven too. An agent that rolls itself out"
-            " (+search, +episode, +robust) can drive one learner, the others need scripts"
-        )
-    scripts = script_agents(scenario, except_for=drivers)
-    shield = team.shield
-    if shield is None:
-        engine = Engine(
-            scenario, worlds.n, learners=(), scripts={**scripts, **drivers}, deciders=tuple(drivers), worlds=worlds
-        )
-    else:
-        engine = Engine(
-            scenario, worlds.n, learners=tuple(drivers), scripts=scripts, worlds=worlds,
-            guard=lambda engine: shield.guard(engine, drivers),
-        )  # fmt: skip
-        engine.check_time_step(drivers)
-    engine.roster.warns = False  # who drives looks
-    return engine
-
-
-def drive(
-    worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None, *, watched_by: Sequence[Watch] = ()
-) -> Episodes:
-    """Let ``agent`` drive ``vehicle``, or a team its vehicles, through every world (at t = 0) to its episode's end.
-
-    Raises ``PhysicsError`` naming all worlds that could not be advanced; the others are well without them.
-    """
-    engine = episode_engine(worlds, agent, scenario, vehicle)
-    return Episodes.of(engine, scenario.play_pieces(worlds, engine.deciders), watched_by)
-
-
-def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_mps2: Floats) -> Worlds:
-    """Show the step that the engine has just made; gives the worlds as they are now."""
-    if not watched_by:
-        return before
-    now = engine.packed.worlds(before.vehicles)  # the episodes are the same, and so are their vehicles
-    for part in engine.segments(before, command_mps2):
-        for watch in watched_by:
-            watch.see(*part)
-    return now
-
-
-# What a driver does in each step of its episodes, written down.
-
-
-def record_commands(agent: Driver, worlds: Worlds, scenario: Scenario, vehicle: int, steps: int) -> Floats:
-    """The commands that ``agent`` gives ``vehicle`` in the first ``steps`` decisions of its episodes, [n, steps] m/s2.
-
-    ``worlds`` are at the alert. After an episode's end its last command goes on. Raises ``PhysicsError`` naming the
-    worlds that it cannot drive to the end.
-    """
-    engine = episode_engine(worlds, agent, scenario, vehicle)
-    commands = write_down(engine, steps, lambda: engine.wanted_mps2[:, [vehicle]])[:, :, 0]
-    latest = np.maximum.accumulate(np.where(np.isnan(commands), 0, np.arange(steps)), axis=1)
-    filled: Floats = np.take_along_axis(commands, latest, axis=1)
-    return filled
-
-
-def write_down(engine: Engine, steps: int, column: Callable[[], Floats]) -> Floats:
-    """Play such an engine to the end; the ``column`` [n, K] after each of the first steps, [n, steps, K].
-
-    NaN after an episode's end. Raises ``PhysicsError``.
-    """
-    columns = np.full((steps, *column().shape), np.nan)
-    while not engine.ended.all():
-        rows = np.flatnonzero(engine.steps < steps)
-        at = engine.steps[rows]
-        engine.step({})
-        columns[at, rows] = column()[rows]
-    if engine.roster.failed:
-        raise PhysicsError(engine.roster.failed)
-    return columns.swapaxes(0, 1)

@@ -17,33 +17,43 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.segment import Segment
 
-from ethbrake_marl.envs import register_environments
+from ethbrake_marl.env.registration import register_environments
 from ethbrake_marl.errors import InvalidInput, Progress as PartProgress, one_line, plain_text
 
 _KEPT = "\n\t\N{NO-BREAK SPACE}"  # in lines of a result; the last stands between a number and its unit
+
 EVERY_S = 10.0  # between two signs of life where stderr is no terminal
 
 ScenarioOption = Annotated[
     str, typer.Option(metavar="NAME|PATH", help="A shipped or registered scenario, or a path to a YAML file.")
 ]
+
 RecipeOption = Annotated[str, typer.Option(metavar="NAME|PATH", help="A shipped recipe, or a path to a YAML file.")]
+
 SettingsOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Set a key to another value: mass_t=40. Repeatable."),
 ]
+
 StepsOption = Annotated[
     int | None,
     typer.Option(help="Training steps (decisions), rounded up to whole updates.", show_default="the recipe's"),
 ]
+
 AgentsOption = Annotated[
     str, typer.Option(metavar="A,B,...", help="Agents, separated by commas; `ethbrake agent list` shows all.")
 ]
+
 SeedOption = Annotated[int, typer.Option(help="Seed of the list.")]
+
 JobsOption = Annotated[int | None, typer.Option(help="Processes at once; changes no result.", min=1, max=64)]
+
 RayOption = Annotated[
     str | None, typer.Option(metavar="local|ADDRESS", help="Work on Ray: on this machine, or on a running cluster.")
 ]
+
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace what is already there.")]
+
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the results as JSON, and nothing else, on stdout.")]
 
 

@@ -31,8 +31,11 @@ if TYPE_CHECKING:
     from packaging.requirements import Requirement
 
 EXTRAS = ("train", "marl", "export", "data", "render", "cluster", "notebook")
+
 _TINY = ("--set=n_envs=16", "--set=n_steps=8", "--set=counterfactuals=16", "--set=evaluation.worlds=10")
+
 _LINEUP = "ladder,ppo@shipped,ppo@shipped+search+episode,full_brake+step"
+
 # Small calls of what people call first: what they use is what is compiled. One world alone lies otherwise in memory.
 _DOORS = (
     ("run", "--steps", "128", "--episodes", "20", "--output", "run", *_TINY),
@@ -40,11 +43,13 @@ _DOORS = (
     ("evaluate", "--agents", "full_brake,ppo@shipped+episode,full_brake+step", "--episodes", "1"),
     ("shield", "--agents", "full_brake", "--episodes", "3"),
 )
+
 # What `ethbrake run` uses but for three small kernels, without torch, and no more than that.
 _FOR_A_RUN = (
     *("-m", "ethbrake_marl", "evaluate", "--episodes", "20", "--output", "page", "--report"),
     *("--agents", "full_brake,e_v2x_bm,e_v2x_bm:pairwise,ppo@shipped,ppo@shipped+episode"),
 )
+
 _IN_PYTHON = """
 import ethbrake_marl as eb
 for given in ({}, {"reward": {"harm": 0.05, "shaping": 0.05}}):  # shaped, as PPO is trained
@@ -54,7 +59,9 @@ for given in ({}, {"reward": {"harm": 0.05, "shaping": 0.05}}):  # shaped, as PP
 robust = eb.make_agent("full_brake+robust", scenario="paper-random", uncertainty="gaps_m=0.5")
 eb.evaluate(agents={"robust": robust}, scenario="paper-random", episodes=20)
 """
+
 _PACKAGE = Path(__file__).resolve().parents[1]
+
 _CHECKOUT = _PACKAGE.parent  # or the folder of installed packages, where there is no pyproject.toml
 
 
@@ -151,7 +158,7 @@ def _kernel_cache() -> tuple[bool, str]:
 
 
 def _scenarios() -> tuple[bool, str]:
-    from ethbrake_marl.scenario import list_scenarios, shipped_folder
+    from ethbrake_marl.scenario.catalogue import list_scenarios, shipped_folder
 
     found = [entry for entry in list_scenarios() if entry.shipped]
     return len(found) > 0, f"{len(found)} in {shipped_folder()}"
@@ -161,7 +168,8 @@ def _golden_impact() -> tuple[bool, str]:
     """A car at 10 m/s brakes with 5 m/s2, 8 m behind a standing one: harm ``10^2 - 2 * 5 * 8 = 20``."""
     import numpy as np
 
-    from ethbrake_marl.physics import advance, make_worlds
+    from ethbrake_marl.physics.advance import advance
+    from ethbrake_marl.physics.state import make_worlds
 
     world = make_worlds(
         [8.0], [0.0, 10.0], braking_capacity_mps2=5.0, driving_capacity_mps2=5.0, latency_s=0.0, mass_t=5.0,
@@ -176,8 +184,8 @@ def _golden_baseline() -> tuple[bool, str]:
     """The paper's distance scenario at 7 m and 7 m: E-V2X-BM brakes with 5.17021 m/s2 and expects harm 4.03447."""
     import numpy as np
 
-    from ethbrake_marl.agents import optimise_pairwise
-    from ethbrake_marl.physics import make_worlds
+    from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
+    from ethbrake_marl.physics.state import make_worlds
 
     capacity = np.array([6.0, 7.0, 6.0])
     world = make_worlds(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from ethbrake_marl import evaluation, learning, scenario as scenarios
+from ethbrake_marl import evaluation, scenario as scenarios, training
 from ethbrake_marl.cli.command import (
     AgentsOption,
     ForceOption,
@@ -28,26 +28,31 @@ from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.files.store import check_folder, write_output
 
 if TYPE_CHECKING:
-    from ethbrake_marl.agents import Driver
-    from ethbrake_marl.harm import HarmCount
-    from ethbrake_marl.learning import Settings
-    from ethbrake_marl.physics import LeftOutRows
-    from ethbrake_marl.scenario import Sample, Task
+    from ethbrake_marl.agents.protocol import Driver
+    from ethbrake_marl.env.harm import HarmCount
+    from ethbrake_marl.physics.left_out import LeftOutRows
+    from ethbrake_marl.scenario.sample import Sample
+    from ethbrake_marl.scenario.task import Task
+    from ethbrake_marl.training.settings import Settings
 
 GROUP_EPISODES = 400  # of each scenario of a group; the tables of best known harm of `benchmark` hold them
+
 RESULTS, WORLDS, REPORT = "results.json", "worlds", "report.html"  # in the folder of an evaluation
+
 _FILES = (RESULTS, f"{WORLDS}.csv", f"{WORLDS}.parquet", REPORT)
+
 _HARMS = {"first_impact_harm": "First-impact harm", "total_harm": "Total harm", "harm": "Harm"}
+
 _POLICIES = {"same": "the same", "other": "another", "none": ""}
 
 
 def read_task(scenario: str, settings: Sequence[str] | None) -> Task:
     """The scenario that is named, with its settings, its learners, and the harm that ``harm_count`` among them says."""
-    return _task_of(scenario, learning.read_settings(settings, of_agents=("harm_count",)))
+    return _task_of(scenario, training.read_settings(settings, of_agents=("harm_count",)))
 
 
 def _task_of(scenario: str, given: Settings) -> Task:
-    from ethbrake_marl.scenario import Task
+    from ethbrake_marl.scenario.task import Task
 
     chosen = evaluation.load_runnable(scenario, given.scenario, drives="some")
     return Task(chosen, chosen.learners, given.harm_count)
@@ -98,11 +103,11 @@ def evaluate_command(
     +robust:believed needs none. With --set harm_count=total agents minimise the harm of all impacts, not that of first
     impacts only. --set measures=injury,my_file.py:worst shows these beside the usual ones.
     """
-    from ethbrake_marl.agents import split_specs
+    from ethbrake_marl.agents.registry import split_specs
 
     with Out(as_json=as_json, force=force) as out:
         _check_outputs(out, output, per_world, report=report)
-        given = learning.read_settings(settings, of_agents=("harm_count", "measures"))
+        given = training.read_settings(settings, of_agents=("harm_count", "measures"))
         if group := scenarios.group_of_scenarios(scenario):
             other = {"--per-world": per_world, "--report": report, "--jobs": jobs, "--ray": ray}
             for option in (name for name, value in other.items() if value):
@@ -272,7 +277,7 @@ def _write_report(
 ) -> None:
     """Write the page of an evaluation that has just been made."""
     # matplotlib takes a second to load, and most evaluations draw nothing
-    from ethbrake_marl.pages.report import Report
+    from ethbrake_marl.extensions.report.report import Report
 
     done: list[str] = []
 

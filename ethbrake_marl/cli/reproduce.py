@@ -12,6 +12,7 @@ from ethbrake_marl.errors import InvalidInput, need
 from ethbrake_marl.files.sheet import Column, Sheet
 
 KEPT = "the same command goes on with what is in the folder"
+
 PAPER_EPISODES = 10_000
 
 
@@ -44,8 +45,9 @@ def reproduce_command(
     its data and its result. Prints first how long it will take. The same command goes on after an interruption.
     """
     with Out(as_json=as_json, force=force, kept=KEPT) as out:
-        from ethbrake_marl.studies.machine import this_machine
-        from ethbrake_marl.studies.reproduction import Reproduction, choose_items, make_items
+        from ethbrake_marl.extensions.reproduction.folder import Reproduction
+        from ethbrake_marl.extensions.reproduction.making import choose_items, make_items
+        from ethbrake_marl.extensions.studies.machine import this_machine
 
         if quick and full:
             raise InvalidInput("--quick and --full: give one of the two")

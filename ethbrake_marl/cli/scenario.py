@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from ethbrake_marl import evaluation, learning, scenario as scenarios
+from ethbrake_marl import evaluation, scenario as scenarios, training
 from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, SeedOption, SettingsOption, example
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.sheet import Sheet
@@ -18,8 +18,11 @@ from ethbrake_marl.files.store import new_file, read_plain
 from ethbrake_marl.files.yaml import flow_text
 
 TRIED_WORLDS = 200  # by `scenario validate`
+
 MOST_RANGES = 8  # that it tells apart
+
 SCREEN = 24  # lines
+
 TABLE_WORLDS, PICTURE_WORLDS = 10, 1000  # by `scenario sample`
 
 NameArgument = Annotated[
@@ -155,8 +158,8 @@ def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> Non
 
 def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
     """What is declared, piece by piece; empty where there is nothing to say."""
-    from ethbrake_marl.agents import find_entry
-    from ethbrake_marl.harm import OBJECTIVES
+    from ethbrake_marl.agents.registry import find_entry
+    from ethbrake_marl.env.objectives import OBJECTIVES
 
     yield f"{scenario.name}: {scenario.title or 'no title'}. {scenario.description}".rstrip()
     learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners) or "nobody"
@@ -260,9 +263,9 @@ def scenario_parts(as_json: JsonOption = False) -> None:
 
     Reward terms, features of observations, V2X presets, objectives, training algorithms, recipes and measures.
     """
-    from ethbrake_marl.harm import OBJECTIVES
-    from ethbrake_marl.observations import FEATURES
-    from ethbrake_marl.rewards import TERMS
+    from ethbrake_marl.env.features import FEATURES
+    from ethbrake_marl.env.objectives import OBJECTIVES
+    from ethbrake_marl.env.rewards import TERMS
 
     features = FEATURES.usable().items()
     own = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in features]
@@ -271,8 +274,8 @@ def scenario_parts(as_json: JsonOption = False) -> None:
         "Observation": ["own", "front_K", "rear_K", "role", "obstacle", *own],
         "V2X presets": [*scenarios.CHANNELS],
         "Objectives": [kind.form for kind in OBJECTIVES.usable().values()],
-        "Algorithms": [*learning.algorithm_names()],
-        "Recipes": [*learning.TrainingRecipe.shipped()],
+        "Algorithms": [*training.algorithm_names()],
+        "Recipes": [*training.TrainingRecipe.shipped()],
         "Measures": [*evaluation.MEASURES],
     }
     with Out(as_json=as_json) as out:
@@ -356,7 +359,7 @@ def scenario_sample(
     """
     with Out(as_json=as_json, force=force) as out:
         out.check(output, ".csv", ".png", ".svg", ".pdf", what="worlds")
-        chosen = evaluation.load_runnable(scenario, learning.read_settings(settings).scenario)
+        chosen = evaluation.load_runnable(scenario, training.read_settings(settings).scenario)
         pictured = None if output is None or output.suffix.lower() == ".csv" else output
         usual = TABLE_WORLDS if pictured is None else PICTURE_WORLDS
         sample = chosen.sample(usual if episodes is None else episodes, seed)
@@ -366,7 +369,8 @@ def scenario_sample(
             *(",".join("" if each is None else repr(each) for each in state.values()) for state in states),
         ]
         if pictured is not None:
-            from ethbrake_marl.figures import worlds_figure, write_picture
+            from ethbrake_marl.extensions.report.scenario_figures import worlds_figure
+            from ethbrake_marl.extensions.report.style import write_picture
 
             write_picture(pictured, worlds_figure(chosen, sample, seed=seed), force=out.force)
             out.note(f"picture: {pictured}")
@@ -389,7 +393,8 @@ def agent_list(as_json: JsonOption = False) -> None:
     What begins with + goes behind any agent, for instance full_brake+step: +search first, then one shield.
     """
     with Out(as_json=as_json) as out:
-        from ethbrake_marl.agents import Knowledge, agent_entries, agents_refused
+        from ethbrake_marl.agents.protocol import Knowledge
+        from ethbrake_marl.agents.registry import agent_entries, agents_refused
 
         told, rows = [], []
         for entry in agent_entries():
@@ -419,7 +424,7 @@ def agent_export(
     Needs the package onnx, which the extra `export` brings.
     """
     with Out(force=force) as out:
-        from ethbrake_marl.policies import load_named_policy
+        from ethbrake_marl.policies.shipped import load_named_policy
 
         out.check(onnx)
         out.write(onnx, load_named_policy(policy).to_onnx(), what="written")

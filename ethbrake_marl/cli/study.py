@@ -10,19 +10,24 @@ from typing import Annotated, Any
 import typer
 from rich.text import Text
 
-from ethbrake_marl import evaluation, learning
+from ethbrake_marl import evaluation, training
 from ethbrake_marl.cli.command import ForceOption, JobsOption, JsonOption, Out, SettingsOption, example, schema_option
 from ethbrake_marl.cli.evaluate import read_task
 from ethbrake_marl.errors import InvalidInput, count_of, need
 from ethbrake_marl.files.sheet import Sheet
 
 KEPT = "the same command goes on with what is in the folder"
+
 ROUNDING = 1e-6  # m2/s2
+
 MOST_WORKERS = 4096
 
 FolderOption = Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")]
+
 RetriesOption = Annotated[int, typer.Option(help="How often to try again when a process is lost.", min=0, max=100)]
+
 DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print what would be trained; do nothing.")]
+
 ClusterOption = Annotated[
     str, typer.Option(metavar="local|ADDRESS", help="Ray on this machine, or on a running cluster.")
 ]
@@ -46,7 +51,7 @@ def sweep_command(
     ray: ClusterOption = "local",
     retries: RetriesOption = 2,
     dry_run: DryRunOption = False,
-    schema: schema_option("ethbrake_marl.studies.sweep", "SweepPlan", "sweep") = False,  # type: ignore[valid-type]  # made here
+    schema: schema_option("ethbrake_marl.extensions.studies.sweep", "SweepPlan", "sweep") = False,  # type: ignore[valid-type]  # made here
     as_json: JsonOption = False,
 ) -> None:
     """Train every job of a file, and write one table.
@@ -55,7 +60,7 @@ def sweep_command(
     on. Exit status 1 where jobs failed: failures.csv says why.
     """
     with Out(as_json=as_json, kept=KEPT) as out:
-        from ethbrake_marl.studies.sweep import SweepPlan
+        from ethbrake_marl.extensions.studies.sweep import SweepPlan
 
         plan = SweepPlan.read(file)
         plan.folder(output).check()
@@ -97,7 +102,7 @@ def tune_command(
         Path | None, typer.Option(metavar="NAME.yaml", help="Write the best trial as a recipe of this name.")
     ] = None,
     dry_run: DryRunOption = False,
-    schema: schema_option("ethbrake_marl.studies.tuning", "TuningPlan", "tuning") = False,  # type: ignore[valid-type]  # made here
+    schema: schema_option("ethbrake_marl.extensions.studies.tuning", "TuningPlan", "tuning") = False,  # type: ignore[valid-type]  # made here
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -108,7 +113,7 @@ def tune_command(
     """
     with Out(as_json=as_json, force=force, kept=KEPT) as out:
         need("optuna")
-        from ethbrake_marl.studies.tuning import TuningPlan
+        from ethbrake_marl.extensions.studies.tuning import TuningPlan
 
         plan = TuningPlan.read(file)
         plan.folder(output).check()
@@ -140,9 +145,9 @@ def tune_command(
         told, best, shown, lines = f"trials: {counted or 'none'}; table: {result.table}", result.best, None, []
         export = None if best is None or result.interrupted else export  # what goes on exports at its end
         if best is not None:
-            measure = learning.RunDirectory.chosen_by([best.figures], plan.recipe.reward.harm_count)
+            measure = training.RunDirectory.chosen_by([best.figures], plan.recipe.reward.harm_count)
             shown = {"trial": best.number, "measure": measure, "harm": best.harm, "values": best.values}
-            unit = "" if measure == learning.RunDirectory.OBJECTIVE else " m²/s²"  # injuries have another one
+            unit = "" if measure == training.RunDirectory.OBJECTIVE else " m²/s²"  # injuries have another one
             lines = [f"best: trial {best.number}, {measure} {best.harm:.4f}{unit}"]
             lines += [f"  {key} = {value}" for key, value in best.values.items()]
             if export is not None:
@@ -204,8 +209,9 @@ def ablate_command(
     begun ones go on. Writes ablation.html, ablation.md, ablation.csv, ablation.json and three figures.
     """
     with Out(as_json=as_json, kept=KEPT) as out:
-        from ethbrake_marl.studies.ablation import ablation_cost, plan_ablation, run_ablation
-        from ethbrake_marl.studies.machine import this_machine
+        from ethbrake_marl.extensions.cooperation.ablation import ablation_cost, run_ablation
+        from ethbrake_marl.extensions.cooperation.levels import plan_ablation
+        from ethbrake_marl.extensions.studies.machine import this_machine
 
         plan = plan_ablation(
             levels, recipes, settings, quick=quick, tell=out.note, seeds=seeds, steps_per_learner=steps,
@@ -267,8 +273,8 @@ def falsify_command(
     with Out(as_json=as_json, force=force) as out:
         import numpy as np
 
-        from ethbrake_marl.studies.falsification import Measure
-        from ethbrake_marl.studies.machine import this_machine
+        from ethbrake_marl.extensions.studies.machine import this_machine
+        from ethbrake_marl.extensions.studies.weakness import Measure
 
         if again is not None:
             asked = {
@@ -314,7 +320,7 @@ def falsify_command(
             kept = evaluation.NamedWorlds.of(
                 measured_by.scenario,
                 scenario=scenario,
-                settings=[each.text for each in learning.read_settings(settings, of_agents=("harm_count",)).scenario],
+                settings=[each.text for each in training.read_settings(settings, of_agents=("harm_count",)).scenario],
                 agent=agent,
                 measure=measure,
                 against=against,
@@ -355,9 +361,9 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
     """Measure the worlds of a file once more, and compare; exit status 1 where one is worse, or could not be driven."""
     import numpy as np
 
-    from ethbrake_marl.agents import parse_spec
-    from ethbrake_marl.scenario import Sample
-    from ethbrake_marl.studies.falsification import Measure
+    from ethbrake_marl.agents.registry import parse_spec
+    from ethbrake_marl.extensions.studies.weakness import Measure
+    from ethbrake_marl.scenario.sample import Sample
 
     kept = evaluation.NamedWorlds.read(file)
     for spec in (*([kept.agent] if agent is None else []), *([kept.against] if kept.against else [])):
@@ -366,7 +372,7 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
                 f"{file}: names an agent that is code ({code[0]}), which is not run because a file names it; --agent"
                 " names another one, and who is compared with is edited in the file"
             )
-    chosen = evaluation.load_runnable(kept.scenario, learning.read_settings(kept.settings).scenario, drives="some")
+    chosen = evaluation.load_runnable(kept.scenario, training.read_settings(kept.settings).scenario, drives="some")
     measured_by = Measure.of(kept.measure, agent or kept.agent, kept.against, chosen, kept.harm_count)
     worlds = kept.worlds_of(chosen, str(file))
     measured = measured_by(Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0))

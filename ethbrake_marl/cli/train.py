@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
-from ethbrake_marl import evaluation, learning, scenario as scenarios
+from ethbrake_marl import evaluation, scenario as scenarios, training
 from ethbrake_marl.cli.command import (
     ForceOption,
     JsonOption,
@@ -24,14 +24,17 @@ from ethbrake_marl.errors import InvalidInput, Progress
 KEPT = (
     "if the training had begun, the run's folder keeps the last good policy, and ethbrake train --resume FOLDER goes on"
 )
+
 RUNS = Path("runs")
+
 TrainingSeedOption = Annotated[int | None, typer.Option(help="Seed of the training.", show_default="the recipe's")]
+
 OutputOption = Annotated[
     Path | None, typer.Option(metavar="FOLDER", help="Folder of the run.", show_default="runs/SCENARIO-RECIPE-seedSEED")
 ]
 
 
-def run_folder(scenario: scenarios.Scenario, recipe: learning.TrainingRecipe, seed: int | None) -> Path:
+def run_folder(scenario: scenarios.Scenario, recipe: training.TrainingRecipe, seed: int | None) -> Path:
     """Where a run goes if nothing else is said; the scheme stands behind the recipe where the recipe names one."""
     plan = recipe.name if recipe.scheme is None else f"{recipe.name}-{recipe.scheme}"
     return RUNS / f"{scenario.name}-{plan}-seed{recipe.seed if seed is None else seed}"
@@ -57,10 +60,10 @@ def run_command(
     """
     with Out(as_json=as_json, force=force, kept=KEPT) as out:
         # torch takes seconds to load, here and in the other commands that learn
-        from ethbrake_marl.studies.experiment import run_experiment
+        from ethbrake_marl.extensions.report.experiment import run_experiment
 
-        plan = learning.load_recipe(recipe)
-        given = learning.read_settings(settings, [plan])
+        plan = training.load_recipe(recipe)
+        given = training.read_settings(settings, [plan])
         chosen = evaluation.load_runnable(scenario, given.scenario, drives="one")
         plan = given.change(plan, out.note)
         result = run_experiment(
@@ -113,7 +116,7 @@ def train_command(
             "--other-versions", help="With --resume: go on although other versions trained it; numbers may differ."
         ),
     ] = False,
-    schema: schema_option("ethbrake_marl.learning", "TrainingRecipe", "recipe") = False,  # type: ignore[valid-type]  # made here
+    schema: schema_option("ethbrake_marl.training", "TrainingRecipe", "recipe") = False,  # type: ignore[valid-type]  # made here
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -137,15 +140,15 @@ def train_command(
                 name for name, value in {**asked, "--seed": seed, "--force": force or None}.items() if value is not None
             ):
                 raise InvalidInput(f"{option}: --resume goes on with what the folder says; leave one of the two out")
-            _tell(out, learning.resume(resume, on_progress=out.show_progress, other_versions=other_versions))
+            _tell(out, training.resume(resume, on_progress=out.show_progress, other_versions=other_versions))
             return
         if other_versions:
             raise InvalidInput("--other-versions: a new training has the versions of now; give it with --resume FOLDER")
-        plan = learning.load_recipe(recipe or "ppo")
-        given = learning.read_settings(settings, [plan])
+        plan = training.load_recipe(recipe or "ppo")
+        given = training.read_settings(settings, [plan])
         chosen = evaluation.load_runnable(scenario or "paper-random", given.scenario)
         plan = given.change(plan, out.note)
-        begun = [learning.Training.of(plan, chosen).who_drives()]
+        begun = [training.Training.of(plan, chosen).who_drives()]
 
         def tell(progress: Progress) -> None:
             if begun:  # all input is known to be good
@@ -153,13 +156,13 @@ def train_command(
             out.show_progress(progress)
 
         folder = output or run_folder(chosen, plan, seed)
-        result = learning.train(
+        result = training.train(
             plan, chosen, folder, steps=steps, seed=seed, force=force, on_progress=tell, settings=given.texts
         )
         _tell(out, result)
 
 
-def _tell(out: Out, result: learning.TrainResult) -> None:
+def _tell(out: Out, result: training.TrainResult) -> None:
     """What a training came to."""
     out.result({
         "directory": str(result.directory),
@@ -174,7 +177,7 @@ def _tell(out: Out, result: learning.TrainResult) -> None:
     _end(out, result)
 
 
-def _end(out: Out, result: learning.TrainResult) -> None:
+def _end(out: Out, result: training.TrainResult) -> None:
     """Say what a training left; an interrupted one ends with that status."""
     if result.status == "interrupted":
         left = f"go on with: ethbrake train --resume {result.directory} (its policy is there)"

@@ -14,36 +14,30 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from ethbrake_marl.agents import Driver, Knowledge, Team, parse_spec
+from ethbrake_marl.agents.protocol import Driver, Knowledge, Team
+from ethbrake_marl.agents.registry import parse_spec
+from ethbrake_marl.env.harm import HarmCount
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
-from ethbrake_marl.evaluation.inputs import (
-    CHUNK,
-    HELD,
-    make_lineup,
-    own_versions,
-    policies_of,
-    result_versions,
-    scenario_sha256,
-)
-from ethbrake_marl.evaluation.measures import (
-    LOADED,
-    REGISTERED,
-    Conditions,
-    Evaluation,
-    SummaryTable,
-    Tally,
-    load_measures,
-)
+from ethbrake_marl.evaluation.conditions import Conditions
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.identity import CHUNK, HELD, own_versions, policies_of, result_versions, scenario_sha256
+from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.own_measures import LOADED, REGISTERED, load_measures
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk
+from ethbrake_marl.evaluation.summary import SummaryTable
+from ethbrake_marl.evaluation.tally import Tally
+from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.files.python_file import file_sha256
-from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.parallel import Call, run_each
 from ethbrake_marl.registry import versions_used
-from ethbrake_marl.scenario import Sample, Scenario, Task
-from ethbrake_marl.shield import parse_uncertainty
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.task import Task
 
 MOST_EPISODES = 10**12
+
 OnDone = Callable[[int], None]  # worlds done so far
+
 _MADE: dict[str, Mapping[str, Driver]] = {}  # the last lineup of this process; an evaluation drives copies
 
 

@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents import Driver, Episodes, Knowledge, Team, check_agent, drive, script_agents
-from ethbrake_marl.engine import check_alert, is_state_free
+from ethbrake_marl.agents.driving import Episodes, drive, script_agents
+from ethbrake_marl.agents.protocol import Driver, Knowledge, Team, check_agent
+from ethbrake_marl.env.memory import is_state_free
+from ethbrake_marl.env.stream import check_alert
 from ethbrake_marl.errors import (
     AgentFailed,
     InvalidInput,
@@ -24,24 +26,22 @@ from ethbrake_marl.errors import (
     renumbered,
     unknown_name,
 )
-from ethbrake_marl.evaluation.inputs import CHUNK, EPISODES, LIST_SEED, make_lineup, policies_of, warn_unfamiliar
-from ethbrake_marl.evaluation.measures import REGISTERED, Evaluation, LeftOut, Outcome, Tape
-from ethbrake_marl.physics import (
-    Decisions,
-    Floats,
-    Ints,
-    Worlds,
-    advance,
-    leaving_out_failed,
-    move_on,
-    sample_on,
-    sum_rows,
-)
-from ethbrake_marl.scenario import Sample, Scenario, ScriptSpec, Task, load_scenario
-
-# The aftermath of a line: where Vehicle 1 ends, and how much of that others pushed it.
-#
-# Worlds know gaps and speeds, no places: a post ahead (``with_post_ahead``) makes the way of Vehicle 1 one more gap.
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.identity import CHUNK, EPISODES, LIST_SEED, policies_of
+from ethbrake_marl.evaluation.named_worlds import make_lineup, warn_unfamiliar
+from ethbrake_marl.evaluation.outcome import LeftOut, Outcome
+from ethbrake_marl.evaluation.own_measures import REGISTERED, Tape
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.episode import Decisions
+from ethbrake_marl.physics.estimates import move_on
+from ethbrake_marl.physics.left_out import leaving_out_failed
+from ethbrake_marl.physics.paper_map import sample_on
+from ethbrake_marl.physics.state import Floats, Ints, Worlds, sum_rows
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.roles import ScriptSpec
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.task import Task
 
 
 class ShovedFront:

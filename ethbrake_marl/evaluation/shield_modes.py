@@ -9,17 +9,23 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents import Agent, Driver, Team, drive
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.protocol import Agent, Driver, Team
 from ethbrake_marl.errors import renumbered
-from ethbrake_marl.evaluation.inputs import policies_of, result_identity
+from ethbrake_marl.evaluation.identity import policies_of, result_identity
 from ethbrake_marl.evaluation.statistics import mean, paired_difference
 from ethbrake_marl.files.sheet import Column, Estimate, Row, Sheet
-from ethbrake_marl.physics import Floats, Ints, LeftOutRows, Worlds, measured_without_failed
-from ethbrake_marl.scenario import Sample, Task
-from ethbrake_marl.shield import SAME_HARM, VERDICTS, HybridAgent, Shielded, ShieldedDriver, review
+from ethbrake_marl.physics.left_out import LeftOutRows, measured_without_failed
+from ethbrake_marl.physics.state import Floats, Ints, Worlds
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.shield.drivers import Shielded, ShieldedDriver
+from ethbrake_marl.shield.evidence import SAME_HARM, VERDICTS, review
+from ethbrake_marl.shield.paper_hybrid import HybridAgent
 
 # ``step-alert``: rollout at the alert only; ``step-cap``: no vehicle above its cap.
 Mode = Literal["none", "episode", "step", "step-alert", "step-cap"]
+
 CHUNK = 500  # worlds advanced together: bounds memory, changes no result
 
 

@@ -9,7 +9,6 @@ order of the worlds changes no bit of them.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 
@@ -19,7 +18,7 @@ from scipy.special import ndtri, stdtrit
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.physics import Floats, Ints
+from ethbrake_marl.physics.state import Floats, Ints
 
 
 def exact_sum(values: Floats, others: Floats | None = None) -> Fraction:
@@ -47,6 +46,7 @@ def _in_wholes(values: Floats) -> tuple[NDArray[np.object_], Ints]:
 
 
 CONFIDENCE = 0.95
+
 _UPPER = 0.5 + 0.5 * CONFIDENCE  # the quantile at the upper end of an interval
 
 
@@ -94,7 +94,7 @@ class Moments:
     def estimate(self) -> Estimate:
         """The mean of at least one value, with the interval ``mean -+ t s / sqrt(n)``; see ``mean``."""
         found = self._around(self.mean, self.standard_error if self.count > 1 else 0.0)
-        return found if self.negative else _of_amounts(found, nothing=not self.squares)
+        return found if self.negative else of_amounts(found, nothing=not self.squares)
 
     def ratio_error(self, others: Moments, products: Fraction) -> float:
         """Standard error of the ratio ``r`` of two paired means, by the delta method.
@@ -121,7 +121,7 @@ class Moments:
         return Estimate(value, (value - half, value + half))
 
 
-def _of_amounts(found: Estimate, *, nothing: bool) -> Estimate:
+def of_amounts(found: Estimate, *, nothing: bool) -> Estimate:
     """The estimate where no value is below 0: its interval is not either, and there is none where all values are 0.
 
     Then nothing was seen of what may happen in other worlds: a bound of its share is that of ``rate``, a bound of the
@@ -167,7 +167,7 @@ def mean(values: Floats) -> Estimate:
     bootstrap's. Where no value is below 0 the interval ends at 0; where all are 0 there is none. Raises
     ``InvalidInput`` when ``values`` is empty or not finite.
     """
-    return Moments.of(_check(values)).estimate
+    return Moments.of(check(values)).estimate
 
 
 def paired_difference(values: Floats, baseline: Floats) -> Estimate:
@@ -208,7 +208,7 @@ def relative_decrease(values: Floats, baseline: Floats) -> Estimate | None:
     return data.decrease(reference, products)
 
 
-def _check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Floats:
+def check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Floats:
     data = np.asarray(values, np.float64)
     if data.ndim != 1 or len(data) < 1 or not np.isfinite(data).all():
         raise InvalidInput(f"{who}: shape {data.shape}; at least one finite number per {each} is needed, as [n]")
@@ -217,135 +217,7 @@ def _check(values: ArrayLike, who: str = "statistics", each: str = "world") -> F
 
 def _check_pair(values: Floats, baseline: Floats) -> tuple[Moments, Moments, Fraction]:
     """The moments of both, and the exact sum of their products."""
-    data, reference = _check(values), _check(baseline)
+    data, reference = check(values), check(baseline)
     if data.shape != reference.shape:
         raise InvalidInput(f"statistics: {len(data)} values cannot be paired with {len(reference)} of the baseline")
     return Moments.of(data), Moments.of(reference), exact_sum(data, reference)
-
-
-# Statistics over trainings: a figure per seed, and what they say about the next seed.
-#
-# Few seeds are the rule, and one bad one moves a mean a lot. The interquartile mean leaves out the best and the worst
-# quarter; the bootstrap says how far it may be off, drawing seeds anew within each task (stratified), since tasks are
-# chosen and not drawn.
-
-RESAMPLES = 10_000  # of seeds
-_RESAMPLES = 2_000  # of seeds and worlds
-_CUT = 0.25
-_AT_ONCE = 1 << 20  # drawn worlds in memory: 8 MB
-
-
-def interquartile_mean(tasks: Sequence[ArrayLike], *, resamples: int = RESAMPLES, seed: int = 0) -> Estimate:
-    """Mean of the middle half of all figures, with its stratified bootstrap interval (percentiles).
-
-    ``tasks`` holds one list of figures, one per seed, for each task (scenario); floor(n / 4) of all n figures are left
-    out at either end. The interval is None when no task has two seeds. Raises ``InvalidInput`` for a task without
-    figures, or with one that is not finite.
-    """
-    from scipy.stats import bootstrap, trim_mean  # a second to load, and no table of an evaluation needs it
-
-    strata = [_check(figures, f"interquartile_mean: task {k}", "seed") for k, figures in enumerate(tasks)]
-    if not strata:
-        raise InvalidInput("interquartile_mean: no tasks; at least one list of figures is needed")
-
-    def statistic(*drawn: Floats, axis: int) -> Floats:
-        middle: Floats = trim_mean(np.concatenate(drawn, axis=axis), _CUT, axis=axis)
-        return middle
-
-    value = float(statistic(*strata, axis=0))
-    again = [figures for figures in strata if len(figures) > 1]
-    if not again:
-        return Estimate(value, None)
-    fixed = [figures for figures in strata if len(figures) == 1]
-
-    def resample(*drawn: Floats, axis: int) -> Floats:
-        shape = drawn[0].shape[:-1]
-        return statistic(*drawn, *(np.broadcast_to(one, (*shape, 1)) for one in fixed), axis=axis)
-
-    found = bootstrap(
-        again, resample, n_resamples=resamples, confidence_level=CONFIDENCE, method="percentile", rng=seed,
-        vectorized=True,
-    )  # fmt: skip
-    return Estimate(value, (float(found.confidence_interval.low), float(found.confidence_interval.high)))
-
-
-def mean_over_seeds(values: ArrayLike, baseline: ArrayLike | None = None, *, seed: int = 0) -> Estimate:
-    """Mean of ``values``, or of ``values - baseline`` on the same worlds, [seeds, worlds] each.
-
-    Numbers of seeds may differ. The bootstrap interval draws the seeds of either side and the worlds, which both sides
-    share, anew: an interval of differences that leaves out 0 holds for other seeds *and* other worlds. None with a
-    single world, and where all values are 0 and have no baseline. That is no interval of truths that hold nearly
-    always or never: draws of such worlds are all alike. So that of truths without a baseline reaches at least as far
-    as Wilson's of their share over the worlds. Raises ``InvalidInput`` for arrays that cannot be paired or are not
-    finite.
-    """
-    given = np.atleast_2d(np.asarray(values))
-    sides = _pair_sides("mean_over_seeds", given, np.zeros((1, given.shape[-1])) if baseline is None else baseline)
-    value = float((sides[0].mean(axis=0) - sides[1].mean(axis=0)).mean())
-    found = _resampled(value, sides, lambda means: means[:, 0] - means[:, 1], seed)
-    if baseline is not None or (given < 0).any():
-        return found
-    if given.dtype != np.bool_:
-        return _of_amounts(found, nothing=not given.any())
-    share = min(value, 1.0)  # a mean of ones may be rounded up
-    low, high = wilson(share, given.shape[1])
-    ends = found.interval or (low, high)
-    return Estimate(share, (max(min(low, ends[0]), 0.0), min(max(high, ends[1]), 1.0)))
-
-
-def share_over_seeds(values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, seed: int = 0) -> Estimate | None:
-    """``(mean(worst) - mean(values)) / (mean(worst) - mean(best))`` on the same worlds, [seeds, worlds] each.
-
-    Which part of the way from ``worst`` to ``best`` the values are; the interval is as in ``mean_over_seeds``. None
-    where ``best`` is not below ``worst``.
-    """
-    sides = _pair_sides("share_over_seeds", values, worst, best)
-    reached, high, low = (float(side.mean(axis=0).mean()) for side in sides)
-    if not high > low:
-        return None
-
-    def shares(means: Floats) -> Floats:
-        means = means[means[:, 1] > means[:, 2]]
-        share: Floats = (means[:, 1] - means[:, 0]) / (means[:, 1] - means[:, 2])
-        return share
-
-    return _resampled((high - reached) / (high - low), sides, shares, seed)
-
-
-def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
-    """The sides as [seeds, worlds], all with the same worlds; raises ``InvalidInput``."""
-    arrays = tuple(np.atleast_2d(np.asarray(given, np.float64)) for given in sides)
-    if any(side.ndim != 2 or not side.size or side.shape[1] != arrays[0].shape[-1] for side in arrays):
-        shapes = " and ".join(str(side.shape) for side in arrays)
-        raise InvalidInput(f"{who}: shapes {shapes}: must be [seeds, worlds] with the same worlds")
-    if not all(np.isfinite(side).all() for side in arrays):
-        raise InvalidInput(f"{who}: every harm must be finite")
-    return arrays
-
-
-def _resampled(value: float, sides: Sequence[Floats], of: Callable[[Floats], Floats], seed: int) -> Estimate:
-    """``value`` with the percentiles of what it is in means drawn anew; no interval with a single world."""
-    if sides[0].shape[1] < 2:
-        return Estimate(value, None)
-    tail = 50.0 * (1.0 - CONFIDENCE)
-    low, high = np.percentile(of(_resample_means(sides, _RESAMPLES, seed)), [tail, 100.0 - tail])
-    return Estimate(value, (float(low), float(high)))
-
-
-def _resample_means(sides: Sequence[Floats], resamples: int, seed: int) -> Floats:
-    """Means [resamples, sides] over seeds of each side and over worlds, which all sides share, drawn anew."""
-    worlds = sides[0].shape[1]
-    rng = np.random.default_rng(seed)
-    parts: list[Floats] = []
-    chunk = max(1, _AT_ONCE // worlds)
-    for size in (min(chunk, resamples - begin) for begin in range(0, resamples, chunk)):
-        drawn = rng.integers(worlds, size=(size, worlds)) + worlds * np.arange(size)[:, np.newaxis]
-        weights = np.bincount(drawn.ravel(), minlength=size * worlds).reshape(size, worlds) / worlds
-        means = np.empty((size, len(sides)))
-        for column, side in enumerate(sides):
-            seeds = rng.integers(len(side), size=(size, len(side)))
-            # Not a matrix product: its order of adding depends on the machine.
-            of_seeds = np.stack([(weights * row).sum(axis=1) for row in side], axis=1)
-            means[:, column] = np.take_along_axis(of_seeds, seeds, axis=1).mean(axis=1)
-        parts.append(means)
-    return np.concatenate(parts)

@@ -8,17 +8,10 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from ethbrake_marl.env.features import GROUPS, Feature
+from ethbrake_marl.env.observations import Observation, Observations, ObservationSpec, choose_observation, observe
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.observations import (
-    GROUPS,
-    Feature,
-    Observation,
-    Observations,
-    ObservationSpec,
-    choose_observation,
-    observe,
-)
-from ethbrake_marl.physics import Vehicles, Worlds
+from ethbrake_marl.physics.state import Vehicles, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 
 
@@ -83,13 +76,16 @@ def common_observation(observations: tuple[ObservationSpec, ...], scenario: Scen
 Appended = Literal["number", "state"]  # what a row holds behind the vehicle's own observation
 
 _OWN_ONLY = ObservationSpec(front=0, rear=0)
+
 _PAIR_MEANING = {"gap": "free distance between the two", "hit": "1 if the pair has had an impact"}
+
 _OBSTACLE_FEATURES = tuple(
     replace(f, name=f"obstacle.{f.name}", meaning=meaning)
     for f in GROUPS.obstacle
     for name, meaning in (("gap", "distance from Vehicle 1 to the obstacle"), ("hit", f.meaning))
     if f.name == name
 )
+
 _PAIR_FEATURES = tuple(replace(f, meaning=_PAIR_MEANING[f.name]) for f in GROUPS.neighbour if f.name in _PAIR_MEANING)
 
 

@@ -4,43 +4,25 @@ from __future__ import annotations
 
 import csv
 import io
-import math
-import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field as data_field, replace
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
-from functools import lru_cache
-from itertools import pairwise
 from operator import not_
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, NoReturn, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    Discriminator,
-    Field,
-    GetJsonSchemaHandler,
-    PlainSerializer,
-    PrivateAttr,
-    Tag,
-    ValidationError,
-    ValidationInfo,
-    WithJsonSchema,
-    field_validator,
-    model_validator,
-)
-from pydantic.json_schema import JsonSchemaValue
-from pydantic_core import CoreSchema, PydanticCustomError
+from numpy.typing import ArrayLike
+from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_validator
+from pydantic_core import PydanticCustomError
 
+from ethbrake_marl.env.features import ListedFeatures, listed_features
+from ethbrake_marl.env.objectives import objectives_of
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.files.store import read_plain
 from ethbrake_marl.files.yaml import (
     NAME_PATTERN,
-    UNITS,
     UNSHOWN,
     FileModel,
     YamlPath,
@@ -49,960 +31,57 @@ from ethbrake_marl.files.yaml import (
     require,
     suggestion,
 )
-from ethbrake_marl.harm import OBJECTIVES, objectives_of
-from ethbrake_marl.observations import ListedFeatures, listed_features
-from ethbrake_marl.physics import (
-    Bools,
-    Floats,
-    Ints,
-    Worlds,
-    advance,
-    as_road_allows,
-    exp_each,
-    log,
-    make_worlds,
-    normal_probability,
-    normal_quantile_each,
-    real_numbers,
-    stopping_distances,
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.motion import stopping_distances
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds, as_road_allows, make_worlds, real_numbers
+from ethbrake_marl.scenario.channel import V2X, Equipage, Equipped
+from ethbrake_marl.scenario.distributions import (
+    LEAVE_OUT,
+    AnyQuantity,
+    AnyTypeQuantity,
+    Quantity,
+    TableColumn,
+    WithLoad,
+    support,
+    values,
 )
-from ethbrake_marl.scenario.v2x import V2X, Equipage, Equipped
-
-BLOCK = 8  # uniform numbers per vehicle and world; a multiple of 4, the numbers of one Philox counter
-V2X_NEWS = (1,)  # the stream of the links' delays and losses
-OBSTACLE = (2,)  # the stream of the obstacle's distance
-TYPES = (3,)  # the stream of the vehicles' types and loads
-MIXTURE = (4,)  # the stream of what each world of a mixture is drawn from
-LATER_LOSSES = (5,)  # the stream of a world's key, from which its later messages are lost or not
-SURROUNDINGS = (6,)  # the stream of friction, of the row of a table, and of the time before the alert
-BRAKES = (7,)  # the stream of the rates of brakes that build up, BLOCK numbers per vehicle
-OF_WORLD = 4  # numbers per world of the streams of obstacle, mixture, later losses and surroundings
-PER_TYPE = 4  # numbers per vehicle of the stream of types: type, load, and two that are free; one Philox counter
-ROW = (SURROUNDINGS, 1)  # the place of the number that chooses the row of a table
-
-Place = tuple[tuple[int, ...], int]  # a stream of uniform numbers, and the column in it
-
-
-@dataclass(frozen=True, slots=True)
-class QuantityRule:
-    """What a quantity means and which values it may take."""
-
-    name: str  # key in a scenario, field of Worlds or Vehicles
-    unit: str  # key of UNITS, or "" for a plain number
-    per: Literal["vehicle", "pair", "world"]
-    high: float  # largest allowed value
-    positive: bool  # 0 is refused
-    slot: int  # column inside a vehicle's block of uniform numbers
-    column: str  # name in a table of initial states
-    meaning: str
-    example: str
-    low: float = 0.0  # smallest allowed value
-    block: int = 0  # vehicle (from 0) in whose block of uniform numbers entry 0 stands
-    stream: tuple[int, ...] = ()  # of uniform numbers of its own, in which its slot is the column
-
-    @property
-    def symbol(self) -> str:
-        """Of its unit."""
-        return {"mps": "m/s", "mps2": "m/s2", "mps3": "m/s3"}.get(self.unit, self.unit)
-
-    @property
-    def label(self) -> str:
-        """Its name in words, with its unit, as an axis has it: ``braking capacity (m/s²)``."""
-        return self.name.removesuffix(f"_{self.unit}").replace("_", " ") + (
-            f" ({self.symbol.replace('s2', 's²').replace('s3', 's³')})" if self.unit else ""
-        )
-
-    @property
-    def interval(self) -> str:
-        """The allowed range, with its unit, as messages write it."""
-        unit = f" {self.symbol} ({UNITS[self.unit]})" if self.unit else ""
-        return f"finite and in {'(' if self.positive else '['}{self.low:g}, {self.high:g}]{unit}"
-
-    def allows(self, low: float, high: float) -> bool:
-        """Whether every value from ``low`` to ``high`` is in range; false for NaN."""
-        return (low > 0.0 if self.positive else low >= self.low) and high <= self.high
-
-    def count(self, vehicles: int) -> int:
-        """How many values a world of ``vehicles`` vehicles has."""
-        return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
-
-    def place(self, index: int) -> Place:
-        """Which of a world's uniform numbers belongs to entry ``index`` (from 0)."""
-        return self.stream, BLOCK * (self.block + index) + self.slot
-
-    def column_of(self, index: int) -> str:
-        """Name of the column that holds entry ``index`` (from 0) in a table of initial states."""
-        return self.column.format(index + 1)
-
-    def owner(self, index: int) -> str:
-        """Whose value entry ``index`` (from 0) is, in words; empty for a value of the whole world."""
-        front = f"vehicle_{index + 1}"
-        return {"vehicle": front, "pair": f"{front} to vehicle_{index + 2}", "world": ""}[self.per]
-
-    def of(self, worlds: Worlds) -> Floats:
-        """The values that these worlds have, [n, entries]: one entry per vehicle, pair or world.
-
-        Capacities are those on a dry road, as a scenario declares them, where the friction of all is told beside them.
-        """
-        of_vehicles = hasattr(worlds.vehicles, self.name)
-        values: Floats = getattr(worlds.vehicles if of_vehicles else worlds, self.name)
-        if of_vehicles and np.isfinite(worlds.friction).all():
-            values = worlds.dry(self.name)
-        if self.stream == BRAKES:  # as high as a rate can be declared: at once
-            values = np.minimum(values, self.high)
-        if self.stream == OBSTACLE:  # no number where there is none
-            values = np.where(np.isfinite(values), values, np.nan)
-        return values.reshape(worlds.n, -1)
-
-
-class Quantities(NamedTuple):
-    """All quantities by their keys."""
-
-    usual: dict[str, QuantityRule]  # what every world has
-    otherwise: dict[str, QuantityRule]  # other ways to declare speeds, gaps and an obstacle
-    optional: dict[str, QuantityRule]  # what a world need not have; it has a stream of random numbers of its own
-    # A scenario has exactly one of each two, or at most one where what they declare is optional.
-    alternatives: dict[str, str]
-    of_a_type: tuple[str, ...]  # what a type of vehicles may declare
-    needed: tuple[str, ...]  # what has no default, and every vehicle needs
-    declared: dict[str, QuantityRule]  # every key that declares one
-
-    def of(self, worlds: Worlds) -> dict[str, QuantityRule]:
-        """Those that these worlds have: friction only where all have such.
-
-        The distance to an obstacle, and a rate of brakes, are told of all where some have one: the former is NaN
-        where there is no obstacle.
-        """
-        there = {"obstacle_gap_m": worlds.obstacle_ahead.any(), "friction": np.isfinite(worlds.friction).all()}
-        there |= {key: np.isfinite(getattr(worlds.vehicles, key)).any() for key in self.optional if key not in there}
-        return self.usual | {key: rule for key, rule in self.optional.items() if there[key]}
-
-    def columns(self, worlds: Worlds) -> dict[str, Floats]:
-        """Every one of the worlds, each [n], named as in a table of initial states: ``gap_1_m``, ``mass_2_t``."""
-        return {
-            rule.column_of(i): values for rule in self.of(worlds).values() for i, values in enumerate(rule.of(worlds).T)
-        }
-
-
-def _by_name(*rules: QuantityRule) -> dict[str, QuantityRule]:
-    return {rule.name: rule for rule in rules}
-
-
-# The upper ends are far outside traffic: they catch a value in the wrong unit (kilograms, kilometres per hour).
-# The slots are fixed for ever: another order would give other worlds for the same seed.
-_USUAL = _by_name(
-    QuantityRule(
-        "gaps_m", "m", "pair", 1e4, False, 0, "gap_{}_m",
-        "bumper-to-bumper gap of each pair at the alert, front to rear", "[7, 7]",
-    ),
-    QuantityRule(
-        "speeds_mps", "mps", "vehicle", 200.0, False, 1, "speed_{}_mps",
-        "speed of each vehicle at the alert", "[20, 18, 20]",
-    ),
-    QuantityRule(
-        "braking_capacity_mps2", "mps2", "vehicle", 100.0, True, 2, "braking_capacity_{}_mps2",
-        "largest deceleration of each vehicle", "[6, 7, 6]",
-    ),
-    QuantityRule(
-        "driving_capacity_mps2", "mps2", "vehicle", 100.0, False, 3, "driving_capacity_{}_mps2",
-        "largest forward acceleration of each vehicle", "[6, 7, 6]",
-    ),
-    QuantityRule(
-        "latency_s", "s", "vehicle", 3600.0, False, 4, "latency_{}_s",
-        "time from the alert until a vehicle's commands take effect; it coasts until then", "[0, 0.5, 0.8]",
-    ),
-    QuantityRule(
-        "mass_t", "t", "vehicle", 1000.0, True, 5, "mass_{}_t",
-        "mass of each vehicle", "[4.5, 5.5, 5.9]",
-    ),
-    QuantityRule(
-        "speed_limit_mps", "mps", "vehicle", 200.0, True, 6, "speed_limit_{}_mps",
-        "speed at which driving stops accelerating", "40",
-    ),
-    QuantityRule(
-        "restitution", "", "world", 1.0, False, 7, "restitution",
-        "coefficient of restitution of every impact: 0 plastic, 1 elastic", "0.1",
-    ),
-)  # fmt: skip
-
-# Other ways to declare speeds, gaps and an obstacle. What replaces a quantity takes over its uniform numbers; the speed
-# of the line has the one number of vehicle_2 that restitution, one per world, leaves free.
-_OTHERWISE = _by_name(
-    QuantityRule(
-        "time_gaps_s", "s", "pair", 60.0, True, 0, "",
-        "gap of each pair divided by the speed of its rear vehicle, front to rear", "[1, 1]",
-    ),
-    QuantityRule(
-        "line_speed_mps", "mps", "world", 200.0, False, 7, "",
-        "speed that all vehicles share at the alert", "20", block=1,
-    ),
-    QuantityRule(
-        "speed_deviations_mps", "mps", "vehicle", 200.0, False, 1, "",
-        "what each vehicle adds to line_speed_mps", "[0, -2, 0]", low=-200.0,
-    ),
-    QuantityRule(
-        "obstacle_margin_m", "m", "world", 1e4, True, 0, "",
-        "distance of that obstacle from where vehicle_1 stops by full braking as soon as it can", "1.7",
-        stream=OBSTACLE,
-    ),
-    QuantityRule(
-        "alert_s", "s", "world", 3600.0, False, 2, "",
-        "time from the start, when gaps and speeds are as told, to the alert, from which latencies count",
-        "{uniform: [1, 5]}", stream=SURROUNDINGS,
-    ),
-)  # fmt: skip
-_OPTIONAL = _by_name(
-    QuantityRule(
-        "obstacle_gap_m", "m", "world", 1e4, True, 0, "obstacle_gap_m",
-        "distance from the front of vehicle_1 to an unmovable obstacle ahead, at the alert", "42",
-        stream=OBSTACLE,
-    ),
-    QuantityRule(
-        "friction", "", "world", 2.0, True, 0, "friction",
-        "friction of the road: no capacity is above friction x 9.81 m/s2", "{uniform: [0.2, 0.9]}",
-        stream=SURROUNDINGS,
-    ),
-    QuantityRule(
-        "brake_rate_mps3", "mps3", "vehicle", 1e6, True, 0, "brake_rate_{}_mps3",
-        "how fast the deceleration of each vehicle builds up; without it at once", "12.65",
-        stream=BRAKES,
-    ),
-    QuantityRule(
-        "release_rate_mps3", "mps3", "vehicle", 1e6, True, 1, "release_rate_{}_mps3",
-        "how fast it falls again, and driving builds up; without it at once", "25",
-        stream=BRAKES,
-    ),
-)  # fmt: skip
-QUANTITY = Quantities(
-    _USUAL, _OTHERWISE, _OPTIONAL,
-    alternatives={"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps", "obstacle_gap_m": "obstacle_margin_m"},
-    of_a_type=(
-        "braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "latency_s", "speed_limit_mps", "brake_rate_mps3",
-        "release_rate_mps3",
-    ),
-    needed=("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "latency_s"),
-    declared={**_USUAL, **_OTHERWISE, **_OPTIONAL},
-)  # fmt: skip
-_ALSO = (
-    "friction",
-    "brake_rate_mps3",
-    "release_rate_mps3",
-)  # what is drawn where it is declared, and needs nothing else
-_MEANING = {key: rule.meaning for key, rule in QUANTITY.declared.items()}
-
-
-# A quantity of a scenario: a fixed number, or a declared distribution.
-#
-# Each distribution is a pure function of one uniform number ``u`` in [0, 1): its inverse cumulative distribution
-# function. One quantity therefore uses up exactly one uniform number, whatever its distribution is.
-
-_LEAVE_OUT = "must be a number or a distribution; a key that is not used is left out"
-LEAST_MASS = 1e-6  # of a normal distribution inside its bounds; below it the inverse loses its digits
-_LEAST = f"[low, high] must hold at least {LEAST_MASS:g} of the untruncated distribution"
-
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Pair = Annotated[tuple[Number, Number], Field(strict=False)]
-Numbers = Annotated[tuple[Number, ...], Field(strict=False, min_length=1)]
-
-
-class _Distribution(FileModel):
-    """A way to draw a quantity."""
-
-
-class Uniform(_Distribution):
-    """``{uniform: [low, high]}``: every value from low to high is equally likely."""
-
-    uniform: Pair = Field(description="[low, high]")
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Uniform:
-        require(self.uniform[0] <= self.uniform[1], ("uniform",), self.uniform, "low must not be above high")
-        return self
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
-        return self.uniform
-
-    def value(self, u: Floats) -> Floats:
-        """``low + (high - low) u``, in the shape of ``u`` in [0, 1).
-
-        Never above high: u is at most 1 - 2^-53, so (high - low) u is rounded to less than the rounded high - low.
-        """
-        low, high = self.uniform
-        return low + (high - low) * u
-
-
-class LogUniform(_Distribution):
-    """``{loguniform: [low, high]}``: every ratio is equally likely, as between 1 and 2 so between 2 and 4."""
-
-    loguniform: Pair = Field(description="[low, high], both above 0")
-
-    @model_validator(mode="after")
-    def _ordered(self) -> LogUniform:
-        low, high = self.loguniform
-        require(low > 0.0, ("loguniform",), self.loguniform, "low must be above 0")
-        require(low <= high, ("loguniform",), self.loguniform, "low must not be above high")
-        return self
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
-        return self.loguniform
-
-    def value(self, u: Floats) -> Floats:
-        """``low (high / low)^u``, in the shape of ``u`` in [0, 1)."""
-        low, high = self.loguniform
-        return np.clip(low * exp_each((u * log(high / low)).ravel()).reshape(u.shape), low, high)
-
-
-class NormalShape(_Distribution):
-    """Mean and standard deviation of the untruncated bell, and the bounds that cut it."""
-
-    mean: Number
-    sd: Number
-    low: Number
-    high: Number
-
-
-class Normal(_Distribution):
-    """``{normal: {mean, sd, low, high}}``: a normal distribution truncated to [low, high]."""
-
-    normal: NormalShape
-
-    @model_validator(mode="after")
-    def _possible(self) -> Normal:
-        shape = self.normal
-        require(shape.sd > 0.0, ("normal",), shape, "sd must be above 0")
-        require(shape.low < shape.high, ("normal",), shape, "low must be below high")
-        below, above = self._bounds()
-        require(above - below >= LEAST_MASS, ("normal",), shape, _LEAST)
-        return self
-
-    def _bounds(self) -> tuple[float, float]:
-        """Probability below low and below high."""
-        shape = self.normal
-        low, high = (normal_probability((end - shape.mean) / shape.sd) for end in (shape.low, shape.high))
-        return low, high
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
-        return self.normal.low, self.normal.high
-
-    def value(self, u: Floats) -> Floats:
-        """``mean + sd Q(p_low + (p_high - p_low) u)`` with the normal quantile Q; same shape as ``u`` in [0, 1)."""
-        shape = self.normal
-        below, above = self._bounds()
-        quantile = normal_quantile_each((below + (above - below) * u).ravel()).reshape(u.shape)
-        return np.clip(shape.mean + shape.sd * quantile, shape.low, shape.high)
-
-
-class LogNormalShape(_Distribution):
-    """Median, standard deviation of the logarithm, and the bounds that cut it."""
-
-    median: Number
-    sigma: Number
-    low: Number
-    high: Number
-
-
-class LogNormal(_Distribution):
-    """``{lognormal: {median, sigma, low, high}}``: its logarithm is normal; truncated to [low, high]."""
-
-    lognormal: LogNormalShape
-    _of_logarithm: Normal = PrivateAttr()
-
-    @model_validator(mode="after")
-    def _possible(self) -> LogNormal:
-        shape, at = self.lognormal, ("lognormal",)
-        require(min(shape.median, shape.low) > 0.0, at, shape, "median and low must be above 0")
-        require(shape.sigma > 0.0, at, shape, "sigma must be above 0")
-        require(shape.low < shape.high, at, shape, "low must be below high")
-        middle, low, high = (log(value) for value in (shape.median, shape.low, shape.high))
-        try:
-            self._of_logarithm = Normal(normal={"mean": middle, "sd": shape.sigma, "low": low, "high": high})  # type: ignore[arg-type]
-        except ValidationError:
-            refuse(at, shape, _LEAST)
-        return self
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
-        return self.lognormal.low, self.lognormal.high
-
-    def value(self, u: Floats) -> Floats:
-        """``exp`` of the normal logarithm at ``u`` in [0, 1); same shape as ``u``."""
-        drawn = exp_each(self._of_logarithm.value(u).ravel()).reshape(u.shape)
-        return np.clip(drawn, *self.support)
-
-
-class Choice(_Distribution):
-    """``{choice: [a, b, ...]}``: one of these values, equally likely or as ``weights: [...]`` says."""
-
-    choice: Numbers
-    weights: Numbers | None = None
-
-    @model_validator(mode="after")
-    def _weighted(self) -> Choice:
-        if self.weights is not None:
-            fits = f"must have as many entries as choice, {len(self.choice)}"
-            require(len(self.weights) == len(self.choice), ("weights",), self.weights, fits)
-            positive = all(w > 0.0 for w in self.weights) and math.isfinite(sum(self.weights))
-            require(positive, ("weights",), self.weights, "every weight must be above 0, and their sum finite")
-        return self
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
-        return min(self.choice), max(self.choice)
-
-    def value(self, u: Floats) -> Floats:
-        """The first entry whose cumulative weight is above ``u``; same shape as ``u`` in [0, 1)."""
-        cumulative = np.cumsum(np.asarray(self.weights or (1.0,) * len(self.choice)))
-        cumulative /= cumulative[-1]
-        return np.asarray(self.choice)[np.searchsorted(cumulative, u, side="right")]
-
-
-@dataclass(frozen=True, slots=True, repr=False)
-class TableColumn:
-    """A column of a scenario's table: every world takes the value of its own row."""
-
-    name: str
-    rows: Floats = data_field(compare=False)  # [rows]
-    cumulative: Floats = data_field(compare=False)  # [rows] share of the worlds up to this row
-
-    def __repr__(self) -> str:
-        return f"column {self.name} of the table"
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
-        return float(self.rows.min()), float(self.rows.max())
-
-    @property
-    def middle(self) -> TableColumn:
-        """The one row that stands for all: the median."""
-        order = np.argsort(self.rows, kind="stable")
-        shares = np.cumsum(np.diff(self.cumulative, prepend=0.0)[order])
-        return replace(self, rows=self.rows[order][[np.searchsorted(shares, 0.5)]], cumulative=np.ones(1))
-
-    def value(self, u: Floats) -> Floats:
-        """That of the first row whose cumulative weight is above ``u``; same shape as ``u`` in [0, 1)."""
-        found: Floats = self.rows[np.searchsorted(self.cumulative, u, side="right")]
-        return found
-
-
-def _kind(value: object) -> str | None:
-    """Which member of ``Quantity`` a value means; decides whose error messages are shown."""
-    if isinstance(value, _Distribution):
-        return f"#{type(value).__name__.lower()}"
-    if isinstance(value, dict):
-        return next((f"#{name}" for name in DISTRIBUTIONS if name in value), None)
-    return None if isinstance(value, list | tuple) else "#number"
-
-
-DISTRIBUTIONS = ("uniform", "loguniform", "normal", "lognormal", "choice")
-
-# Tags begin with # so that they can be told from keys in the location of an error.
-Quantity = Annotated[
-    Annotated[Number, Tag("#number")]
-    | Annotated[Uniform, Tag("#uniform")]
-    | Annotated[LogUniform, Tag("#loguniform")]
-    | Annotated[Normal, Tag("#normal")]
-    | Annotated[LogNormal, Tag("#lognormal")]
-    | Annotated[Choice, Tag("#choice")],
-    Discriminator(_kind, custom_error_type="quantity", custom_error_message="no such quantity"),
-]
-
-
-class WithLoad(_Distribution):
-    """``{with_load: [empty, full]}``, of a vehicle type only: moves with the load of the vehicle, from 0 to 1.
-
-    ``spread`` is added to it, of its own for every vehicle.
-    """
-
-    with_load: Pair = Field(description="[empty, full]: at load 0 and at load 1")
-    spread: Quantity = Field(default=0.0, exclude_if=not_, description="what each vehicle adds to it by chance")
-
-    @field_validator("spread")
-    @classmethod
-    def _spreads(cls, value: Any) -> Any:
-        right = "must be a distribution around 0, such as {uniform: [-0.3, 0.3]}"
-        require(not isinstance(value, float), (), value, right)
-        return value
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
-        low, high = support(self.spread)
-        return min(self.with_load) + low, max(self.with_load) + high
-
-    def value(self, load: Floats, u: Floats) -> Floats:
-        """``empty + (full - empty) load``, and the spread at ``u``; ``load`` in [0, 1] and ``u`` have one shape."""
-        empty, full = self.with_load
-        moved = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))
-        return moved if self.spread == 0.0 else moved + values(self.spread, u)
-
-
-AnyQuantity = float | Uniform | LogUniform | Normal | LogNormal | Choice | TableColumn
-AnyTypeQuantity = AnyQuantity | WithLoad
-
-
-def support(quantity: AnyTypeQuantity) -> tuple[float, float]:
-    """Smallest and largest value that the quantity can take."""
-    return (quantity, quantity) if isinstance(quantity, float) else quantity.support
-
-
-def values(quantity: AnyQuantity, u: Floats) -> Floats:
-    """The quantity's values for uniform numbers ``u`` in [0, 1), in the shape of ``u``."""
-    return np.full(u.shape, quantity) if isinstance(quantity, float) else quantity.value(u)
-
-
-# A part of a list of worlds: the worlds, where they stand in the list, and what they were drawn as.
-
-_Texts = NDArray[np.str_]
-
-
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """Worlds at the alert, and where in the list they stand.
-
-    >>> import ethbrake_marl as eb
-    >>> sample = eb.load_scenario("paper-random").sample(2, seed=7)
-    >>> sample.index, sample.worlds.gaps_m.round(2)
-    (array([0, 1]), array([[6.62, 8.49], [5.33, 7.79]]))
-
-    """
-
-    worlds: Worlds  # at t = 0
-    index: Ints  # [n] number of each world in the list of its seed
-    rejected: int  # draws refused because of an early impact
-    types: _Texts | None = None  # [n, N] type of every vehicle, where a scenario has types; empty: it has none
-    scenarios: _Texts | None = None  # [n] the scenario of a mixture that each world was drawn from
-
-    def __repr__(self) -> str:
-        numbers = f"numbers {self.index.min()} to {self.index.max()}" if len(self.index) else "no numbers"
-        return f"Sample({self.worlds!r}, {numbers}, {self.rejected:,} rejected)"
-
-    def take(self, rows: ArrayLike) -> Sample:
-        """Some of the worlds, by row or mask (always a copy); none of them was rejected."""
-        some = np.asarray(rows)
-        types, scenarios = (None if each is None else each[some] for each in (self.types, self.scenarios))
-        return Sample(self.worlds.take(some), self.index[some], 0, types, scenarios)
-
-    @staticmethod
-    def join(parts: Sequence[Sample], rejected: int) -> Sample:
-        """The worlds of all parts in the order of their numbers; all have types, or scenarios, or none has."""
-        index = np.concatenate([part.index for part in parts])
-        order = np.argsort(index)
-        joined: dict[str, _Texts] = {}
-        for name in ("types", "scenarios"):
-            given = [getattr(part, name) for part in parts if getattr(part, name) is not None]
-            joined |= {name: np.concatenate(given)[order]} if given else {}
-        worlds = Worlds.concatenate([part.worlds for part in parts]).take(order)
-        return Sample(worlds, index[order], rejected, **joined)
-
-    @property
-    def kinds(self) -> dict[str, _Texts]:
-        """``scenario`` of a mixture and ``vehicle_K_type``, each [n], where the worlds were drawn with such."""
-        columns = {} if self.scenarios is None else {"scenario": self.scenarios}
-        types = () if self.types is None else self.types.T
-        return columns | {f"vehicle_{i + 1}_type": column for i, column in enumerate(types)}
-
-    def count_kinds(self) -> str:
-        """How often each scenario of a mixture, and each type of a vehicle, is there; empty without such."""
-        told = ""
-        for kind, column in self.kinds.items():
-            names, counts = np.unique(column, return_counts=True)
-            told += f"; {kind}: " + ", ".join(f"{n or 'none'} {c}" for n, c in zip(names, counts, strict=True))
-        return told
-
-
-# The fields of a scenario: what a file may say, before anything is checked or drawn.
-
-# Roles: who learns, names of scripts (``name[:argument]``), and the commands of the scripts that need no state.
-
-LEARNER = "learner"
-_PROFILE = "profile"  # a constant command in pieces
-MOST_PIECES = 64
-
-_SPEC = re.compile(r"(?P<name>[a-z][a-z0-9_@.-]*)(:(?P<argument>\S+))?")
-
-
-class ScriptSpec(NamedTuple):
-    """``name[:argument]``, for instance ``constant:3.5``: how a scenario, or a command, names an agent."""
-
-    name: str
-    argument: str | None
-
-    def __str__(self) -> str:
-        return self.name if self.argument is None else f"{self.name}:{self.argument}"
-
-    @staticmethod
-    @lru_cache(maxsize=256)
-    def parse(spec: str) -> ScriptSpec:
-        """Split it.
-
-        Raises ``InvalidInput`` unless the name matches ``[a-z][a-z0-9_@.-]*`` and the argument has no blanks, and for a
-        Python file: a scenario that somebody else wrote must not run code.
-        """
-        match = _SPEC.fullmatch(spec) if isinstance(spec, str) else None
-        if match is None:
-            raise InvalidInput(
-                f"agent {spec!r}: must be name or name:argument, the name in lower case letters, digits and _ @ . -,"
-                " for instance full_brake or constant:3.5"
-            )
-        if match["name"].endswith(".py") or ".py:" in spec:
-            raise InvalidInput(
-                f"agent {spec!r}: is a function of a Python file, and those are loaded only where a person names them"
-                " (--agents); no scenario does. A package that you install can give it a name"
-            )
-        return ScriptSpec(match["name"], match["argument"])
-
-    @property
-    def deceleration_mps2(self) -> float | None:
-        """The deceleration a (negative = drive) of ``constant:a``; None for any other script.
-
-        Raises ``InvalidInput`` when a is missing or not a finite number.
-        """
-        if self.name != "constant":
-            return None
-        deceleration = parse_numeral(self.argument or "")
-        if deceleration is None or not math.isfinite(deceleration):
-            raise InvalidInput(
-                f"agent {str(self)!r}: constant needs a finite deceleration in m/s2 after the colon, for instance"
-                " constant:3.5"
-            )
-        return deceleration
-
-    @property
-    def pieces(self) -> tuple[tuple[float, float], ...]:
-        """The pieces of a ``profile``: s after the latency, m/s2 of braking; none of any other script.
-
-        Raises ``InvalidInput`` unless times begin with 0 and rise, and no braking is negative.
-        """
-        if self.name != _PROFILE:
-            return ()
-        given = [part.split("=") for part in (self.argument or "").split(",")]
-        return checked_pieces([[parse_numeral(number) for number in piece] for piece in given])
-
-    @property
-    def hardest_mps2(self) -> float | None:
-        """The largest deceleration (m/s2) that ``constant:a`` or a ``profile`` asks for; None for any other script."""
-        return max(braking for _, braking in self.pieces) if self.name == _PROFILE else self.deceleration_mps2
-
-    def is_state_free(self) -> bool:
-        """Whether the script's command never depends on the state: ``full_brake``, ``coast`` or ``constant:a``.
-
-        Raises ``InvalidInput`` when such a script has an argument it does not take, or lacks the one it needs.
-        """
-        if self.name == _PROFILE:
-            return len(self.pieces) > 0
-        if self.name in ("full_brake", "coast"):
-            if self.argument is not None:
-                raise InvalidInput(f"agent {str(self)!r}: {self.name} takes no argument")
-            return True
-        return self.deceleration_mps2 is not None
-
-    def command(
-        self, braking_capacity_mps2: ArrayLike, driving_capacity_mps2: ArrayLike | None = None
-    ) -> Floats | None:
-        """Signed command (m/s2) of a state-free script, in the shape of the capacity; None for any other script.
-
-        ``full_brake`` -> -capacity, ``coast`` -> 0, ``constant:a`` -> -a, a ``profile`` that of its first piece.
-        Raises ``InvalidInput`` when a, or a piece, is above the braking capacity of any vehicle, or -a above its
-        driving capacity where that is given.
-        """
-        capacity = np.asarray(braking_capacity_mps2, dtype=np.float64)
-        if not self.is_state_free():
-            return None
-        deceleration = self.hardest_mps2
-        if deceleration is None:
-            return -capacity if self.name == "full_brake" else np.zeros(capacity.shape)
-        if not np.all(deceleration <= capacity):
-            raise InvalidInput(f"agent {str(self)!r}: above the braking capacity {np.min(capacity):g} m/s2")
-        if driving_capacity_mps2 is not None and not np.all(-deceleration <= np.asarray(driving_capacity_mps2)):
-            raise InvalidInput(
-                f"agent {str(self)!r}: above the driving capacity {np.min(driving_capacity_mps2):g} m/s2"
-            )
-        return np.full(capacity.shape, 0.0 - (self.pieces[0][1] if self.pieces else deceleration))
-
-
-def checked_pieces(given: object) -> tuple[tuple[float, float], ...]:
-    """The pieces of a ``profile``, [[s, m/s2], ...], as they are written in roles; raises ``InvalidInput``."""
-    right = f"a profile is 1 to {MOST_PIECES} pieces [s after the latency, m/s2 of braking], such as [[0, 3], [1, 7]]"
-    if not isinstance(given, list | tuple) or not 1 <= len(given) <= MOST_PIECES:
-        raise InvalidInput(right)
-    for piece in given:
-        numbers = isinstance(piece, list | tuple) and len(piece) == 2
-        if not numbers or not all(type(each) in (int, float) and 0.0 <= each <= 3600.0 for each in piece):
-            raise InvalidInput(f"{right}; both in [0, 3600], which {piece!r:.60} is not")
-    if given[0][0] != 0.0 or not all(one[0] < other[0] for one, other in pairwise(given)):
-        raise InvalidInput(f"{right}; times begin with 0 and rise")
-    return tuple((float(begins), float(braking)) for begins, braking in given)
-
-
-def _role_text(role: object) -> object:
-    """A role as a script is named: ``{profile: [[0, 3], [1, 7]]}`` is ``profile:0=3,1=7``."""
-    if not isinstance(role, dict):
-        return role
-    try:
-        if set(role) != {_PROFILE}:
-            raise InvalidInput("must be learner, a script, or {profile: [[0, 3], [1, 7]]} and nothing beside it")
-        pieces = checked_pieces(role[_PROFILE])
-    except InvalidInput as error:
-        refuse((), role, str(error))
-    numbers = (tuple(repr(number).removesuffix(".0") for number in piece) for piece in pieces)
-    return f"{_PROFILE}:" + ",".join(f"{begins}={braking}" for begins, braking in numbers)
-
-
-def _role_content(role: str) -> str | dict[str, list[list[float]]]:
-    """A role as a file says it."""
-    pieces = ScriptSpec.parse(role).pieces
-    return {_PROFILE: [list(piece) for piece in pieces]} if pieces else role
-
-
-_ROLE_SCHEMA = {
-    "anyOf": [
-        {"type": "string"},
-        {
-            "type": "object",
-            "required": [_PROFILE],
-            "additionalProperties": False,
-            "properties": {
-                _PROFILE: {
-                    "type": "array",
-                    "minItems": 1,
-                    "maxItems": MOST_PIECES,
-                    "items": {"type": "array", "minItems": 2, "maxItems": 2, "items": {"type": "number", "minimum": 0}},
-                }
-            },
-        },
-    ]
-}
-Role = Annotated[
-    str, BeforeValidator(_role_text), PlainSerializer(_role_content, return_type=Any), WithJsonSchema(_ROLE_SCHEMA)
-]
-
-
-class Roles(dict[str, str]):
-    """Vehicle -> ``learner`` or a script; like the rest of a scenario it cannot be changed."""
-
-    def _refuse(self, *args: object, **kwargs: object) -> NoReturn:
-        raise InvalidInput("roles of a scenario are frozen; use scenario.replace(roles=...) or scenario.with_learners")
-
-    __setitem__ = __delitem__ = __ior__ = _refuse
-    update = setdefault = pop = popitem = clear = _refuse
-
-    def __reduce__(self) -> tuple[type[Roles], tuple[dict[str, str]]]:
-        """Copy and pickle through the constructor."""
-        return Roles, (dict(self),)
-
-    @staticmethod
-    def complete(given: Mapping[str, str] | None, vehicles: int) -> Roles:
-        """A role for every vehicle in order: full braking where none is given; by default vehicle_2 learns."""
-        roles = {"vehicle_2": LEARNER} if given is None else given
-        names = [f"vehicle_{i + 1}" for i in range(vehicles)]
-        return Roles({name: roles.get(name, "full_brake") for name in names})
-
+from ethbrake_marl.scenario.fields import (
+    ALSO,
+    BLOCK,
+    BRAKES,
+    LATER_LOSSES,
+    MEANING,
+    MIXTURE,
+    OBSTACLE,
+    OF_WORLD,
+    PER_TYPE,
+    QUANTITY,
+    ROW,
+    SURROUNDINGS,
+    TYPES,
+    V2X_NEWS,
+    Place,
+    QuantityRule,
+)
+from ethbrake_marl.scenario.roles import LEARNER, Role, Roles, ScriptSpec
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.vehicle_types import (
+    ANY,
+    LEFT_OUT,
+    ListedByVehicle,
+    Member,
+    ObjectiveName,
+    PerVehicle,
+    Table,
+    Types,
+    TypesOfLine,
+    VehicleTypes,
+)
 
 # Types of vehicles: what a car, a van or a truck is, drawn together, and which of them may stand where.
 #
 # A world's vehicle first gets its type, then its quantities as that type declares them. What moves with the load of a
 # vehicle, ``{with_load: [empty, full]}``, moves together: a full truck is heavy *and* brakes weakly.
-
-ANY = "any"  # in ``types``: every type, by its weight
-
-TypeName = Annotated[str, Field(pattern=NAME_PATTERN)]
-ListedByVehicle = Annotated[
-    dict[Annotated[str, Field(pattern=r"^vehicle_[1-9][0-9]?$")], ListedFeatures],
-    Field(min_length=1, json_schema_extra={"additionalProperties": False}),
-]
-Weight = Annotated[float, Field(gt=0.0, le=1e9, allow_inf_nan=False)]
-
-
-def _loaded(value: object) -> str:
-    return "#with_load" if isinstance(value, WithLoad) or (isinstance(value, dict) and "with_load" in value) else "#one"
-
-
-TypeQuantity = Annotated[
-    Annotated[Quantity, Tag("#one")] | Annotated[WithLoad, Tag("#with_load")], Discriminator(_loaded)
-]
-
-
-class VehicleType(FileModel):
-    """One type: how likely it is, and every quantity that it declares; the rest is as beside ``vehicle_types``."""
-
-    weight: Weight = Field(default=1.0, description="how likely it is, relative to the other types")
-    load: Quantity = Field(
-        default_factory=lambda: Uniform(uniform=(0.0, 1.0)), description="share of the full load, 0 to 1"
-    )
-    braking_capacity_mps2: TypeQuantity | None = Field(default=None, description=_MEANING["braking_capacity_mps2"])
-    driving_capacity_mps2: TypeQuantity | None = Field(default=None, description=_MEANING["driving_capacity_mps2"])
-    mass_t: TypeQuantity | None = Field(default=None, description=_MEANING["mass_t"])
-    latency_s: TypeQuantity | None = Field(default=None, description=_MEANING["latency_s"])
-    speed_limit_mps: TypeQuantity | None = Field(default=None, description=_MEANING["speed_limit_mps"])
-    brake_rate_mps3: TypeQuantity | None = Field(default=None, exclude_if=not_, description=_MEANING["brake_rate_mps3"])
-    release_rate_mps3: TypeQuantity | None = Field(
-        default=None, exclude_if=not_, description=_MEANING["release_rate_mps3"]
-    )
-    v2x: Equipage | None = Field(default=None, exclude_if=not_, description="what it has of V2X; by default all")
-
-    @field_validator(*QUANTITY.of_a_type)
-    @classmethod
-    def _in_range(cls, value: Any, info: ValidationInfo) -> Any:
-        require(value is not None, (), value, _LEAVE_OUT)
-        rule = QUANTITY.declared[str(info.field_name)]
-        require(rule.allows(*support(value)), (), value, f"must be {rule.interval}")
-        return value
-
-    @field_validator("load")
-    @classmethod
-    def _share(cls, value: Any) -> Any:
-        low, high = support(value)
-        require(low >= 0.0 and high <= 1.0, (), value, "must be in [0, 1]: 0 empty, 1 full")
-        return value
-
-
-def _check_type_names(kinds: dict[str, VehicleType]) -> dict[str, VehicleType]:
-    require(ANY not in kinds, (ANY,), UNSHOWN, f"{ANY} stands for every type; give another name")
-    return kinds
-
-
-VehicleTypes = Annotated[dict[TypeName, VehicleType], Field(min_length=1), AfterValidator(_check_type_names)]
-TypesHere = str | dict[str, Weight]  # of one vehicle: a type, ``any``, or a weight for each type that may stand there
-
-
-def _one_or_each(value: object) -> str:
-    return "#each" if isinstance(value, list | tuple) else "#one"
-
-
-Types = Annotated[
-    Annotated[TypesHere, Tag("#one")]
-    | Annotated[tuple[TypesHere, ...], Field(strict=False, min_length=1), Tag("#each")],
-    Discriminator(_one_or_each),
-]
-
-
-class TypesOfLine:
-    """Which types may stand at each place of a line, and how likely each is there."""
-
-    def __init__(self, kinds: Mapping[str, VehicleType], types: Types | None, vehicles: int) -> None:
-        self.names = tuple(kinds)
-        self.kinds = tuple(kinds.values())
-        given: Sequence[TypesHere]
-        given = types if isinstance(types, tuple) else (ANY if types is None else types,) * vehicles
-        self.weights = np.array([[_weight(kinds, name, here) for name in kinds] for here in given])
-
-    def possible(self, vehicle: int) -> list[int]:
-        """Indices of the types that may stand there."""
-        return np.flatnonzero(self.weights[vehicle] > 0.0).tolist()
-
-    def draw(self, u: Floats) -> tuple[Ints, Floats]:
-        """Type (index) and load of every vehicle, both [n, N], from uniform numbers ``u`` [n, N, 2]."""
-        n, vehicles = u.shape[:2]
-        types, load = np.zeros((n, vehicles), np.int64), np.zeros((n, vehicles))
-        for i in range(vehicles):
-            cumulative = np.cumsum(self.weights[i])
-            types[:, i] = np.searchsorted(cumulative / cumulative[-1], u[:, i, 0], side="right")
-            for kind in self.possible(i):
-                rows, shape = types[:, i] == kind, self.kinds[kind].load
-                load[rows, i] = shape if isinstance(shape, float) else shape.value(u[rows, i, 1])
-        return types, load
-
-
-def _weight(kinds: Mapping[str, VehicleType], name: str, here: TypesHere) -> float:
-    if isinstance(here, str):
-        return kinds[name].weight if here == ANY else float(here == name)
-    return here.get(name, 0.0)
-
-
-_LEFT_OUT: Any = object()  # a key that is not given, where a check must say whether it may be
-
-
-PerVehicle = Annotated[
-    Annotated[Quantity, Tag("#one")] | Annotated[tuple[Quantity, ...], Field(strict=False, min_length=1), Tag("#each")],
-    Discriminator(_one_or_each),
-]
-
-
-class _ObjectiveSchema:
-    """The JSON schema of an objective: what is known when it is asked for."""
-
-    @classmethod
-    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        kinds = OBJECTIVES.usable()
-        plain = [name for name, kind in kinds.items() if ":" not in kind.form]
-        with_argument = "|".join(name for name, kind in kinds.items() if ":" in kind.form)
-        return {"type": "string", "anyOf": [{"enum": plain}, {"pattern": f"^({with_argument}):"}]}
-
-
-_ObjectiveName = Annotated[str, _ObjectiveSchema]
-
-
-class _MemberSchema:
-    """In a file also a scenario's name, or the path of its file."""
-
-    @classmethod
-    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        return {"anyOf": [{"type": "string"}, {"type": "object"}]}
-
-
-MOST_NUMBERS = 100_000  # of a table: a scenario is kept whole wherever it is used
-
-Column = Annotated[str, Field(pattern=r"^[a-z_]+(_[0-9]+)?[a-z0-9_]*$", max_length=64)]
-
-
-class Table(FileModel):
-    """Rows of which every world takes one, by weight; in a scenario file read from a CSV file beside it."""
-
-    file: str = Field(default="", exclude_if=not_, description="CSV file with a header, from the scenario's folder on")
-    columns: Annotated[tuple[Column, ...], Field(strict=False, min_length=1)] = Field(
-        description="as in a table of initial states: gap_1_m, speed_2_mps, ...; of a file those that are used"
-    )
-    weights: str | Annotated[Numbers, Field()] | None = Field(
-        default=None, exclude_if=not_, description="how likely each row is; of a file the column that says it"
-    )
-    rows: Annotated[tuple[Numbers, ...], Field(strict=False, min_length=1)] | None = Field(
-        default=None, description="one row of numbers for each; left out with a file, which has them"
-    )
-
-    @model_validator(mode="after")
-    def _complete(self) -> Table:
-        read = "files are read where they stand in a file (load_scenario); give rows"
-        require(not (self.file and self.rows), ("file",), self.file, "give either a file or rows, not both")
-        require(self.rows is not None and not isinstance(self.weights, str), ("rows",), UNSHOWN, read)
-        rows = self.rows or ()
-        for k, row in enumerate(rows):
-            right = f"has {len(row)} numbers; there are {len(self.columns)} columns"
-            require(len(row) == len(self.columns), ("rows", k), UNSHOWN, right)
-        numbers = len(rows) * len(self.columns)
-        require(numbers <= MOST_NUMBERS, ("rows",), UNSHOWN, f"{numbers:,} numbers; at most {MOST_NUMBERS:,}")
-        twice = [name for name in self.columns if self.columns.count(name) > 1]
-        require(not twice, ("columns",), twice[:1], "each column can be given once")
-        if isinstance(self.weights, tuple):
-            fits = f"must be one for each of {len(rows)} rows, all above 0, and their sum finite"
-            good = len(self.weights) == len(rows) and min(self.weights) > 0.0 and math.isfinite(sum(self.weights))
-            require(good, ("weights",), UNSHOWN, fits)
-        return self
-
-    def column_values(self) -> dict[str, TableColumn]:
-        """The columns by name."""
-        rows = np.array(self.rows)
-        weights = self.weights if isinstance(self.weights, tuple) else (1.0,) * len(rows)
-        cumulative = np.cumsum(np.asarray(weights))
-        return {
-            name: TableColumn(name, column, cumulative / cumulative[-1])
-            for name, column in zip(self.columns, rows.T, strict=True)
-        }
-
-
-class Member(FileModel):
-    """One scenario of a mixture: what it says, and how likely it is, relative to the others."""
-
-    scenario: Annotated[dict[str, Any], _MemberSchema] = Field(description="a name, a path, or what its file says")
-    weight: Weight = Field(default=1.0, description="how likely it is, relative to the other scenarios")
 
 
 class ScenarioFields(FileModel):
@@ -1031,42 +110,42 @@ class ScenarioFields(FileModel):
     horizon_s: float = Field(
         default=8.0, gt=0.0, le=3600.0, allow_inf_nan=False, description="time after which an episode is cut off"
     )
-    gaps_m: PerVehicle | None = Field(default=None, description=_MEANING["gaps_m"])
-    time_gaps_s: PerVehicle | None = Field(default=None, description=_MEANING["time_gaps_s"])
-    speeds_mps: PerVehicle | None = Field(default=None, description=_MEANING["speeds_mps"])
-    line_speed_mps: Quantity | None = Field(default=None, description=_MEANING["line_speed_mps"])
-    speed_deviations_mps: PerVehicle = Field(default=0.0, description=_MEANING["speed_deviations_mps"])
+    gaps_m: PerVehicle | None = Field(default=None, description=MEANING["gaps_m"])
+    time_gaps_s: PerVehicle | None = Field(default=None, description=MEANING["time_gaps_s"])
+    speeds_mps: PerVehicle | None = Field(default=None, description=MEANING["speeds_mps"])
+    line_speed_mps: Quantity | None = Field(default=None, description=MEANING["line_speed_mps"])
+    speed_deviations_mps: PerVehicle = Field(default=0.0, description=MEANING["speed_deviations_mps"])
     braking_capacity_mps2: PerVehicle | None = Field(
-        default_factory=lambda: _LEFT_OUT, validate_default=True, description=_MEANING["braking_capacity_mps2"]
+        default_factory=lambda: LEFT_OUT, validate_default=True, description=MEANING["braking_capacity_mps2"]
     )
     driving_capacity_mps2: PerVehicle | None = Field(
-        default_factory=lambda: _LEFT_OUT, validate_default=True, description=_MEANING["driving_capacity_mps2"]
+        default_factory=lambda: LEFT_OUT, validate_default=True, description=MEANING["driving_capacity_mps2"]
     )
     mass_t: PerVehicle | None = Field(
-        default_factory=lambda: _LEFT_OUT, validate_default=True, description=_MEANING["mass_t"]
+        default_factory=lambda: LEFT_OUT, validate_default=True, description=MEANING["mass_t"]
     )
     latency_s: PerVehicle | None = Field(
-        default_factory=lambda: _LEFT_OUT, validate_default=True, description=_MEANING["latency_s"]
+        default_factory=lambda: LEFT_OUT, validate_default=True, description=MEANING["latency_s"]
     )
-    speed_limit_mps: PerVehicle = Field(default=40.0, description=_MEANING["speed_limit_mps"])
-    restitution: Quantity = Field(default=0.1, description=_MEANING["restitution"])
+    speed_limit_mps: PerVehicle = Field(default=40.0, description=MEANING["speed_limit_mps"])
+    restitution: Quantity = Field(default=0.1, description=MEANING["restitution"])
     roles: dict[str, Role] = Field(
         default_factory=lambda data: Roles.complete(None, data.get("vehicles", 3)),
         description="learner or a script for each vehicle; vehicles left out of a given mapping brake fully",
     )
-    obstacle_gap_m: Quantity | None = Field(default=None, description=_MEANING["obstacle_gap_m"])
-    obstacle_margin_m: Quantity | None = Field(default=None, description=_MEANING["obstacle_margin_m"])
-    friction: Quantity | None = Field(default=None, exclude_if=not_, description=_MEANING["friction"])
-    brake_rate_mps3: PerVehicle | None = Field(default=None, exclude_if=not_, description=_MEANING["brake_rate_mps3"])
+    obstacle_gap_m: Quantity | None = Field(default=None, description=MEANING["obstacle_gap_m"])
+    obstacle_margin_m: Quantity | None = Field(default=None, description=MEANING["obstacle_margin_m"])
+    friction: Quantity | None = Field(default=None, exclude_if=not_, description=MEANING["friction"])
+    brake_rate_mps3: PerVehicle | None = Field(default=None, exclude_if=not_, description=MEANING["brake_rate_mps3"])
     release_rate_mps3: PerVehicle | None = Field(
-        default=None, exclude_if=not_, description=_MEANING["release_rate_mps3"]
+        default=None, exclude_if=not_, description=MEANING["release_rate_mps3"]
     )
-    alert_s: Quantity | None = Field(default=None, exclude_if=not_, description=_MEANING["alert_s"])
+    alert_s: Quantity | None = Field(default=None, exclude_if=not_, description=MEANING["alert_s"])
     early_impacts: Literal["keep", "reject"] = Field(
         default="keep", description="what happens to worlds with an impact before the first learner may act"
     )
 
-    objective: _ObjectiveName | Annotated[tuple[_ObjectiveName, ...], Field(strict=False)] = Field(
+    objective: ObjectiveName | Annotated[tuple[ObjectiveName, ...], Field(strict=False)] = Field(
         default="total", description="whose harm a reward counts: one for all vehicles, or one for each"
     )
     observation: ListedFeatures | ListedByVehicle | None = Field(
@@ -1114,7 +193,7 @@ class ScenarioFields(FileModel):
     @classmethod
     def _given(cls, value: Any) -> Any:
         """``null`` is no value: a key that is not used is left out."""
-        require(value is not None, (), value, _LEAVE_OUT)
+        require(value is not None, (), value, LEAVE_OUT)
         return value
 
     @field_validator(*QUANTITY.needed, mode="before")
@@ -1124,8 +203,8 @@ class ScenarioFields(FileModel):
         key, data = str(info.field_name), info.data
         kinds = data.get("vehicle_types")
         without = None if kinds is None else next((k for k, kind in kinds.items() if getattr(kind, key) is None), None)
-        if value is not _LEFT_OUT:
-            require(value is not None, (), value, _LEAVE_OUT)
+        if value is not LEFT_OUT:
+            require(value is not None, (), value, LEAVE_OUT)
             require(kinds is None or without is not None, (), value, "every type declares it; leave it out")
             return value
         if data.get("mixture") is None and {"vehicle_types", "mixture"} <= data.keys() and not _tabled(data, key):
@@ -1575,14 +654,14 @@ def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]
     found = {key: declared(key) for key in QUANTITY.usual if other.get(key) is None}
     if scenario.alert_s is not None:
         found["latency_s"] = found["latency_s"] + declared("alert_s")
-    for key in _ALSO:
+    for key in ALSO:
         if scenario.declares(key):
             found[key] = declared(key)
     if scenario.line_speed_mps is not None:
         found["speeds_mps"] = declared("line_speed_mps") + declared("speed_deviations_mps")
     if scenario.time_gaps_s is not None:
         found["gaps_m"] = declared("time_gaps_s") * found["speeds_mps"][:, 1:]
-    return {key: found[key] for key in (*QUANTITY.usual, *_ALSO) if key in found}
+    return {key: found[key] for key in (*QUANTITY.usual, *ALSO) if key in found}
 
 
 def on_road(found: Mapping[str, Floats]) -> dict[str, Floats]:
@@ -1646,12 +725,15 @@ def _supports_of(scenario: ScenarioFields) -> Callable[[str], Floats]:
 Channel = Literal["list", "training"]
 
 CHANNELS: dict[str, int] = {"list": 0, "training": 1}
+
 MOST_ATTEMPTS = 1000  # draws of one world before its scenario is declared unusable
+
 _PATIENCE = 10  # attempts of a whole list before one world is tried to its end
 
 MOST_AT_ONCE = 10_000_000  # worlds of one sample; a longer list is drawn in parts
 
 _MOST_WORLDS = 2**62  # their numbers are 64-bit integers
+
 _NUMBERS_PER_COUNTER = 4  # 64-bit integers that Philox makes from one counter
 
 

@@ -8,15 +8,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.actions import action_to_command
-from ethbrake_marl.agents import Agent, AgentAround, Driver, Team, drive
-from ethbrake_marl.engine import Memory, Script
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.protocol import Agent, AgentAround, Driver, Team
+from ethbrake_marl.env.actions import action_to_command
+from ethbrake_marl.env.memory import Memory
+from ethbrake_marl.env.scripts import Script
 from ethbrake_marl.errors import InvalidInput, count_of, renumbered
-from ethbrake_marl.physics import Bools, Decisions, Floats, Ints, Worlds
-from ethbrake_marl.shield.step_shield import StepShield, proposed_action
+from ethbrake_marl.physics.episode import Decisions
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.shield.rollouts import proposed_action
+from ethbrake_marl.shield.step import StepShield
 
 SAME_HARM = 1e-9  # harms (m2/s2) closer than this are one harm
+
 ALLOWANCES = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0, 1e6)  # m2/s2, of an operating curve
+
 VERDICTS = ("needed", "harmless", "costly")
 
 

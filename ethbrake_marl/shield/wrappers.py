@@ -14,13 +14,16 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
-from ethbrake_marl.agents import Agent, LearnedPolicy, Team
-from ethbrake_marl.envs import InTurns, Ordered, SeededInside
+from ethbrake_marl.agents.learned import LearnedPolicy
+from ethbrake_marl.agents.protocol import Agent, Team
+from ethbrake_marl.env.observations import Observations
+from ethbrake_marl.env.pettingzoo import InTurns, Ordered, SeededInside
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.observations import Observations
-from ethbrake_marl.physics import Bools, Floats
-from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.shield.guard import Attached, HybridAgent, Proposing, ShieldedDriver, shielded
+from ethbrake_marl.physics.state import Bools, Floats
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.shield.drivers import ShieldedDriver, shielded
+from ethbrake_marl.shield.options import Proposing
+from ethbrake_marl.shield.paper_hybrid import Attached, HybridAgent
 
 Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # what a step of the environment returns
 

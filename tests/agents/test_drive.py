@@ -6,30 +6,27 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import (
-    LearnedAgent,
-    Searched,
-    Team,
-    agent_entries,
-    agent_names,
-    drive,
-    make_agent,
-    optimise_coupled,
-    optimise_pairwise,
-    parse_spec,
-    policy_agent,
-    register_agent,
-    script_agents,
-)
-from ethbrake_marl.agents.registry import AgentSpec
+from ethbrake_marl.agents.driving import drive, script_agents
+from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
+from ethbrake_marl.agents.foreign import policy_agent
+from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.protocol import Team
+from ethbrake_marl.agents.registry import AgentSpec, agent_entries, agent_names, make_agent, parse_spec, register_agent
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.envs.interfaces import make_engine
+from ethbrake_marl.env.making import make_engine
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.evaluation import evaluate, follow_episodes, record_episode, worlds_sha256
-from ethbrake_marl.evaluation.episodes import Task, film_scenes, record_episodes
-from ethbrake_marl.evaluation.inputs import FIELD
-from ethbrake_marl.physics import Floats, Worlds
-from ethbrake_marl.shield import HybridAgent, ShieldedDriver
+from ethbrake_marl.evaluation.identity import worlds_sha256
+from ethbrake_marl.evaluation.motion import follow_episodes
+from ethbrake_marl.evaluation.named_worlds import FIELD
+from ethbrake_marl.evaluation.record import record_episode
+from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.extensions.datasets.recording import Task, record_episodes
+from ethbrake_marl.extensions.report.film import film_scenes
+from ethbrake_marl.extensions.search.around import Searched
+from ethbrake_marl.physics.state import Floats, Worlds
+from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shield.paper_hybrid import HybridAgent
 from tests.fixtures.asked import Acts, Asked
 
 SCENARIO = eb.load_scenario("paper-random")

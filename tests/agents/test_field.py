@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import record_commands
-from ethbrake_marl.agents.field import LAWS, Parameters, Seen, fuzzy
+from ethbrake_marl.agents.driving import record_commands
+from ethbrake_marl.extensions.field.controllers import LAWS, Parameters, Seen, fuzzy
 from tests.refused import refused
 
 

@@ -9,27 +9,23 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.actions import action_to_command, command_to_action
-from ethbrake_marl.agents import (
-    Knowledge,
-    Odometer,
-    Ranges,
-    Source,
-    Told,
-    agent_entries,
-    drive,
-    find_entry,
-    make_agent,
-    parse_spec,
-    script_agents,
-)
-from ethbrake_marl.engine import Memory, Script, ask_script, begin_script
-from ethbrake_marl.evaluation import make_lineup
-from ethbrake_marl.physics import Bools, Floats, Packed
+from ethbrake_marl.agents.driving import drive, script_agents
+from ethbrake_marl.agents.protocol import Knowledge, Source
+from ethbrake_marl.agents.registry import agent_entries, find_entry, make_agent, parse_spec
+from ethbrake_marl.env.actions import action_to_command, command_to_action
+from ethbrake_marl.env.memory import Memory, ask_script, begin_script
+from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.extensions.certified.estimated import Ranges, Told
+from ethbrake_marl.extensions.certified.estimating_agents import Odometer
+from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
+from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.messages import CHANNEL, LINK, Messages, link_at, place_at, ring_at
-from ethbrake_marl.scenario.v2x import PRESETS
-from ethbrake_marl.shield import ShieldedDriver, parse_uncertainty
-from ethbrake_marl.shield.step_shield import Proposer, proposed_action, seen_columns
+from ethbrake_marl.physics.state import Bools, Floats
+from ethbrake_marl.scenario.channel import PRESETS
+from ethbrake_marl.shield.comparison import seen_columns
+from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shield.rollouts import Proposer, proposed_action
 from tests.fixtures.asked import Acts
 from tests.fixtures.policies import make_policy
 

@@ -5,12 +5,12 @@ import shutil
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import parse_spec, split_names, split_specs
+from ethbrake_marl.agents.registry import parse_spec, split_names, split_specs
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.learning import TrainingRecipe
-from ethbrake_marl.policies import shipped_policies
-from ethbrake_marl.studies.ablation import plan_ablation
-from ethbrake_marl.studies.learning_curves import LearningCurves
+from ethbrake_marl.extensions.cooperation.levels import plan_ablation
+from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
+from ethbrake_marl.policies.shipped import shipped_policies
+from ethbrake_marl.training.recipe import TrainingRecipe
 
 NAMES = (
     "lr=0.001,seed=1",

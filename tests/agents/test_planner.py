@@ -4,12 +4,16 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl import search
-from ethbrake_marl.agents import Searched, drive, make_agent, optimise_coupled, script_agents
-from ethbrake_marl.agents.planner import Planner
+from ethbrake_marl.agents.driving import drive, script_agents
+from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.env.harm import HARM_COUNTS
+from ethbrake_marl.env.profiles import profile_problem
 from ethbrake_marl.errors import PhysicsError
-from ethbrake_marl.harm import HARM_COUNTS
-from ethbrake_marl.search import profile_problem, refine
+from ethbrake_marl.extensions.search import refine as refine_module
+from ethbrake_marl.extensions.search.around import Searched
+from ethbrake_marl.extensions.search.planner import Planner
+from ethbrake_marl.extensions.search.refine import refine
 from tests.fixtures.asked import Asked
 
 SCENARIO = eb.load_scenario("paper-random")
@@ -111,6 +115,6 @@ def test_refine__is_a_function_of_the_world_and_the_seed(monkeypatch):
     def fail(*arguments):
         arguments[-1][4] = True
 
-    monkeypatch.setattr(search, "_refine_worlds", fail)
+    monkeypatch.setattr(refine_module, "_refine_worlds", fail)
     with pytest.raises(PhysicsError, match="world 4: its commands could not be played"):
         refine(problem, given, budget=5)

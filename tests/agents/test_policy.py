@@ -9,11 +9,12 @@ import stable_baselines3 as stable
 import torch
 
 import ethbrake_marl as eb
-from ethbrake_marl.actions import action_to_command
-from ethbrake_marl.agents import LearnedAgent, drive
-from ethbrake_marl.evaluation import policy_sha256
-from ethbrake_marl.observations import ObservationSpec, observe
-from ethbrake_marl.shield import ShieldedDriver
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.env.actions import action_to_command
+from ethbrake_marl.env.observations import ObservationSpec, observe
+from ethbrake_marl.evaluation.identity import policy_sha256
+from ethbrake_marl.shield.drivers import ShieldedDriver
 from tests.fixtures.asked import Asked
 
 SCENARIO = eb.load_scenario("paper-random")

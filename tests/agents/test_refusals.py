@@ -11,14 +11,17 @@ import torch
 from stable_baselines3 import PPO
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import make_agent, optimise_pairwise, register_agent
-from ethbrake_marl.agents.e_v2x_bm import pairwise_harm
-from ethbrake_marl.agents.planner import Searched
-from ethbrake_marl.agents.policy import LearnedAgent
-from ethbrake_marl.agents.registry import Knowledge, Team, drive
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
+from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.protocol import Knowledge, Team
+from ethbrake_marl.agents.registry import make_agent, register_agent
+from ethbrake_marl.env.observations import observe
+from ethbrake_marl.env.profiles import ProfileProblem, profile_problem
 from ethbrake_marl.errors import AgentFailed, AlreadyExists, UnknownName
-from ethbrake_marl.observations import observe
-from ethbrake_marl.search import ProfileProblem, best_templates, profile_problem, refine
+from ethbrake_marl.extensions.search.around import Searched
+from ethbrake_marl.extensions.search.refine import refine
+from ethbrake_marl.extensions.search.templates import best_templates
 from tests.fixtures.asked import Asked
 from tests.refused import refused
 

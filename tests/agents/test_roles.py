@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import Episodes, Team, agent_names, registry, script_agents
+from ethbrake_marl.agents import registry
+from ethbrake_marl.agents.driving import Episodes, script_agents
+from ethbrake_marl.agents.protocol import Team
+from ethbrake_marl.agents.registry import agent_names
 from ethbrake_marl.errors import InvalidInput
 from tests.fixtures.policies import make_policy
 

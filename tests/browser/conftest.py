@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.pages.page import Part
-from ethbrake_marl.pages.report import Report
+from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.extensions.report.page import Part
+from ethbrake_marl.extensions.report.report import Report
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 AGENTS = ("full_brake", "e_v2x_bm", "constant:3+step", "ppo@shipped")

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.pages.report import TRAINED_POLICY, Report
-from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.reproduction import Reproduction
+from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.extensions.report.report import Report
+from ethbrake_marl.extensions.report.shown_worlds import TRAINED_POLICY
+from ethbrake_marl.extensions.reproduction.folder import Reproduction
+from ethbrake_marl.scenario.catalogue import load_scenario
 from tests.browser.conftest import AGENTS, PAPER, wait_until
 from tests.pages.hostile import HOSTILE
 from tests.pages.test_report import whole_page

@@ -11,7 +11,7 @@ import yaml
 from filelock import FileLock
 
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.scenario import new_scenario_text
+from ethbrake_marl.scenario.catalogue import new_scenario_text
 from tests.fixtures.pictures import draw_nothing
 
 TINY_RECIPE = {

@@ -25,8 +25,8 @@ from ethbrake_marl.cli import app as frame
 from ethbrake_marl.cli.app import add_command, app, run_command, whole_command
 from ethbrake_marl.cli.command import Out
 from ethbrake_marl.errors import AlreadyExists
-from ethbrake_marl.evaluation import EPISODES, LIST_SEED
-from ethbrake_marl.physics.compiling import compiled
+from ethbrake_marl.evaluation.identity import EPISODES, LIST_SEED
+from ethbrake_marl.physics.jit import compiled
 from tests.cli.conftest import Command, check_refused, told_json
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -110,8 +110,8 @@ def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, 
     folder = tmp_path / ("ethbrake_marl-x" if temporary else "kept")
     folder.mkdir()
     monkeypatch.setattr("ethbrake_marl.kernel_store.cache_folder", lambda: folder)
-    monkeypatch.setattr("ethbrake_marl.physics.compiling.cache_folder", lambda: folder)
-    monkeypatch.setattr("ethbrake_marl.physics.compiling._loaded", loaded)
+    monkeypatch.setattr("ethbrake_marl.physics.jit.cache_folder", lambda: folder)
+    monkeypatch.setattr("ethbrake_marl.physics.jit._loaded", loaded)
     monkeypatch.setattr("ethbrake_marl.kernel_store._tellers", [])
     monkeypatch.setitem(event._registered, "numba:compile", [])  # nobody listens any more after this test
     monkeypatch.setattr("warnings.showwarning", None)
@@ -154,11 +154,11 @@ def test_a_command_of_a_program__prints_where_it_likes(ethbrake: Command, monkey
 
 
 def test_defect_of_the_program__keeps_its_traceback_and_missing_memory_is_one_line(ethbrake, monkeypatch) -> None:
-    monkeypatch.setattr("ethbrake_marl.scenario.list_scenarios", Mock(side_effect=RuntimeError("a defect")))
+    monkeypatch.setattr("ethbrake_marl.scenario.catalogue.list_scenarios", Mock(side_effect=RuntimeError("a defect")))
     with pytest.raises(RuntimeError, match="a defect"):
         ethbrake("scenario", "list")
     short = Mock(side_effect=MemoryError("Unable to allocate 9 TiB"))
-    monkeypatch.setattr("ethbrake_marl.evaluation.evaluate_held", short)
+    monkeypatch.setattr("ethbrake_marl.evaluation.chunks.evaluate_held", short)
     check_refused(ethbrake("evaluate"), "not enough memory (Unable to allocate 9 TiB)", "fewer worlds")
 
 

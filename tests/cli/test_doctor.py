@@ -12,14 +12,15 @@ import numpy as np
 import pytest
 from packaging.requirements import Requirement
 
-from ethbrake_marl import physics, scenario
-from ethbrake_marl.agents import e_v2x_bm
+from ethbrake_marl.agents.e_v2x_bm import coupled, pairwise
 from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.doctor import Check, diagnose
-from ethbrake_marl.envs import make_engine
+from ethbrake_marl.env.making import make_engine
+from ethbrake_marl.extensions.studies.machine import this_machine
 from ethbrake_marl.kernel_store import cache_folder
-from ethbrake_marl.physics import advance
-from ethbrake_marl.studies.machine import this_machine
+from ethbrake_marl.physics import advance as advance_module
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.scenario import catalogue
 from tests.cli.conftest import Command, told_json
 from tests.docs.site import load
 
@@ -63,7 +64,7 @@ def test_dependencies__too_old_missing_and_untested_ones_are_told(monkeypatch) -
 
 
 def test_checks__other_physics_another_optimum_and_a_damaged_folder_are_findings(monkeypatch) -> None:
-    exact, optimum = physics.advance, e_v2x_bm.optimise_pairwise
+    exact, optimum = advance_module.advance, pairwise.optimise_pairwise
 
     def doubled(*args, **kwargs):
         worlds, impacts = exact(*args, **kwargs)
@@ -73,12 +74,12 @@ def test_checks__other_physics_another_optimum_and_a_damaged_folder_are_findings
         best = optimum(worlds, vehicle)
         return best._replace(deceleration_mps2=best.deceleration_mps2 + 1e-4)
 
-    monkeypatch.setattr(e_v2x_bm, "optimise_pairwise", shifted)
+    monkeypatch.setattr(coupled, "optimise_pairwise", shifted)
     assert not found("baseline")[0]
-    monkeypatch.setattr(physics, "advance", doubled)
+    monkeypatch.setattr(advance_module, "advance", doubled)
     ok, told = found("physics")
     assert not ok and "harm 40 (exact: 20)" in told
-    monkeypatch.setattr(scenario, "list_scenarios", Mock(side_effect=OSError("gone")))
+    monkeypatch.setattr(catalogue, "list_scenarios", Mock(side_effect=OSError("gone")))
     assert found("scenarios") == (False, "OSError: gone")
 
 

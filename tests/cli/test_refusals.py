@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ethbrake_marl.scenario import new_scenario_text
+from ethbrake_marl.scenario.catalogue import new_scenario_text
 from tests.cli.conftest import Command, check_refused
 from tests.cli.test_printed import STORIES
 

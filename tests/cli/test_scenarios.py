@@ -11,14 +11,14 @@ from unittest.mock import Mock
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import planner
 from ethbrake_marl.cli import scenario as module
-from ethbrake_marl.evaluation.inputs import load_runnable
-from ethbrake_marl.files.yaml import flow_text
-from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
-from ethbrake_marl.limits import limits
-from ethbrake_marl.scenario import QUANTITY, Scenario, list_scenarios, load_scenario, parse_yaml
-from ethbrake_marl.search import search_profiles
+from ethbrake_marl.evaluation.named_worlds import load_runnable
+from ethbrake_marl.extensions.search.problem import search_profiles
+from ethbrake_marl.files.yaml import flow_text, parse_yaml
+from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
+from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
 from tests.cli.conftest import Answer, Command, check_refused, rows_of, told_json
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -20,11 +20,12 @@ import yaml
 import ethbrake_marl as eb
 from ethbrake_marl.cli.command import Out
 from ethbrake_marl.errors import InvalidInput, Progress
-from ethbrake_marl.evaluation.inputs import make_lineup, scenario_sha256, worlds_sha256
-from ethbrake_marl.figures import learning_curve
-from ethbrake_marl.studies import experiment
-from ethbrake_marl.studies.experiment import telling_world, write_figures
-from ethbrake_marl.studies.learning_curves import LearningCurves
+from ethbrake_marl.evaluation.identity import scenario_sha256, worlds_sha256
+from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.extensions.report import experiment
+from ethbrake_marl.extensions.report.experiment import telling_world, write_figures
+from ethbrake_marl.extensions.reproduction.figures import learning_curve
+from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
 from tests.cli.conftest import TINY_RECIPE, Command, check_refused, rows_of, told_json
 
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "trained policy", "hybrid"]
@@ -176,7 +177,7 @@ def test_run__interrupted_twice_stops_at_once_and_keeps_the_policy(ethbrake, tin
 
 def test_run__failed_says_so_in_its_status(ethbrake, tiny_recipe, tmp_path, monkeypatch) -> None:
     broken = Mock(side_effect=RuntimeError("no space left"))
-    monkeypatch.setattr("ethbrake_marl.studies.experiment.write_results", broken)
+    monkeypatch.setattr("ethbrake_marl.extensions.report.experiment.write_results", broken)
     with pytest.raises(RuntimeError, match="no space left"):
         ethbrake("run", "--recipe", tiny_recipe, "--episodes", "20", "--output", tmp_path / "failed")
     status, stage, reason = status_of(tmp_path / "failed", "status", "stage", "reason")

@@ -15,16 +15,19 @@ from scipy.stats import ttest_ind
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents import registry
-from ethbrake_marl.agents.registry import Entry, Team, make_agent
+from ethbrake_marl.agents.protocol import Team
+from ethbrake_marl.agents.registry import Entry, make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.inputs import NamedWorlds, check_agents, make_lineup
-from ethbrake_marl.evaluation.results import compare_results, read_result, write_per_world
+from ethbrake_marl.evaluation.comparison import compare_results
+from ethbrake_marl.evaluation.named_worlds import NamedWorlds, check_agents, make_lineup
+from ethbrake_marl.evaluation.per_world import read_result, write_per_world
 from ethbrake_marl.evaluation.statistics import mean, paired_difference, unpaired_difference
 from ethbrake_marl.files import python_file
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.policies import shipped_policies
-from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.policies.shipped import shipped_policies
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
 from tests.cli.conftest import Command, check_refused, rows_of, told_json
 from tests.failing_worlds import plant
 
@@ -94,7 +97,7 @@ def test_evaluate__a_damaged_bundle_is_refused_by_file_whatever_is_around_it(eth
 
 
 def test_evaluate__one_agent_that_cannot_drive_is_refused_before_another_works(ethbrake, monkeypatch) -> None:
-    monkeypatch.setattr("ethbrake_marl.evaluation.evaluate_held", lambda *args, **kwargs: pytest.fail("worked"))
+    monkeypatch.setattr("ethbrake_marl.evaluation.chunks.evaluate_held", lambda *args, **kwargs: pytest.fail("worked"))
     refused = ethbrake("evaluate", "--agents", "e_v2x_bm,constant:99", "--episodes", "5")
     check_refused(refused, "agent 'constant:99': above the braking capacity 7 m/s2")
 
@@ -149,7 +152,7 @@ def test_evaluate__by_force_leaves_no_file_of_earlier_results(ethbrake: Command,
 def test_evaluate__a_list_that_is_not_held_tells_what_needs_no_proof(ethbrake: Command, monkeypatch) -> None:
     line = ("evaluate", "--agents", "full_brake,coast", "--episodes", "600", "--json")
     held = told_json(ethbrake(*line))
-    monkeypatch.setattr("ethbrake_marl.evaluation.inputs.HELD", 500)
+    monkeypatch.setattr("ethbrake_marl.evaluation.identity.HELD", 500)
     flat = told_json(ethbrake(*line))
     for one, other in zip(flat, held, strict=True):
         assert one["parameters"]["no_limits_because"]

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.interfaces import EthBrakeEnv, EthBrakeParallelEnv, EthBrakeVectorEnv, InTurns
+from ethbrake_marl.env.gymnasium import EthBrakeEnv
+from ethbrake_marl.env.pettingzoo import EthBrakeParallelEnv, InTurns
+from ethbrake_marl.env.vector import EthBrakeVectorEnv
 
 Array = NDArray[Any]
 Wrap = Callable[[Any], Any]

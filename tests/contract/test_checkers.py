@@ -15,8 +15,10 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.drawing import HEIGHT, WIDTH, Viewer
-from ethbrake_marl.envs.interfaces import EthBrakeEnv, env, parallel_env
+from ethbrake_marl.env.gymnasium import EthBrakeEnv
+from ethbrake_marl.env.motion import Viewer
+from ethbrake_marl.env.pettingzoo import env, parallel_env
+from ethbrake_marl.env.rendering import HEIGHT, WIDTH
 from tests.contract.interfaces import FIVE, LEVELS, PAPER, REST, SCENARIOS, line
 
 pytestmark = pytest.mark.filterwarnings(

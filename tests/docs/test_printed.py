@@ -13,10 +13,10 @@ import pytest
 import yaml
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.e_v2x_bm import optimise_pairwise, pairwise_harm
+from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.policies import shipped_policies
-from ethbrake_marl.scenario import list_scenarios, load_scenario, new_scenario_text
+from ethbrake_marl.policies.shipped import shipped_policies
+from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario, new_scenario_text
 from tests.docs.printed import (
     BLOCKS,
     EXACT,

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.engine import Engine, Moment
-from ethbrake_marl.envs.interfaces import make_engine
+from ethbrake_marl.env.engine import Engine, Moment
+from ethbrake_marl.env.harm import HARM_COUNTS
+from ethbrake_marl.env.making import make_engine
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import HARM_COUNTS
-from ethbrake_marl.learning import algorithms
-from ethbrake_marl.learning.algorithms import Offsets, play_to_the_end
+from ethbrake_marl.extensions.learners import branches
+from ethbrake_marl.extensions.learners.branches import Offsets, play_to_the_end
 from tests.physics.random_worlds import line
 
 PAPER = eb.load_scenario("paper-random").replace(early_impacts="keep")
@@ -451,7 +451,7 @@ def test_branch__ends_where_nothing_can_change_any_more(monkeypatch: pytest.Monk
         return np.array(found), new.steps.copy()
 
     early, some = pressed()
-    monkeypatch.setattr(algorithms, "_stands_for_good", lambda engine, before, rows: np.zeros(len(rows), bool))
+    monkeypatch.setattr(branches, "_stands_for_good", lambda engine, before, rows: np.zeros(len(rows), bool))
     whole, every = pressed()
     assert np.array_equal(early, whole)
     assert every.max() == 75 and some.max() < 75 and (some <= every).all()

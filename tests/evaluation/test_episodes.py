@@ -16,27 +16,23 @@ from gymnasium.envs.registration import EnvSpec
 from PIL import Image, ImageSequence
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import Team, drive, make_agent
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.protocol import Team
+from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.env.rewards import reward_params
 from ethbrake_marl.errors import PhysicsError
-from ethbrake_marl.evaluation import Evaluation, episodes, record_episode
-from ethbrake_marl.evaluation.episodes import (
-    KEY,
-    EpisodeMotion,
-    Recording,
-    Task,
-    decision_columns,
-    env_spec,
-    film_bytes,
-    film_scenes,
-    follow_episodes,
-    record_episodes,
-    state_at,
-)
-from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.physics import Floats
-from ethbrake_marl.rewards import reward_params
-from ethbrake_marl.shield import ShieldedDriver
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.motion import EpisodeMotion, follow_episodes, state_at
+from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.record import record_episode
+from ethbrake_marl.extensions.datasets import minari as minari_module, recording
+from ethbrake_marl.extensions.datasets.minari import env_spec
+from ethbrake_marl.extensions.datasets.parquet import KEY, decision_columns
+from ethbrake_marl.extensions.datasets.recording import Recording, Task, record_episodes
+from ethbrake_marl.extensions.report.film import film_bytes, film_scenes
+from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.shield.drivers import ShieldedDriver
 from tests.contract.interfaces import CRASH, FIVE, PAPER
 
 IMPACT_S = 0.5 + 0.25 / 3.0  # see PAIR
@@ -344,7 +340,7 @@ def test_file__has_the_columns_in_row_groups_and_tells_what_they_are(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
-    monkeypatch.setattr(episodes, "BATCH", 3)
+    monkeypatch.setattr(minari_module, "BATCH", 3)
     path = tmp_path / "a.parquet"
     path.write_text("stale")
     agents = {**BRAKING, "coast": eb.make_agent("coast")}
@@ -366,7 +362,7 @@ def test_file__has_the_columns_in_row_groups_and_tells_what_they_are(
 
 def test_file__appears_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pyarrow")
-    monkeypatch.setattr(episodes, "BATCH", 3)
+    monkeypatch.setattr(minari_module, "BATCH", 3)
     stop = Mock(side_effect=KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):
         eb.write_dataset(tmp_path / "a.parquet", BRAKING, scenario=PAPER, episodes=5, on_progress=stop)
@@ -427,7 +423,7 @@ def test_folder__is_replaced_when_asked_and_only_then(tmp_path: Path) -> None:
 
 
 def test_work__leaves_a_failed_world_out_and_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real: Callable[..., Recording] = episodes.record_episodes
+    real: Callable[..., Recording] = recording.record_episodes
 
     def failing(sample: Any, *rest: Any) -> Recording:
         if bad := {row: "planted" for row, number in enumerate(sample.index) if number == 4}:
@@ -437,7 +433,7 @@ def test_work__leaves_a_failed_world_out_and_names_it(tmp_path: Path, monkeypatc
     recorded, seen = Mock(), Mock()
     for name, planted in (("need", Mock()), ("record_episodes", failing), ("BATCH", 3)):
         monkeypatch.setattr(episodes, name, planted)
-    monkeypatch.setattr(episodes, "parquet_dataset", lambda path, told: nullcontext(recorded))
+    monkeypatch.setattr(minari_module, "parquet_dataset", lambda path, told: nullcontext(recorded))
     work = eb.write_dataset(tmp_path / "some.parquet", BRAKING, scenario=PAPER, episodes=7, on_progress=seen)
     assert [call.args[0].index.tolist() for call in recorded.call_args_list] == [[0, 1, 2], [3, 5], [6]]
     assert [call.args for call in seen.call_args_list] == [("full_brake", 3), ("full_brake", 6), ("full_brake", 7)]

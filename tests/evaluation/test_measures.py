@@ -16,42 +16,29 @@ import pytest
 from rich.console import Console
 
 import ethbrake_marl as eb
+from ethbrake_marl.env.harm import HARM_COUNTS, Ledger, injury_probability
+from ethbrake_marl.env.objectives import STANDARD, declared_objectives, parse_objective, scored
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation import (
-    Evaluation,
-    Outcome,
-    SummaryTable,
-    evaluate,
-    load_measures,
-    summarise,
-    write_per_world,
-)
-from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.evaluation.measures import (
-    KNOWN_OF_WORLDS,
-    PAPER_ROWS,
-    Between,
-    Exploits,
-    IncompleteTable,
-    is_papers_test,
-)
-from ethbrake_marl.evaluation.results import read_harms
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.exploits import Exploits
+from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.outcome import IncompleteTable, Outcome
+from ethbrake_marl.evaluation.own_measures import load_measures
+from ethbrake_marl.evaluation.per_world import read_harms, write_per_world
+from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.evaluation.summary import SummaryTable, summarise
+from ethbrake_marl.extensions.report.experiment import results_csv
+from ethbrake_marl.extensions.report.report import Report
+from ethbrake_marl.extensions.reproduction.tests import PAPER_ROWS, is_papers_test
+from ethbrake_marl.extensions.search import shipped
+from ethbrake_marl.extensions.search.regret import KNOWN_OF_WORLDS, Between
+from ethbrake_marl.extensions.search.shipped import Unproven, known_limits, shipped_tables, unproven_because
+from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.harm import (
-    HARM_COUNTS,
-    STANDARD,
-    Ledger,
-    declared_objectives,
-    injury_probability,
-    parse_objective,
-    scored,
-)
-from ethbrake_marl.limits import limits as limits_module
-from ethbrake_marl.limits.limits import BestHarmTable, Unproven, known_limits, shipped_tables, unproven_because
-from ethbrake_marl.pages.report import Report
-from ethbrake_marl.physics.batch import Impacts
-from ethbrake_marl.scenario import Scenario, Task, list_scenarios, load_scenario
-from ethbrake_marl.studies.experiment import results_csv
+from ethbrake_marl.physics.left_out import Impacts
+from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.task import Task
 from tests.contract.interfaces import CRASH
 from tests.docs.site import load
 
@@ -423,7 +410,7 @@ def test_frame__is_made_by_the_library_that_is_there(
 ) -> None:
     planted = SimpleNamespace(DataFrame=lambda columns: (library, columns))
     monkeypatch.setitem(sys.modules, str(library), planted)
-    monkeypatch.setattr("ethbrake_marl.evaluation.measures.find_spec", lambda name: name == library or None)
+    monkeypatch.setattr("ethbrake_marl.evaluation.evaluation.find_spec", lambda name: name == library or None)
     found = evaluation.to_frame()
     made, columns = found if library else (None, found)  # without any, a mapping of columns
     assert made == library and isinstance(columns, dict) and len(columns["agent"]) == 600
@@ -497,8 +484,8 @@ def four(evaluation: Evaluation, monkeypatch: pytest.MonkeyPatch) -> Evaluation:
     def best(worlds: eb.Worlds, task: Task) -> dict[str, np.ndarray]:
         return {count: harm[: worlds.n] for count, harm in TABLE.items()}
 
-    monkeypatch.setattr(limits_module, "lower_bound", bound)
-    monkeypatch.setattr(limits_module, "best_known", best)
+    monkeypatch.setattr(shipped, "lower_bound", bound)
+    monkeypatch.setattr(shipped, "best_known", best)
     return first_worlds(evaluation, 4, full_brake=FULL, a=AGENT)
 
 

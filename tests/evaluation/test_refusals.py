@@ -12,31 +12,22 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import AlreadyExists, UnknownName
-from ethbrake_marl.evaluation import episodes, evaluate, summarise
-from ethbrake_marl.evaluation.curves import deceleration_curve
-from ethbrake_marl.evaluation.episodes import film_bytes, film_scenes
-from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.evaluation.results import compare_results, read_harms, read_result
-from ethbrake_marl.evaluation.statistics import (
-    exact_sum,
-    interquartile_mean,
-    mean,
-    mean_over_seeds,
-    paired_difference,
-    rate,
-    share_over_seeds,
-)
-from ethbrake_marl.figures import (
-    SeedCurve,
-    harm_against_total_gap,
-    harm_by_agent,
-    learning_curve,
-    picture_ending,
-    seed_curves,
-    trajectories,
-)
-from ethbrake_marl.physics import advance
-from ethbrake_marl.scenario import Task
+from ethbrake_marl.evaluation.comparison import compare_results
+from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.per_world import read_harms, read_result
+from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.evaluation.seeds import interquartile_mean, mean_over_seeds, share_over_seeds
+from ethbrake_marl.evaluation.statistics import exact_sum, mean, paired_difference, rate
+from ethbrake_marl.evaluation.summary import summarise
+from ethbrake_marl.extensions.report.deceleration_curve import deceleration_curve
+from ethbrake_marl.extensions.report.film import film_bytes, film_scenes
+from ethbrake_marl.extensions.report.harm_figures import harm_by_agent
+from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
+from ethbrake_marl.extensions.report.style import picture_ending
+from ethbrake_marl.extensions.report.trajectories import trajectories
+from ethbrake_marl.extensions.reproduction.figures import harm_against_total_gap, learning_curve
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.scenario.task import Task
 from tests.contract.interfaces import CRASH
 from tests.docs.site import DOCS, load
 from tests.refused import refused

@@ -20,24 +20,30 @@ from ethbrake_marl import registry
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput, PhysicsError, Unfamiliar
 from ethbrake_marl.evaluation import (
-    Evaluation,
-    Outcome,
     chunks,
-    evaluate,
-    inputs,
-    record_episode,
-    summarise,
-    write_per_world,
-)  # fmt: skip
+    identity,  # fmt: skip
+)
 from ethbrake_marl.evaluation.chunks import Lineup, evaluate_held, summarise_tally, tally_list
-from ethbrake_marl.evaluation.inputs import make_agents, make_lineup, policy_sha256, scenario_sha256, worlds_sha256
-from ethbrake_marl.evaluation.measures import FAR_M, MEASURES, REGISTERED, Tally, measures
-from ethbrake_marl.evaluation.rollout import ShovedFront, chunks_of, drive_chunk
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.exploits import FAR_M
+from ethbrake_marl.evaluation.identity import policy_sha256, scenario_sha256, worlds_sha256
+from ethbrake_marl.evaluation.measures import measures
+from ethbrake_marl.evaluation.named_worlds import make_agents, make_lineup
+from ethbrake_marl.evaluation.outcome import Outcome
+from ethbrake_marl.evaluation.own_measures import MEASURES, REGISTERED
+from ethbrake_marl.evaluation.per_world import write_per_world
+from ethbrake_marl.evaluation.record import record_episode
+from ethbrake_marl.evaluation.rollout import ShovedFront, chunks_of, drive_chunk, evaluate
+from ethbrake_marl.evaluation.summary import summarise
+from ethbrake_marl.evaluation.tally import Tally
+from ethbrake_marl.extensions.report.report import Report
+from ethbrake_marl.extensions.search.shipped import Limits
 from ethbrake_marl.files import python_file
-from ethbrake_marl.limits import Limits
-from ethbrake_marl.pages.report import Report
-from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, advance_sampled
-from ethbrake_marl.scenario import Scenario, Task, load_scenario
+from ethbrake_marl.physics.paper_map import advance_sampled
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.task import Task
 from tests.failing_worlds import planted_list, without
 
 BRAKE = {"full_brake": eb.make_agent("full_brake")}
@@ -275,7 +281,7 @@ def test_worlds_sha256__tells_every_bit_and_not_how_it_lies_in_memory(monkeypatc
     ]
     assert len({own, *(worlds_sha256(*each) for each in others)}) == 6
     copied = worlds.take(np.arange(60))  # the news of a world is a view there, an array of its own here
-    monkeypatch.setattr("ethbrake_marl.evaluation.inputs._BLOCK", 7)
+    monkeypatch.setattr("ethbrake_marl.evaluation.identity._BLOCK", 7)
     assert worlds_sha256(replace(copied, gaps_m=np.asfortranarray(copied.gaps_m)), index) == own
 
 
@@ -452,7 +458,7 @@ def test_worker__needs_the_packages_and_files_of_the_process_that_asks_and_no_ot
 def test_figures__of_a_list_that_is_not_held_are_those_of_evaluate(lineup, paper_random, monkeypatch) -> None:
     """Those that need no proof; ``HELD`` is lowered for the hash of the list."""
     tally = tally_list(lineup, LISTED, 11, objectives=("own",))
-    monkeypatch.setattr(inputs, "HELD", LISTED - 1)
+    monkeypatch.setattr(identity, "HELD", LISTED - 1)
     evaluation = evaluate(paper_random.sample(LISTED, 11), lineup.make(), scenario=paper_random, seed=11, chunk=777)
     for one, other in zip(summarise_tally(lineup, tally, 11), summarise(evaluation), strict=True):
         for measure in measures(()):

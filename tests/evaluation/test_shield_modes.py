@@ -5,15 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.registry import Team, drive, make_agent
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.protocol import Team
+from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.evaluation.shield_modes import ShieldModes, compare_modes
 from ethbrake_marl.evaluation.statistics import mean, paired_difference
-from ethbrake_marl.pages import page
-from ethbrake_marl.pages.report import shield_section
-from ethbrake_marl.scenario import Task, load_scenario
-from ethbrake_marl.shield import HybridAgent, ShieldedDriver
+from ethbrake_marl.extensions.report import page
+from ethbrake_marl.extensions.report.report import shield_section
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.shield.drivers import ShieldedDriver
 from ethbrake_marl.shield.evidence import review
+from ethbrake_marl.shield.paper_hybrid import HybridAgent
 from tests.failing_worlds import plant, without
 from tests.pages.hostile import Page
 

@@ -14,15 +14,16 @@ import yaml
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import app, run_command
+from ethbrake_marl.env.objectives import declared_objectives
+from ethbrake_marl.env.observations import observe
+from ethbrake_marl.env.rewards import TERMS, StepOutcome
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.measures import REGISTERED
+from ethbrake_marl.evaluation.own_measures import REGISTERED
 from ethbrake_marl.evaluation.statistics import mean, rate
-from ethbrake_marl.harm import declared_objectives
-from ethbrake_marl.observations import observe
-from ethbrake_marl.pages.report import Report
-from ethbrake_marl.rewards import TERMS, StepOutcome
-from ethbrake_marl.scenario import new_scenario_text, scenario_json_schema
-from ethbrake_marl.scenario.v2x import CHANNELS
+from ethbrake_marl.extensions.report.report import Report
+from ethbrake_marl.scenario.catalogue import new_scenario_text
+from ethbrake_marl.scenario.channel import CHANNELS
+from ethbrake_marl.scenario.schema import scenario_json_schema
 from tests.contract.interfaces import BARE
 from tests.learning.tiny import TINY_PPO
 
@@ -339,7 +340,7 @@ def test_measure__one_function_and_it_stands_in_every_output(
     told("--episodes", "40", "--output", "other", "--per-world", "parquet")
     table = pyarrow.parquet.read_table("other/worlds.parquet")
     assert [table[name].to_pylist()[:40] for name in names] == [change.tolist(), hit.tolist()]
-    monkeypatch.setattr("ethbrake_marl.evaluation.inputs.HELD", 30)
+    monkeypatch.setattr("ethbrake_marl.evaluation.identity.HELD", 30)
     flat = json.loads(told("--episodes", "40", "--json"))
     assert [flat[0][name] for name in names] == [results[name] for name in names]
 

@@ -8,31 +8,26 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation import EpisodeRecord, Evaluation, curves as module, evaluate, record_episode, summarise
-from ethbrake_marl.evaluation.curves import deceleration_curve
+from ethbrake_marl.env.rendering import BODY_M, COLOURS
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
+from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import mean
-from ethbrake_marl.figures import (
-    BODY_M,
-    COLOURS,
-    SeedCurve,
-    ShownFigure,
-    deceleration_figure,
-    harm_against_total_gap,
-    harm_by_agent,
-    harm_in_parts,
-    label_text,
-    learning_curve,
-    new_figure,
-    picture_bytes,
-    regret_distribution,
-    seed_curves,
-    series_style,
-    signed_ticks,
-    trajectories,
-    worlds_figure,
-)
-from ethbrake_marl.limits.limits import Limits, Proof
-from ethbrake_marl.scenario import Scenario, Task, load_scenario
+from ethbrake_marl.evaluation.summary import summarise
+from ethbrake_marl.extensions.cooperation.figures import signed_ticks
+from ethbrake_marl.extensions.report import deceleration_curve as module
+from ethbrake_marl.extensions.report.deceleration_curve import deceleration_curve
+from ethbrake_marl.extensions.report.deceleration_figure import deceleration_figure
+from ethbrake_marl.extensions.report.harm_figures import harm_by_agent, harm_in_parts, regret_distribution
+from ethbrake_marl.extensions.report.scenario_figures import worlds_figure
+from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
+from ethbrake_marl.extensions.report.style import ShownFigure, label_text, new_figure, picture_bytes, series_style
+from ethbrake_marl.extensions.report.trajectories import trajectories
+from ethbrake_marl.extensions.reproduction.figures import harm_against_total_gap, learning_curve
+from ethbrake_marl.extensions.search.shipped import Limits, Proof
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.task import Task
 from tests.physics.random_worlds import line
 
 BRAKE = {"full_brake": eb.make_agent("full_brake")}

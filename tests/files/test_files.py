@@ -12,7 +12,7 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.store import read_plain, write_output
 from ethbrake_marl.files.yaml import DEPTH_LIMIT, SIZE_LIMIT, flow_text, parse_yaml
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario.schema import Scenario
 
 
 def test_plain_file__is_read_up_to_the_limit(tmp_path: Path) -> None:

@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.evaluation.inputs import worlds_sha256
-from ethbrake_marl.harm import empty_ledger
-from ethbrake_marl.physics import Floats, advance
-from ethbrake_marl.scenario import list_scenarios, load_scenario
-from ethbrake_marl.shield import StepShield, parse_uncertainty
+from ethbrake_marl.env.harm import empty_ledger
+from ethbrake_marl.evaluation.identity import worlds_sha256
+from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
+from ethbrake_marl.shield.step import StepShield
 from tests.physics.random_worlds import Draws, driving_lines
 from tests.shield.attacks import line
 

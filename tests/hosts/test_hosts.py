@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.physics import Impacts, advance_sampled
-from ethbrake_marl.shield import ShieldedDriver, StepShield
+from ethbrake_marl.physics.left_out import Impacts
+from ethbrake_marl.physics.paper_map import advance_sampled
+from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shield.step import StepShield
 from tests.docs.site import DOCS
 
 PAPER = eb.load_scenario("paper-random")

@@ -21,36 +21,38 @@ from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.sac.policies import SACPolicy
 
 import ethbrake_marl as eb
+from ethbrake_marl.env.objectives import scored
+from ethbrake_marl.env.profiles import profile_problem
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import scored
-from ethbrake_marl.learning import Training, TrainingRecipe, load_recipe, resume, train
-from ethbrake_marl.learning.algorithms import (
+from ethbrake_marl.extensions.learners.actors import (
     Adam,
-    CounterfactualModel,
-    NoOtherMode,
-    Scout,
-    Shown,
     Tried,
-    choose_rows,
-    draw_rows,
-    drive_from,
-    explore,
     limit_that_cuts,
-    own_worlds,
-    ppo_arguments,
-    sac_arguments,
-    show_templates,
     smallest_offset,
-    stages_of,
-    tensors_of,
     trusted_targets,
-    visit,
     widened,
 )
-from ethbrake_marl.learning.runs import TrainingDiverged, make_environment, make_model
-from ethbrake_marl.learning.training import ModesPlan
-from ethbrake_marl.policies import Actor, load_policy
-from ethbrake_marl.search import best_templates, profile_problem
+from ethbrake_marl.extensions.learners.branches import visit
+from ethbrake_marl.extensions.learners.explored import (
+    NoOtherMode,
+    Shown,
+    drive_from,
+    explore,
+    own_worlds,
+    show_templates,
+)
+from ethbrake_marl.extensions.learners.recipes import ModesPlan
+from ethbrake_marl.extensions.learners.scout import Scout, choose_rows, draw_rows
+from ethbrake_marl.extensions.learners.stages import stages_of
+from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
+from ethbrake_marl.extensions.search.templates import best_templates
+from ethbrake_marl.policies.network import Actor, load_policy
+from ethbrake_marl.training.models import TrainingDiverged, make_environment, make_model
+from ethbrake_marl.training.networks import ppo_arguments, tensors_of
+from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.training.run_folder import Training
+from ethbrake_marl.training.sac import sac_arguments
+from ethbrake_marl.training.train import resume, train
 from tests.learning.tiny import (
     MODES,
     TINY_COUNTERFACTUAL,

@@ -8,22 +8,19 @@ from typing import Any
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import script_agents
+from ethbrake_marl.agents.driving import script_agents
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, UnknownName
-from ethbrake_marl.evaluation.inputs import load_runnable
+from ethbrake_marl.evaluation.named_worlds import load_runnable
+from ethbrake_marl.extensions.learners.actors import widened
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.files.store import hold_lock
-from ethbrake_marl.learning.algorithms import Ppo, widened
-from ethbrake_marl.learning.runs import resume, train
-from ethbrake_marl.learning.training import (
-    PpoRecipe,
-    RunDirectory,
-    Training,
-    load_recipe,
-    read_settings,
-    register_algorithm,
-)
-from ethbrake_marl.policies import load_policy
+from ethbrake_marl.policies.network import load_policy
+from ethbrake_marl.training.ppo import Ppo
+from ethbrake_marl.training.recipe import load_recipe, register_algorithm
+from ethbrake_marl.training.recipes import PpoRecipe
+from ethbrake_marl.training.run_folder import RunDirectory, Training
+from ethbrake_marl.training.settings import read_settings
+from ethbrake_marl.training.train import resume, train
 from tests.fixtures.policies import make_policy
 from tests.learning.test_algorithms import A2C, recipe_file
 from tests.learning.tiny import TINY_COUNTERFACTUAL, TINY_MODES, TINY_OPTIONS, TINY_PPO

@@ -23,23 +23,22 @@ from stable_baselines3.common.logger import Logger
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.train import run_folder
+from ethbrake_marl.env.objectives import objective_harm, objectives_of
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, Progress
-from ethbrake_marl.evaluation import evaluate, measures as outcomes, summarise
+from ethbrake_marl.evaluation import evaluation as evaluation_module
+from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.evaluation.summary import summarise
+from ethbrake_marl.extensions.search import shipped
 from ethbrake_marl.files.store import new_folder, write_file
-from ethbrake_marl.harm import objective_harm, objectives_of
-from ethbrake_marl.learning import RunDirectory, Training, TrainingRecipe, TrainResult, load_recipe, resume, runs
-from ethbrake_marl.learning.runs import (
-    ARRAYS,
-    NUMBERS,
-    Course,
-    TrainingDiverged,
-    TrainingState,
-    open_logs,
-    read_checkpoint,
-    write_checkpoint,
-)
-from ethbrake_marl.learning.training import LearningRate
-from ethbrake_marl.policies import Policy, Trained, dense, load_policy, read_trained
+from ethbrake_marl.policies.network import Policy, dense, load_policy
+from ethbrake_marl.policies.teams import Trained, read_trained
+from ethbrake_marl.training import models, progress as progress_module, random_state, train as train_module
+from ethbrake_marl.training.checkpoint import ARRAYS, NUMBERS, TrainingState, read_checkpoint, write_checkpoint
+from ethbrake_marl.training.models import TrainingDiverged, open_logs
+from ethbrake_marl.training.progress import Course
+from ethbrake_marl.training.recipe import LearningRate, TrainingRecipe, load_recipe
+from ethbrake_marl.training.run_folder import RunDirectory, Training
+from ethbrake_marl.training.train import TrainResult, resume
 from tests.docs.site import load
 from tests.learning.tiny import (
     MODES,
@@ -61,7 +60,7 @@ SCENARIO = eb.load_scenario("paper-random")
 UPDATE = 8 * 16  # decisions
 EVERY_SECOND = {"every_updates": 2, "worlds": 10, "seed": 7}
 TINY = TINY_PPO.replace(total_steps=3 * UPDATE, evaluation=EVERY_SECOND)
-train = partial(runs.train, measure=None)
+train = partial(train_module.train, measure=None)
 
 
 def status_of(run: Path) -> dict[str, Any]:
@@ -154,9 +153,9 @@ def test_train__stops_where_it_should_and_goes_on_to_the_same_bits(tmp_path: Pat
 def test_train__measures_what_an_evaluation_of_the_kept_policy_tells_and_proves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    prove = Mock(side_effect=outcomes.known_limits)
-    monkeypatch.setattr(outcomes, "known_limits", prove)
-    result = runs.train(TINY, SCENARIO, tmp_path / "run", steps=UPDATE, on_progress=None)
+    prove = Mock(side_effect=shipped.known_limits)
+    monkeypatch.setattr(evaluation_module, "known_limits", prove)
+    result = train_module.train(TINY, SCENARIO, tmp_path / "run", steps=UPDATE, on_progress=None)
     prove.assert_not_called()
     worlds = result.training.scenario.sample(TINY.evaluation.worlds, TINY.evaluation.seed)
     agents = {"policy": eb.LearnedAgent(result.last_policy, "policy")}
@@ -239,7 +238,7 @@ def test_train__shows_its_progress_on_stderr_and_on_a_terminal_in_one_line(
     terminal: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sys.stderr.isatty", lambda: terminal)
-    runs.train(TINY, "paper-random", tmp_path / "shown")
+    train_module.train(TINY, "paper-random", tmp_path / "shown")
     out, err = capsys.readouterr()
     lines = err.splitlines()
     assert out == "" and (err.count("\n") == 1) == (err.count("\r") > 1) == terminal and err.endswith("\n")
@@ -252,7 +251,7 @@ def test_train__keeps_and_tells_what_the_learners_objectives_make_of_the_harm(tm
     scenario = SCENARIO.with_learners(["vehicle_2", "vehicle_3"]).replace(objective=objectives)
     recipe = TINY.replace(total_steps=6 * 128, evaluation={"every_updates": 1, "worlds": 10, "seed": 7})
     said: list[str] = []
-    result = runs.train(recipe, scenario, tmp_path / "run", on_progress=lambda shown: said.append(shown.harm))
+    result = train_module.train(recipe, scenario, tmp_path / "run", on_progress=lambda shown: said.append(shown.harm))
     assert said[0] == f"objective by first impacts (own, {objectives[2]}) {result.evaluations[0]['objective']:.2f}"
     rows = [row for row in RunDirectory(tmp_path / "run").rows() if row["eval/objective"]]
     best = min(result.evaluations, key=lambda each: each["objective"])
@@ -262,7 +261,7 @@ def test_train__keeps_and_tells_what_the_learners_objectives_make_of_the_harm(tm
     harm = objective_harm(found.outcome("kept").ledger, "first", objectives_of(objectives, 3)).mean(axis=0)
     told = [best["objective_vehicle_2"], best["objective_vehicle_3"]]
     assert told == pytest.approx(harm[1:]) and best["objective"] == sum(told) / 2
-    assert "objective" not in runs.train(TINY, SCENARIO, tmp_path / "plain", steps=1).evaluations[0]
+    assert "objective" not in train_module.train(TINY, SCENARIO, tmp_path / "plain", steps=1).evaluations[0]
 
 
 @pytest.mark.parametrize(
@@ -278,9 +277,9 @@ def test_train__keeps_and_tells_what_the_learners_objectives_make_of_the_harm(tm
     ],
 )
 def test_progress__calls_harm_only_what_somebody_bears(objective: str, words: str) -> None:
-    assert runs.objective_in_words(Training.of(TINY, SCENARIO.replace(objective=objective))) == words
+    assert progress_module.objective_in_words(Training.of(TINY, SCENARIO.replace(objective=objective))) == words
     total = TINY.replace(reward=TINY.reward.model_copy(update={"harm_count": "total"}))
-    said = runs.objective_in_words(Training.of(total, SCENARIO.replace(objective=objective)))
+    said = progress_module.objective_in_words(Training.of(total, SCENARIO.replace(objective=objective)))
     assert said == words.replace("by first", "by all").replace("first-impact", "total")
 
 
@@ -290,7 +289,7 @@ GOAL = 1.10  # harm of the policy, in the least harm known
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_quick__ends_near_the_best_known_for_every_seed(seed: int, tmp_path: Path) -> None:
-    result = runs.train("quick", "paper-random", tmp_path / "run", seed=seed, on_progress=None)
+    result = train_module.train("quick", "paper-random", tmp_path / "run", seed=seed, on_progress=None)
     agents = {"last": eb.LearnedAgent(result.last_policy), "kept": eb.LearnedAgent(result.policy)}
     for row in summarise(evaluate(SCENARIO.sample(10_000, seed=7), agents, scenario=SCENARIO, aftermath=False)):
         assert row.first_impact_harm.value <= GOAL * row["best_known_first_impact_harm"].value
@@ -611,7 +610,7 @@ def test_resume__without_any_checkpoint_it_starts_again(whole: Whole, run: Path)
 def test_resume__with_other_versions_is_refused_unless_it_is_asked_for(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runs, "installed_versions", lambda: {"torch": "99.0"})
+    monkeypatch.setattr(train_module, "installed_versions", lambda: {"torch": "99.0"})
     with pytest.raises(InvalidInput, match=r"was trained with ethbrake-marl .*: the numbers would differ"):
         resume(run)
     assert json.loads((run / "run.json").read_text())["status"] == "interrupted"
@@ -721,13 +720,13 @@ def test_resume__a_forged_checkpoint_is_refused_in_one_line(run: Path, name: str
 
 def test_restore__a_forged_replay_memory_of_sac_is_refused() -> None:
     training = Training.of(*TRAININGS["sac"])
-    algorithm, environment = training.recipe.make_algorithm(), runs.make_environment(training)
-    with runs.own_random_state():
-        model = runs.make_model(algorithm, training, environment)
+    algorithm, environment = training.recipe.make_algorithm(), models.make_environment(training)
+    with random_state.own_random_state():
+        model = models.make_model(algorithm, training, environment)
         model._last_obs, model._last_episode_starts = environment.reset(), np.ones(environment.num_envs)
         model.set_logger(Logger(None, []))
-        numbers, arrays = runs.capture_model(model, algorithm)
-        restore = partial(runs.restore_model, model, algorithm)
+        numbers, arrays = random_state.capture_model(model, algorithm)
+        restore = partial(random_state.restore_model, model, algorithm)
         restore(TrainingState(numbers, arrays))
         for forged in ([-1, False], [1.5, False], [1 << 40, True], [0, 1]):
             with pytest.raises(ValueError, match=r"replay = .*: is no place in its memory"):

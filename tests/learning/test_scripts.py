@@ -65,7 +65,7 @@ def mappo() -> ModuleType:
 def test_line_env__keeps_torchrls_contract_and_shows_the_native_worlds() -> None:
     from torchrl.envs.utils import check_env_specs
 
-    from ethbrake_marl.learning.benchmarl import LineEnv
+    from ethbrake_marl.extensions.benchmarl.task import LineEnv
 
     check_env_specs(LineEnv(PAIR, 4, 0, RECIPE.reward))
     env = LineEnv(PAIR, 4, 5, RECIPE.reward)
@@ -96,7 +96,7 @@ def test_line_env__keeps_torchrls_contract_and_shows_the_native_worlds() -> None
 def test_line_env__behind_a_shield_keeps_the_bound_of_every_alert() -> None:
     from torchrl.envs.utils import check_env_specs
 
-    from ethbrake_marl.learning.benchmarl import LineEnv, LineTask
+    from ethbrake_marl.extensions.benchmarl.task import LineEnv, LineTask
 
     check_env_specs(LineEnv(PAIR, 4, 0, RECIPE.reward, shield="step"))
     config = {"scenario": PAIR, "reward": "harm", "horizon_is_end": True}

@@ -11,9 +11,13 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.files.yaml import parse_yaml, read_yaml
-from ethbrake_marl.learning import RunDirectory, Training, TrainingRecipe, algorithm_names, load_recipe, train
-from ethbrake_marl.learning.runs import make_model
-from ethbrake_marl.policies import NetworkSpec, PolicyTeam, load_policy
+from ethbrake_marl.policies.manifest import NetworkSpec
+from ethbrake_marl.policies.network import load_policy
+from ethbrake_marl.policies.teams import PolicyTeam
+from ethbrake_marl.training.models import make_model
+from ethbrake_marl.training.recipe import TrainingRecipe, algorithm_names, load_recipe
+from ethbrake_marl.training.run_folder import RunDirectory, Training
+from ethbrake_marl.training.train import train
 from tests.learning.tiny import TINY_PPO, Answer, files_of, harm_beside_full_braking, marked, watch_steps
 
 PAIR = eb.load_scenario("cooperation-3-pair")

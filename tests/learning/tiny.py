@@ -11,7 +11,7 @@ from jsonschema import Draft202012Validator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import ethbrake_marl as eb
-from ethbrake_marl.learning import runs
+from ethbrake_marl.training import models
 
 TINY_PPO = eb.load_recipe("ppo").replace(
     n_envs=8,
@@ -93,7 +93,7 @@ def watch_steps(monkeypatch: pytest.MonkeyPatch, watch: Callable[[int, Answer], 
         environment.__class__ = Watched
         return environment
 
-    monkeypatch.setattr(runs, "make_sb3_vec_env", make)
+    monkeypatch.setattr(models, "make_sb3_vec_env", make)
 
 
 def ctrl_c_in(*steps: int) -> Callable[[int, Answer], Answer]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.limits.lower_bound import avoidability
+from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from tests.limits.worlds import line, opening, paper_line, random_profiles, wide_worlds
 from tests.reference.avoidability_lp import avoidable_by_lp
 from tests.reference.play_profile import play_profile

@@ -11,32 +11,45 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents import BestHarm, drive, make_agent, optimise_coupled
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.cli.evaluate import GROUP_EPISODES
+from ethbrake_marl.env.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.env.profiles import Profiles, profile_problem
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
-from ethbrake_marl.evaluation import TESTS, chunks, evaluate, make_lineup, measures, summarise, write_per_world
-from ethbrake_marl.figures import harm_in_parts
-from ethbrake_marl.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.limits import Unproven, known_limits, limits, lower_bound as bounding, prove
-from ethbrake_marl.limits.limits import (
-    LEFT_OUT,
+from ethbrake_marl.evaluation import chunks, measures
+from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.per_world import write_per_world
+from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.evaluation.summary import summarise
+from ethbrake_marl.extensions.proofs.extreme_profiles import KEPT, extreme_profiles
+from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
+from ethbrake_marl.extensions.proofs.ramped_meetings import onset_states
+from ethbrake_marl.extensions.proofs.team_bound import team_bound
+from ethbrake_marl.extensions.report.harm_figures import harm_in_parts
+from ethbrake_marl.extensions.report.report import avoidable_section, worst_section
+from ethbrake_marl.extensions.reproduction.tests import TESTS
+from ethbrake_marl.extensions.search.best_harm import best_harm, fold_episodes, search_list, task_problem
+from ethbrake_marl.extensions.search.problem import search_profiles
+from ethbrake_marl.extensions.search.recall import BestHarm
+from ethbrake_marl.extensions.search.shipped import (
     TABLES,
-    BestHarmTable,
-    best_harm,
+    Unproven,
     best_known,
-    fold_episodes,
-    search_list,
+    known_limits,
+    prove,
     shipped_profiles,
     shipped_tables,
-    task_problem,
 )
-from ethbrake_marl.limits.lower_bound import KEPT, extreme_profiles, lower_bound, onset_states, team_bound
-from ethbrake_marl.pages.report import avoidable_section, worst_section
-from ethbrake_marl.physics import Floats, Worlds, advance
-from ethbrake_marl.policies import load_shipped, shipped_policies
-from ethbrake_marl.scenario import Scenario, Task, group_of_scenarios, load_scenario
-from ethbrake_marl.search import Profiles, profile_problem, search_profiles
+from ethbrake_marl.extensions.search.tables import LEFT_OUT, BestHarmTable
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.state import Floats, Worlds
+from ethbrake_marl.policies.shipped import load_shipped, shipped_policies
+from ethbrake_marl.scenario.catalogue import group_of_scenarios, load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.task import Task
 from tests.docs.site import load
 from tests.failing_worlds import planted_list, without
 from tests.limits.worlds import line
@@ -185,7 +198,7 @@ def test_improved__takes_only_what_undercuts_by_more_than_the_tolerance(table: B
 
 
 def test_search_list__goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ethbrake_marl.limits.limits.CHUNK", 3)
+    monkeypatch.setattr("ethbrake_marl.extensions.search.best_harm.CHUNK", 3)
     sample, seen = SCENARIO.sample(6, seed=11), []
 
     def stop(*done: int) -> None:

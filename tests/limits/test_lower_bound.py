@@ -7,49 +7,27 @@ from functools import partial
 import numpy as np
 import pytest
 
-from ethbrake_marl.harm import empty_ledger
-from ethbrake_marl.limits.limits import best_known
-from ethbrake_marl.limits.lower_bound import (
-    CELLS,
-    FRONT_FIRST,
-    HEAP_WIDTH,
-    LARGE,
-    LINE,
-    REAR_FIRST,
-    after,
-    after_front,
-    after_rear,
-    avoidability,
-    behind_full_braking,
-    behind_leader,
-    empty_plan,
-    follower,
-    front_first,
-    gained,
-    gentlest,
-    gentlest_front,
-    held_by_leader,
-    lacking,
-    last_soft,
-    lead,
-    leader,
-    least_beyond,
-    lower_bound,
-    meet_front,
-    meet_rear,
-    obstacle_harm,
-    onset_states,
-    rear_first,
-    rounding,
-    slowed_by_rear,
-    soft_behind,
-    team_bound,
-    widest_flight,
-)
-from ethbrake_marl.physics import Vehicles, Worlds, advance, make_worlds
-from ethbrake_marl.physics.kernel import solo_motion
-from ethbrake_marl.scenario import Task, load_scenario
-from ethbrake_marl.search import Profiles, profile_problem, search_profiles
+from ethbrake_marl.env.harm import empty_ledger
+from ethbrake_marl.env.profiles import Profiles, profile_problem
+from ethbrake_marl.extensions.proofs.avoidability import avoidability
+from ethbrake_marl.extensions.proofs.branch_and_bound import CELLS, HEAP_WIDTH, lacking
+from ethbrake_marl.extensions.proofs.flights import lead, widest_flight
+from ethbrake_marl.extensions.proofs.followers import after_front, held_by_leader, obstacle_harm, slowed_by_rear
+from ethbrake_marl.extensions.proofs.free_rear import behind_full_braking, gained, soft_behind
+from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, LARGE, LINE, REAR_FIRST, follower, leader
+from ethbrake_marl.extensions.proofs.lower_bound import front_first, last_soft, lower_bound, rear_first
+from ethbrake_marl.extensions.proofs.meetings import gentlest, gentlest_front, meet_front, meet_rear
+from ethbrake_marl.extensions.proofs.obstacle import after, after_rear, behind_leader, least_beyond
+from ethbrake_marl.extensions.proofs.plans import empty_plan
+from ethbrake_marl.extensions.proofs.ramped_meetings import onset_states, rounding
+from ethbrake_marl.extensions.proofs.team_bound import team_bound
+from ethbrake_marl.extensions.search.problem import search_profiles
+from ethbrake_marl.extensions.search.shipped import best_known
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.motion import solo_motion
+from ethbrake_marl.physics.state import Vehicles, Worlds, make_worlds
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.task import Task
 from tests.limits.worlds import (
     REGIONS,
     line,

@@ -8,11 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ethbrake_marl.env.profiles import ProfileProblem, Profiles, profile_problem
 from ethbrake_marl.errors import CorruptBundle
-from ethbrake_marl.limits.limits import TABLES, BestHarmTable, best_harm
-from ethbrake_marl.limits.lower_bound import avoidability, lower_bound, team_bound
-from ethbrake_marl.scenario import Task, load_scenario
-from ethbrake_marl.search import ProfileProblem, Profiles, profile_problem
+from ethbrake_marl.extensions.proofs.avoidability import avoidability
+from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
+from ethbrake_marl.extensions.proofs.team_bound import team_bound
+from ethbrake_marl.extensions.search.best_harm import best_harm
+from ethbrake_marl.extensions.search.shipped import TABLES
+from ethbrake_marl.extensions.search.tables import BestHarmTable
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.task import Task
 from tests.limits.worlds import line, wide_worlds
 from tests.programmes.archives import good, packed
 from tests.refused import refused

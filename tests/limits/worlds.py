@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ethbrake_marl.physics import Floats, Worlds, make_worlds
+from ethbrake_marl.physics.state import Floats, Worlds, make_worlds
 
 
 def line(

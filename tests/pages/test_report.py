@@ -10,14 +10,17 @@ import pytest
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
+from ethbrake_marl.env.harm import HarmCount
+from ethbrake_marl.env.rendering import COLOURS
 from ethbrake_marl.errors import AlreadyExists, plain_text
-from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.figures import COLOURS, add_caption, inline_svg, new_figure
+from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.extensions.report import page as page_module
+from ethbrake_marl.extensions.report.page import Part, Section, read_file
+from ethbrake_marl.extensions.report.report import Report
+from ethbrake_marl.extensions.report.shown_worlds import choose_shown, worst_rows
+from ethbrake_marl.extensions.report.style import add_caption, new_figure
+from ethbrake_marl.extensions.report.svg import inline_svg
 from ethbrake_marl.files.sheet import Column, Sheet, Shown
-from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.pages import page as pages
-from ethbrake_marl.pages.page import Part, Section, read_file
-from ethbrake_marl.pages.report import Report, choose_shown, worst_rows
 from tests.fixtures.pictures import draw_nothing
 from tests.pages.hostile import HOSTILE, UNSEEN, Page
 
@@ -33,7 +36,7 @@ def whole_page(text: str) -> str:
         Part.facts({text: text}),
         Part.opened(text, [Part.paragraph(text)]),
     ]
-    return pages.Page(text, [Section(text, body), Section(text, [text]), Section(text, [])], lead=text).html
+    return page_module.Page(text, [Section(text, body), Section(text, [text]), Section(text, [])], lead=text).html
 
 
 HARMLESS = Page(whole_page("Harmless"))
@@ -85,7 +88,7 @@ def a_figure() -> Figure:
 
 
 def test_drawing__names_of_two_figures_do_not_collide() -> None:
-    html = pages.Page("t", [Section("s", [Part.drawing(a_figure(), name, "d") for name in ("One", "Two")])]).html
+    html = page_module.Page("t", [Section("s", [Part.drawing(a_figure(), name, "d") for name in ("One", "Two")])]).html
     ids = [attributes["id"] for _, attributes in Page(html).tags if "id" in attributes]
     assert len(ids) == len(set(ids))
     targets = re.findall(r'(?:url\(|href=")#([^)"]+)', html)

@@ -13,13 +13,18 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import make_agent
-from ethbrake_marl.agents.registry import drive
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.files.yaml import flow_text
-from ethbrake_marl.physics import Floats, Ints, Worlds, advance, make_worlds, stopping_distances
-from ethbrake_marl.scenario import QUANTITY, Scenario, Task, load_scenario
-from ethbrake_marl.shield.guard import ShieldedDriver
-from ethbrake_marl.shield.uncertainty import parse_uncertainty
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.motion import stopping_distances
+from ethbrake_marl.physics.state import Floats, Ints, Worlds, make_worlds
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.shield.drivers import ShieldedDriver
 from tests.physics.random_worlds import Draws, line
 from tests.reference.small_steps import run
 

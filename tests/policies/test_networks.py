@@ -19,24 +19,18 @@ import torch
 from torch import nn
 
 import ethbrake_marl as eb
-from ethbrake_marl import policies as bundle
+from ethbrake_marl.env.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.env.observations import observe
 from ethbrake_marl.errors import CorruptBundle
-from ethbrake_marl.evaluation import TESTS, evaluate, make_lineup
-from ethbrake_marl.evaluation.inputs import scenario_sha256
-from ethbrake_marl.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.observations import observe
-from ethbrake_marl.policies import (
-    Actor,
-    NetworkSpec,
-    Policy,
-    content_sha256,
-    load_named_policy,
-    load_policy,
-    shipped_name,
-    shipped_policies,
-    squash,
-)
-from ethbrake_marl.shield import HybridAgent
+from ethbrake_marl.evaluation.identity import scenario_sha256
+from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.extensions.reproduction.tests import TESTS
+from ethbrake_marl.policies import shipped as shipped_module
+from ethbrake_marl.policies.manifest import NetworkSpec, content_sha256
+from ethbrake_marl.policies.network import Actor, Policy, load_policy, squash
+from ethbrake_marl.policies.shipped import load_named_policy, shipped_name, shipped_policies
+from ethbrake_marl.shield.paper_hybrid import HybridAgent
 from tests.docs.site import DOCS
 
 RandomTensors = Callable[[NetworkSpec], dict[str, np.ndarray]]
@@ -585,7 +579,7 @@ def folder(policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
     for name in ("ppo", "ppo-total", "ppo-paper-distance", "universal"):
         policy.save(tmp_path / name / "policy")
         (tmp_path / name / "card.md").write_text(f"# {name}\n")
-    monkeypatch.setattr(bundle, "_FOLDER", tmp_path)
+    monkeypatch.setattr(shipped_module, "_FOLDER", tmp_path)
     return tmp_path
 
 

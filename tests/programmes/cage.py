@@ -28,9 +28,10 @@ from typing import Any
 from ethbrake_marl.cli.app import app, run_command
 from ethbrake_marl.cli.command import Out
 from ethbrake_marl.errors import EthBrakeError
-from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.limits import BestHarmTable, search_list
-from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.extensions.search.best_harm import search_list
+from ethbrake_marl.extensions.search.tables import BestHarmTable
+from ethbrake_marl.scenario.catalogue import load_scenario
 
 CPU_LIMIT_S = 10  # of a case
 WALL_LIMIT_S = 90.0  # on a machine that does other things too

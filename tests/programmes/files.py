@@ -24,11 +24,14 @@ from typing import Any, NamedTuple
 import yaml
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.inputs import NamedWorld, NamedWorlds, states_of
-from ethbrake_marl.learning.runs import NUMBERS, train
-from ethbrake_marl.policies import content_sha256, load_policy, shipped_policies
-from ethbrake_marl.studies.sweep import SweepPlan
-from ethbrake_marl.studies.tuning import TuningPlan
+from ethbrake_marl.evaluation.named_worlds import NamedWorld, NamedWorlds, states_of
+from ethbrake_marl.extensions.studies.sweep import SweepPlan
+from ethbrake_marl.extensions.studies.tuning import TuningPlan
+from ethbrake_marl.policies.manifest import content_sha256
+from ethbrake_marl.policies.network import load_policy
+from ethbrake_marl.policies.shipped import shipped_policies
+from ethbrake_marl.training.checkpoint import NUMBERS
+from ethbrake_marl.training.train import train
 from tests.programmes.cage import NASTY, OUTSIDE, PRECIOUS, Case, damaged, write
 
 # ---------------------------------------------------------------- text

@@ -18,10 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.search import profile_problem
-from ethbrake_marl.shield.step_shield import StepShield, begin_running, plan_harm
-from ethbrake_marl.shield.uncertainty import parse_uncertainty
+from ethbrake_marl.env.profiles import profile_problem
+from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.shield.members import begin_running, plan_harm
+from ethbrake_marl.shield.step import StepShield
 from tests.programmes import Cases, Given, Told
 from tests.shield.attacks import (
     ABOVE,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.learning import Training
 from ethbrake_marl.scenario.sampling import uniform_numbers
+from ethbrake_marl.training.run_folder import Training
 from tests.scenario.test_sampling import ALL_RANDOM, DELAYS, PAPER, bits, build, closing_pair, quantity, typed
 
 LINE = {"time_gaps_s": {"uniform": [0.2, 2]}, "line_speed_mps": {"uniform": [10, 38]}}

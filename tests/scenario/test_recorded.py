@@ -11,8 +11,8 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.scenario import recorded, scenario_from_data
-from ethbrake_marl.scenario.recorded import DataDraw
+from ethbrake_marl.extensions.recorded import traffic as recorded
+from ethbrake_marl.extensions.recorded.traffic import DataDraw, scenario_from_data
 from tests.docs.site import DOCS
 from tests.fixtures.recordings import HIGHD, write_files, write_highd, write_ngsim, write_openacc
 

@@ -8,8 +8,10 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.errors import UnknownName
-from ethbrake_marl.scenario import Scenario, load_scenario, new_scenario_text, parse_yaml
-from ethbrake_marl.scenario.sampling import ScriptSpec
+from ethbrake_marl.files.yaml import parse_yaml
+from ethbrake_marl.scenario.catalogue import load_scenario, new_scenario_text
+from ethbrake_marl.scenario.roles import ScriptSpec
+from ethbrake_marl.scenario.schema import Scenario
 from tests.refused import refused
 
 PAPER, DELAYS = load_scenario("paper-random"), load_scenario("mixture-delays")

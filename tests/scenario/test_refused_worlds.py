@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
 from tests.refused import refused
 
 PAPER = load_scenario("paper-random")

@@ -9,11 +9,14 @@ import pytest
 from scipy import stats
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import Team, drive, make_agent
-from ethbrake_marl.evaluation import states_of
-from ethbrake_marl.limits import prove
-from ethbrake_marl.scenario import QUANTITY, Task
-from ethbrake_marl.shield import parse_uncertainty
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.protocol import Team
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.evaluation.named_worlds import states_of
+from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
+from ethbrake_marl.extensions.search.shipped import prove
+from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.task import Task
 from tests.refused import refused
 
 PAPER = eb.load_scenario("paper-random")

@@ -12,13 +12,16 @@ from hypothesis import given, strategies as st
 from scipy import stats
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import drive, make_agent
-from ethbrake_marl.evaluation import worlds_sha256
-from ethbrake_marl.physics import Vehicles
-from ethbrake_marl.scenario import QUANTITY, load_scenario
-from ethbrake_marl.scenario.sampling import BLOCK, Choice, LogUniform, Normal, Uniform, support, values
-from ethbrake_marl.scenario.v2x import PRESETS
-from ethbrake_marl.shield import ShieldedDriver, parse_uncertainty
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.evaluation.identity import worlds_sha256
+from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
+from ethbrake_marl.physics.state import Vehicles
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.channel import PRESETS
+from ethbrake_marl.scenario.distributions import Choice, LogUniform, Normal, Uniform, support, values
+from ethbrake_marl.scenario.fields import BLOCK, QUANTITY
+from ethbrake_marl.shield.drivers import ShieldedDriver
 
 near = pytest.approx
 PAPER = eb.load_scenario("paper-random")

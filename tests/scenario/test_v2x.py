@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import script_agents
-from ethbrake_marl.envs import make_engine
-from ethbrake_marl.evaluation import worlds_sha256
-from ethbrake_marl.observations import observe
-from ethbrake_marl.physics.batch import Packed
-from ethbrake_marl.physics.kernel import CLOCK
+from ethbrake_marl.agents.driving import script_agents
+from ethbrake_marl.env.making import make_engine
+from ethbrake_marl.env.observations import observe
+from ethbrake_marl.env.profiles import identities
+from ethbrake_marl.evaluation.identity import worlds_sha256
+from ethbrake_marl.physics.columns import Packed
+from ethbrake_marl.physics.episode import CLOCK
 from ethbrake_marl.physics.messages import CHANNEL, Messages, chance
-from ethbrake_marl.scenario import CHANNELS, full_state, state_features
-from ethbrake_marl.scenario.v2x import PER_LINK, PRESETS, V2X, Channel, Equipage, Equipped, burst_periods
-from ethbrake_marl.search import identities
+from ethbrake_marl.scenario.channel import CHANNELS, PER_LINK, PRESETS, V2X, Channel, Equipage, Equipped, burst_periods
+from ethbrake_marl.scenario.observed import full_state, state_features
 from tests.agents.test_knowledge import alter_unreceived
 
 PAPER = eb.load_scenario("paper-random")

@@ -14,11 +14,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import drive, make_agent, script_agents
-from ethbrake_marl.physics import Floats, Worlds, advance
-from ethbrake_marl.physics.kernel import CLOCK
-from ethbrake_marl.shield import ShieldedDriver, StepShield, parse_uncertainty
-from ethbrake_marl.shield.step_shield import Decision, certify, seen_columns
+from ethbrake_marl.agents.driving import drive, script_agents
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.episode import CLOCK
+from ethbrake_marl.physics.state import Floats, Worlds
+from ethbrake_marl.shield.comparison import seen_columns
+from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shield.members import Decision, certify
+from ethbrake_marl.shield.step import StepShield
 
 # ---------------------------------------------------------------- lines
 

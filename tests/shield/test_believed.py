@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import drive, make_agent
-from ethbrake_marl.physics import Floats
-from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
-from ethbrake_marl.shield.enclosure import Boxes
-from ethbrake_marl.shield.step_shield import BelievedShield
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.extensions.certified.enclosure import Boxes
+from ethbrake_marl.extensions.certified.estimated_shield import BelievedShield
+from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from tests.shield.attacks import ABOVE, HEARD_LATE, INSIDE, LISTS, NEVER_HEARD, WAYS, all_infos, shielded
 from tests.shield.plays import reported
 

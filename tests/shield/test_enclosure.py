@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import drive, fixed_commands, script_agents
-from ethbrake_marl.search import profile_problem
-from ethbrake_marl.shield import ShieldedDriver, StepShield, Uncertainty, enclosure, parse_uncertainty
-from ethbrake_marl.shield.enclosure import (
+from ethbrake_marl.agents.driving import drive, script_agents
+from ethbrake_marl.agents.protocol import fixed_commands
+from ethbrake_marl.env.profiles import profile_problem
+from ethbrake_marl.extensions.certified import affine, enclosure
+from ethbrake_marl.extensions.certified.affine import (
     CLOSING,
     HARDEST,
     OPENING,
@@ -17,23 +18,19 @@ from ethbrake_marl.shield.enclosure import (
     TOUCH_WIDTH,
     TOUCHES,
     WIDE,
-    Known,
     Path,
-    backwards,
-    bounce,
-    cell_of,
-    go_on,
     high,
     hold,
-    may_meet_unseen,
-    meet,
     move_alone,
     new_motion,
-    new_stack,
-    stray,
-    wait,
 )
-from ethbrake_marl.shield.step_shield import begin_running, plan_harm
+from ethbrake_marl.extensions.certified.enclosure import Known, cell_of, wait
+from ethbrake_marl.extensions.certified.paths import go_on, may_meet_unseen, meet, new_stack
+from ethbrake_marl.extensions.certified.touching import backwards, bounce, stray
+from ethbrake_marl.extensions.certified.uncertainty import Uncertainty, parse_uncertainty
+from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shield.members import begin_running, plan_harm
+from ethbrake_marl.shield.step import StepShield
 from tests.shield.test_uncertainty import STANDING
 
 STEPS = 81
@@ -104,12 +101,12 @@ def plans(rng, braking=-0.9):
 
 
 OPERATIONS = {
-    "product": (lambda x, y: enclosure.product(x, y), lambda a, b: a * b),
-    "square": (lambda x, y: enclosure.square(x), lambda a, b: a * a),
-    "square_root": (lambda x, y: enclosure.square_root(x), lambda a, b: np.sqrt(a)),
-    "reciprocal": (lambda x, y: enclosure.reciprocal(x), lambda a, b: 1.0 / a),
-    "positive_part": (lambda x, y: enclosure.positive_part(y), lambda a, b: np.maximum(b, 0.0)),
-    "difference": (lambda x, y: enclosure.difference(x, y), lambda a, b: a - b),
+    "product": (lambda x, y: affine.product(x, y), lambda a, b: a * b),
+    "square": (lambda x, y: affine.square(x), lambda a, b: a * a),
+    "square_root": (lambda x, y: affine.square_root(x), lambda a, b: np.sqrt(a)),
+    "reciprocal": (lambda x, y: affine.reciprocal(x), lambda a, b: 1.0 / a),
+    "positive_part": (lambda x, y: affine.positive_part(y), lambda a, b: np.maximum(b, 0.0)),
+    "difference": (lambda x, y: affine.difference(x, y), lambda a, b: a - b),
 }
 
 
@@ -382,7 +379,7 @@ def test_drive_that_a_speed_limit_may_end__gives_any_part_of_its_way() -> None:
     cell, _ = cell_in(case, case.boxes.low[0], np.ones(STEPS))
     path = Path(np.concatenate([cell.speed, cell.gap, 0 * cell.gap[:1]]), np.zeros((2, TOUCH_WIDTH)), np.zeros(5, int))
     move_alone(cell, path, 0, motion := new_motion(3, cell.drive.shape[0]))
-    assert [enclosure.low(motion.reach[1]), enclosure.high(motion.reach[1])] == pytest.approx([2.0, 2.035], abs=1e-9)
+    assert [affine.low(motion.reach[1]), affine.high(motion.reach[1])] == pytest.approx([2.0, 2.035], abs=1e-9)
 
 
 def test_brakes_released_at_standstill__hold_until_the_vehicle_drives() -> None:
@@ -390,7 +387,7 @@ def test_brakes_released_at_standstill__hold_until_the_vehicle_drives() -> None:
     motion = new_motion(1, 3)
     motion.vague[0] = 1.0
     hold(np.zeros(3), 0, 0.1, motion)
-    assert enclosure.low(motion.onward[0]) <= 0.0 < 0.025 <= enclosure.high(motion.onward[0]) <= 0.1 + 1e-12
+    assert affine.low(motion.onward[0]) <= 0.0 < 0.025 <= affine.high(motion.onward[0]) <= 0.1 + 1e-12
 
 
 def test_bound__of_two_that_touch_from_the_alert_on() -> None:

@@ -3,9 +3,13 @@
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents import drive, make_agent
-from ethbrake_marl.scenario import Task, load_scenario
-from ethbrake_marl.shield import ShieldedDriver, parse_uncertainty, review
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shield.evidence import review
 from tests.shield.test_step_shield import wavering
 
 SCENARIO = load_scenario("paper-random")

@@ -11,18 +11,16 @@ import pytest
 from gymnasium.wrappers import Autoreset
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import drive, episode_engine, make_agent
-from ethbrake_marl.engine import STEP, Engine
+from ethbrake_marl.agents.driving import drive, episode_engine
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.env.compiled_step import STEP
+from ethbrake_marl.env.engine import Engine
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
-from ethbrake_marl.shield import (
-    HybridAgent,
-    HybridShield,
-    MovingAtHorizon,
-    ShieldedDriver,
-    ShieldedEnv,
-    ShieldedVectorEnv,
-    parse_uncertainty,
-)
+from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
+from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shield.options import MovingAtHorizon
+from ethbrake_marl.shield.paper_hybrid import HybridAgent
+from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv
 from tests.fixtures.asked import Acts, Asked
 from tests.shield.attacks import above_later
 from tests.shield.plays import reported

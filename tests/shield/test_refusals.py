@@ -11,27 +11,25 @@ from pettingzoo.utils import BaseParallelWrapper, BaseWrapper
 from stable_baselines3.common.vec_env import VecMonitor
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import Team, drive, make_agent
-from ethbrake_marl.envs.interfaces import EthBrakeEnv, EthBrakeVectorEnv, env as aec_env, parallel_env
-from ethbrake_marl.envs.sb3 import make_sb3_vec_env
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.protocol import Team
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.env.gymnasium import EthBrakeEnv
+from ethbrake_marl.env.pettingzoo import env as aec_env, parallel_env
+from ethbrake_marl.env.sb3 import make_sb3_vec_env
+from ethbrake_marl.env.vector import EthBrakeVectorEnv
 from ethbrake_marl.errors import UncertifiedStep, UnknownName
-from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.shield import (
-    HybridAgent,
-    HybridShield,
-    ShieldedDriver,
-    ShieldedEnv,
-    ShieldedVectorEnv,
-    ShieldOptions,
-    StepShield,
-    parse_uncertainty,
-    shielded_aec,
-)
+from ethbrake_marl.extensions.certified.uncertainty import Interval, Uncertainty, parse_uncertainty
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.drivers import ShieldedDriver
 from ethbrake_marl.shield.evidence import review
-from ethbrake_marl.shield.guard import checked_uncertainty
+from ethbrake_marl.shield.members import certify, plan_harm
+from ethbrake_marl.shield.options import ShieldOptions, checked_uncertainty
+from ethbrake_marl.shield.paper_hybrid import HybridAgent
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
-from ethbrake_marl.shield.step_shield import certify, plan_harm
-from ethbrake_marl.shield.uncertainty import Interval, Uncertainty
+from ethbrake_marl.shield.step import StepShield
+from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from tests.limits.worlds import line as one_line
 from tests.refused import refused
 from tests.shield.attacks import begun, line

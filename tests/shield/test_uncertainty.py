@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.registry import drive, make_agent
-from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.shield import ShieldedDriver
-from ethbrake_marl.shield.guard import checked_uncertainty
-from ethbrake_marl.shield.step_shield import ShieldReason, plan_harm
-from ethbrake_marl.shield.uncertainty import parse_uncertainty
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shield.members import ShieldReason, plan_harm
+from ethbrake_marl.shield.options import checked_uncertainty
 from tests.limits.worlds import line as one_line
 from tests.shield.attacks import Hostile, begun, line
 

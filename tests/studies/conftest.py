@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.studies.reproduction import Reproduction
+from ethbrake_marl.extensions.reproduction.folder import Reproduction
 from tests.fixtures.pictures import draw_nothing
 from tests.learning.tiny import TINY_PPO
 

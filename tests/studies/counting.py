@@ -20,8 +20,8 @@ from typing import Any
 
 from filelock import FileLock
 
-from ethbrake_marl.studies.figures import FIGURES
-from ethbrake_marl.studies.sweep import RUNS, Row, SweepPlan
+from ethbrake_marl.extensions.studies.figures import FIGURES
+from ethbrake_marl.extensions.studies.sweep import RUNS, Row, SweepPlan
 
 ROOT = Path(__file__).resolve().parents[2]
 STEPS, SLEEP_S = 40, 0.01

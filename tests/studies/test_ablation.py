@@ -13,36 +13,38 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.figures import ALARM, ablation_figures
-from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.learning import runs as learning_train
-from ethbrake_marl.learning.training import Scheme, Training, TrainingRecipe, load_recipe
-from ethbrake_marl.limits.limits import best_harm, chunks_left
-from ethbrake_marl.scenario import Sample, load_scenario, scenario_path
-from ethbrake_marl.shield.guard import Shielded
-from ethbrake_marl.studies.ablation import (
-    FIGURES,
-    STANDARD,
+from ethbrake_marl.env.harm import HarmCount
+from ethbrake_marl.extensions.cooperation.comparison import compare
+from ethbrake_marl.extensions.cooperation.figures import ablation_figures
+from ethbrake_marl.extensions.cooperation.joint_optimum import (
     Goal,
     Harms,
-    Level,
     LevelOptimum,
     Measured,
-    Plan,
-    ablation_page,
     best_known,
-    common_worlds,
-    compare,
-    interval_words,
-    levels_csv,
-    markdown,
     measure,
     questions,
-    read_levels,
     search_all,
+)
+from ethbrake_marl.extensions.cooperation.levels import (
+    FIGURES,
+    STANDARD,
+    Level,
+    Plan,
+    common_worlds,
+    read_levels,
     with_scheme,
 )
-from ethbrake_marl.studies.trainings import TrainingJob
+from ethbrake_marl.extensions.cooperation.page import ablation_page, interval_words, levels_csv, markdown
+from ethbrake_marl.extensions.report.style import ALARM
+from ethbrake_marl.extensions.search.best_harm import best_harm, chunks_left
+from ethbrake_marl.extensions.studies.trainings import TrainingJob
+from ethbrake_marl.scenario.catalogue import load_scenario, scenario_path
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.shield.drivers import Shielded
+from ethbrake_marl.training import train
+from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, load_recipe
+from ethbrake_marl.training.run_folder import Training
 from tests.learning.tiny import TINY_PPO
 from tests.pages.hostile import Page
 from tests.studies.conftest import ABLATE, LEVELS, check_snapshot, study
@@ -110,7 +112,7 @@ def test_ablate__goes_on_where_it_was_stopped_to_the_same_result(
     finished_ablation, tmp_path, tiny_total, monkeypatch, capsys
 ) -> None:
     """Stopped in the middle of a later training; ended by two processes."""
-    folder, original = tmp_path / "stopped", learning_train.Session._after_update
+    folder, original = tmp_path / "stopped", train.Session._after_update
 
     def after_update(self, **options):
         original(self, **options)
@@ -118,7 +120,7 @@ def test_ablate__goes_on_where_it_was_stopped_to_the_same_result(
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(learning_train.Session, "_after_update", after_update)
+        patch.setattr(train.Session, "_after_update", after_update)
         assert ablate(folder, tiny_total) == 130
     statuses = [json.loads(path.read_text())["status"] for path in folder.glob("trainings/*/run.json")]
     assert sorted(statuses) == ["finished", "interrupted"] and not (folder / "ablation.json").exists()

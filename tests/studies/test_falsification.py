@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.physics import Bools, Floats, Worlds
-from ethbrake_marl.studies.falsification import APART, Measure, MeasureName, Scored, far_apart, search
+from ethbrake_marl.env.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.extensions.studies.falsification import APART, Scored, far_apart, search
+from ethbrake_marl.extensions.studies.weakness import Measure, MeasureName
+from ethbrake_marl.physics.state import Bools, Floats, Worlds
 
 SCENARIO = eb.load_scenario("paper-random")
 

@@ -14,11 +14,13 @@ from filelock import FileLock
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.learning import Training, load_recipe
-from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.ablation import ablation_cost, plan_ablation
-from ethbrake_marl.studies.folder import StudyFolder
-from ethbrake_marl.studies.trainings import TrainingJob, train_all
+from ethbrake_marl.extensions.cooperation.ablation import ablation_cost
+from ethbrake_marl.extensions.cooperation.levels import plan_ablation
+from ethbrake_marl.extensions.studies.folder import StudyFolder
+from ethbrake_marl.extensions.studies.trainings import TrainingJob, train_all
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.training.recipe import load_recipe
+from ethbrake_marl.training.run_folder import Training
 from tests.studies.conftest import ABLATE, LEVELS
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,13 +10,17 @@ import yaml
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import AlreadyExists, UnknownName
-from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.ablation import Level, common_worlds, with_scheme
-from ethbrake_marl.studies.falsification import Measure, search
-from ethbrake_marl.studies.learning_curves import LearningCurves
-from ethbrake_marl.studies.reproduction import Reproduction, make_items, open_folder, read_results, render_page
-from ethbrake_marl.studies.sweep import SweepPlan
-from ethbrake_marl.studies.tuning import TuningPlan
+from ethbrake_marl.extensions.cooperation.levels import Level, common_worlds, with_scheme
+from ethbrake_marl.extensions.reproduction.folder import Reproduction
+from ethbrake_marl.extensions.reproduction.items import read_results
+from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
+from ethbrake_marl.extensions.reproduction.making import make_items, open_folder
+from ethbrake_marl.extensions.reproduction.pages import render_page
+from ethbrake_marl.extensions.studies.falsification import search
+from ethbrake_marl.extensions.studies.sweep import SweepPlan
+from ethbrake_marl.extensions.studies.tuning import TuningPlan
+from ethbrake_marl.extensions.studies.weakness import Measure
+from ethbrake_marl.scenario.catalogue import load_scenario
 from tests.fixtures.pictures import draw_nothing
 from tests.refused import refused
 from tests.studies.test_reproduction import drawn, made, planted

@@ -11,48 +11,37 @@ import pytest
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.measures import PAPER_ROWS, PaperRow
 from ethbrake_marl.evaluation.statistics import rate
-from ethbrake_marl.figures import SeedCurve, estimates_figure
-from ethbrake_marl.files.sheet import Estimate, Sheet
-from ethbrake_marl.studies import reproduction
-from ethbrake_marl.studies.reproduction import (
-    FULL_BRAKE,
-    GAPS,
-    HARM,
-    ITEMS,
-    NAMES,
+from ethbrake_marl.extensions.report.seed_curves import SeedCurve
+from ethbrake_marl.extensions.reproduction import delay_curves, folder as folder_module, hybrid, trainings
+from ethbrake_marl.extensions.reproduction.delay_curves import Course
+from ethbrake_marl.extensions.reproduction.figures import estimates_figure
+from ethbrake_marl.extensions.reproduction.folder import Drawn, Item, Made, Reproduction, checked_result, stated
+from ethbrake_marl.extensions.reproduction.items import ITEMS, read_results
+from ethbrake_marl.extensions.reproduction.making import choose_items, make_items, open_folder
+from ethbrake_marl.extensions.reproduction.open_quantities import GAPS
+from ethbrake_marl.extensions.reproduction.pages import docs_page, render_page, write_docs
+from ethbrake_marl.extensions.reproduction.strategies import FULL_BRAKE, NAMES, READINGS, lineup
+from ethbrake_marl.extensions.reproduction.tables import (
     NOBODY,
-    PERCENT,
-    READINGS,
     Beside,
-    Course,
-    Drawn,
-    Group,
-    Item,
-    Less,
-    Made,
-    Reproduction,
-    TrainedRecipe,
-    Verdict,
-    checked_result,
-    choose_items,
-    compare_number,
     compare_rows,
     decrease_verdict,
-    docs_page,
-    judge_statement,
-    lineup,
-    make_items,
-    open_folder,
-    read_results,
-    render_page,
     rows_table,
     selection_verdict,
-    stated,
-    summarise_verdicts,
-    write_docs,
 )
+from ethbrake_marl.extensions.reproduction.tests import PAPER_ROWS, PaperRow
+from ethbrake_marl.extensions.reproduction.trainings import Group, TrainedRecipe
+from ethbrake_marl.extensions.reproduction.verdicts import (
+    HARM,
+    PERCENT,
+    Less,
+    Verdict,
+    compare_number,
+    judge_statement,
+    summarise_verdicts,
+)
+from ethbrake_marl.files.sheet import Estimate, Sheet
 from tests.learning.tiny import TINY_PPO
 from tests.pages.hostile import Page
 from tests.studies.conftest import check_snapshot
@@ -251,10 +240,10 @@ def test_register__every_gap_says_what_the_paper_says_and_what_is_measured() -> 
 def test_hybrid__is_driven_anew_once_its_policy_was_trained(
     settings: Reproduction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first, again = (reproduction._drive_hybrid("paper-random", settings, READINGS[0]) for _ in range(2))
+    first, again = (hybrid._drive_hybrid("paper-random", settings, READINGS[0]) for _ in range(2))
     assert again is first
-    monkeypatch.setattr(reproduction, "unconverged_policy", lambda _: (eb.load_shipped("ppo"), "trained since"))
-    assert reproduction._drive_hybrid("paper-random", settings, READINGS[0]) is not first
+    monkeypatch.setattr(hybrid, "unconverged_policy", lambda _: (eb.load_shipped("ppo"), "trained since"))
+    assert hybrid._drive_hybrid("paper-random", settings, READINGS[0]) is not first
 
 
 def drawn() -> dict[Drawn, Figure]:
@@ -320,7 +309,7 @@ def test_full__trains_draws_and_keeps_what_is_trained(settings: Reproduction, mo
     """One training of a second at either delay, in the place of all."""
     trained = {"ppo": (TrainedRecipe("ppo", TINY.total_steps, 1, 1000), TINY)}
     groups = {delay: Group(delay, f"paper-delay-{delay}", trained, 1) for delay in ("low", "high")}
-    monkeypatch.setattr(reproduction, "groups", lambda: groups)
+    monkeypatch.setattr(folder_module, "groups", lambda: groups)
     monkeypatch.setattr(reproduction, "CURVES", {"low": ("low",), "high": ("high",)})
     full = replace(settings, mode="full", episodes=5)
     (item,) = choose_items(["learning-low"])
@@ -353,7 +342,7 @@ def test_full__interrupted_makes_what_is_finished_and_an_item_again_when_more_is
 
 
 def test_groups__fit_their_recipes_and_every_item_names_groups_that_exist() -> None:
-    found = reproduction.groups()
+    found = trainings.groups()
     assert {name for item in ITEMS for name in item.trained} == set(found)
     for group in found.values():
         for name, (asked, recipe) in group.trained.items():
@@ -367,7 +356,7 @@ def test_groups__fit_their_recipes_and_every_item_names_groups_that_exist() -> N
 def test_cost__is_told_before_and_at_most_an_hour(tmp_path: Path) -> None:
     settings = Reproduction("full", tmp_path)
     assert "trainings before them about" in settings.cost(ITEMS)
-    assert 600.0 < settings.seconds_left(list(reproduction.groups())) <= 3_600.0
+    assert 600.0 < settings.seconds_left(list(trainings.groups())) <= 3_600.0
     assert "trainings" not in replace(settings, mode="quick").cost(ITEMS)
     assert settings.trained(["low"]) == {}
 
@@ -440,5 +429,5 @@ def test_returns__of_a_shaped_reward_say_nothing_between_delays_so_its_harm_is_c
     better = course([[-10.0] * 20, [-9.99] * 20], [[10.0] * 20, [8.0] * 20])  # of lower returns
     for recipe, outcome, told in (("ppo", "agrees", "minus its harm"), ("ppo-paper", "differs", "ppo-paper")):
         assert bool(eb.load_recipe(recipe).reward.shaping) == (recipe == "ppo")
-        verdict = reproduction._higher_when_low({"high": {recipe: worse}, "low": {recipe: better}})
+        verdict = delay_curves._higher_when_low({"high": {recipe: worse}, "low": {recipe: better}})
         assert (verdict.outcome, told in verdict.because) == (outcome, True)

@@ -18,10 +18,12 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.studies.sweep import SweepFile, SweepPlan
+from ethbrake_marl.extensions.studies.tuning import TuningFile, TuningPlan
 from ethbrake_marl.files.yaml import read_yaml
-from ethbrake_marl.learning.training import Training, TrainingRecipe, load_recipe, read_settings
-from ethbrake_marl.studies.sweep import SweepFile, SweepPlan
-from ethbrake_marl.studies.tuning import TuningFile, TuningPlan
+from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.training.run_folder import Training
+from ethbrake_marl.training.settings import read_settings
 from tests.cli.conftest import rows_of as read
 from tests.learning.tiny import marked
 from tests.studies.conftest import TRIALS, Write, study, write_yaml

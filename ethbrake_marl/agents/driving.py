@@ -1,0 +1,144 @@
+"""Letting agents drive through whole episodes: the loop of every evaluation and of every prediction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from ethbrake_marl.agents.protocol import Agent, Driver, Team
+from ethbrake_marl.agents.registry import make_role
+from ethbrake_marl.env.engine import Engine
+from ethbrake_marl.env.harm import Ledger
+from ethbrake_marl.env.memory import Memory
+from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.physics.state import Bools, Floats, Worlds
+from ethbrake_marl.scenario.schema import Scenario
+
+
+@dataclass(frozen=True, slots=True)
+class Episodes:
+    """How the episodes of a batch went."""
+
+    ledger: Ledger
+    final: Worlds  # each world as its episode left it
+    at_rest: Bools  # [n] the line came to rest; else the horizon cut the episode off
+    guarded: Any  # what the shield remembers at their end; None without one
+    memories: Mapping[int, Memory]  # by driven vehicle, what its agent remembers at their end
+
+    @classmethod
+    def of(cls, engine: Engine, worlds: Worlds, watched_by: Sequence[Watch] = ()) -> Episodes:
+        """Those of an ``episode_engine``, still at the first decision in ``worlds``; raises ``PhysicsError``."""
+        at_rest = np.zeros(worlds.n, np.bool_)
+        now = _show(watched_by, worlds, engine, engine.worlds.command_mps2)
+        while not engine.ended.all():
+            at_rest |= engine.step({}).terminated
+            now = _show(watched_by, now, engine, engine.wanted_mps2.copy())
+        if engine.roster.failed:
+            raise PhysicsError(engine.roster.failed)
+        memories = {i: memory for i, memory in engine.memories.items() if i in engine.deciders}
+        return cls(engine.ledger, engine.worlds, at_rest, engine.guarded, memories)
+
+
+class Watch(Protocol):
+    """Sees every step of a batch of episodes."""
+
+    def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
+        """``before`` moved to the times ``until_s`` [n] under ``command_mps2`` [n, N]; ended worlds stay at theirs.
+
+        The first step is from the alert to the first decision; where a script decides on the way, a step is seen in
+        parts. Nothing of what is given may be changed.
+        """
+        ...
+
+
+def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | None = None) -> dict[int, Agent]:
+    """Agents for the scenario's scripts, by vehicle."""
+    left_out = (except_for,) if isinstance(except_for, int) else except_for or ()
+    return {i: make_role(scenario, i) for i in scenario.scripts if i not in left_out}
+
+
+def episode_engine(worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None) -> Engine:
+    """An engine over ``worlds`` in which ``agent`` drives ``vehicle``, or a team its vehicles; the others are scripted.
+
+    They decide when their first vehicle's latency has elapsed and every time step from then on, as learners do; their
+    commands are applied unrounded. Behind a shield they propose, and learn as far as the engine knows. One that looks
+    ahead knows the scripts, and takes the other driven vehicles to
+    brake fully. Raises ``InvalidInput`` for a learner that nobody drives.
+    """
+    team = agent if isinstance(agent, Team) else Team.of(agent, () if vehicle is None else (vehicle,))
+    drivers = team.drivers
+    undriven = [scenario.vehicle_names[i] for i in scenario.learners if i not in drivers]
+    if undriven:
+        raise InvalidInput(
+            f"agent {team.name!r} drives {', '.join(scenario.vehicle_names[i] for i in drivers) or 'nobody'}, but"
+            f" {', '.join(undriven)} of scenario {scenario.name!r} must be driven too. An agent that rolls itself out"
+            " (+search, +episode, +robust) can drive one learner, the others need scripts"
+        )
+    scripts = script_agents(scenario, except_for=drivers)
+    shield = team.shield
+    if shield is None:
+        engine = Engine(
+            scenario, worlds.n, learners=(), scripts={**scripts, **drivers}, deciders=tuple(drivers), worlds=worlds
+        )
+    else:
+        engine = Engine(
+            scenario, worlds.n, learners=tuple(drivers), scripts=scripts, worlds=worlds,
+            guard=lambda engine: shield.guard(engine, drivers),
+        )  # fmt: skip
+        engine.check_time_step(drivers)
+    engine.roster.warns = False  # who drives looks
+    return engine
+
+
+def drive(
+    worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None, *, watched_by: Sequence[Watch] = ()
+) -> Episodes:
+    """Let ``agent`` drive ``vehicle``, or a team its vehicles, through every world (at t = 0) to its episode's end.
+
+    Raises ``PhysicsError`` naming all worlds that could not be advanced; the others are well without them.
+    """
+    engine = episode_engine(worlds, agent, scenario, vehicle)
+    return Episodes.of(engine, scenario.play_pieces(worlds, engine.deciders), watched_by)
+
+
+def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_mps2: Floats) -> Worlds:
+    """Show the step that the engine has just made; gives the worlds as they are now."""
+    if not watched_by:
+        return before
+    now = engine.packed.worlds(before.vehicles)  # the episodes are the same, and so are their vehicles
+    for part in engine.segments(before, command_mps2):
+        for watch in watched_by:
+            watch.see(*part)
+    return now
+
+
+def record_commands(agent: Driver, worlds: Worlds, scenario: Scenario, vehicle: int, steps: int) -> Floats:
+    """The commands that ``agent`` gives ``vehicle`` in the first ``steps`` decisions of its episodes, [n, steps] m/s2.
+
+    ``worlds`` are at the alert. After an episode's end its last command goes on. Raises ``PhysicsError`` naming the
+    worlds that it cannot drive to the end.
+    """
+    engine = episode_engine(worlds, agent, scenario, vehicle)
+    commands = write_down(engine, steps, lambda: engine.wanted_mps2[:, [vehicle]])[:, :, 0]
+    latest = np.maximum.accumulate(np.where(np.isnan(commands), 0, np.arange(steps)), axis=1)
+    filled: Floats = np.take_along_axis(commands, latest, axis=1)
+    return filled
+
+
+def write_down(engine: Engine, steps: int, column: Callable[[], Floats]) -> Floats:
+    """Play such an engine to the end; the ``column`` [n, K] after each of the first steps, [n, steps, K].
+
+    NaN after an episode's end. Raises ``PhysicsError``.
+    """
+    columns = np.full((steps, *column().shape), np.nan)
+    while not engine.ended.all():
+        rows = np.flatnonzero(engine.steps < steps)
+        at = engine.steps[rows]
+        engine.step({})
+        columns[at, rows] = column()[rows]
+    if engine.roster.failed:
+        raise PhysicsError(engine.roster.failed)
+    return columns.swapaxes(0, 1)

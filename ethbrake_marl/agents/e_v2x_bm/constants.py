@@ -1,0 +1,260 @@
+"""Many constant decelerations of one vehicle in one world, compiled: what the coupled search asks for.
+
+The harm is that of ``physics.advance`` under constant commands, to the same bits; the motion is not kept. Three
+things make it cheap. Until the vehicle's command takes effect all candidates are one, and that part is moved once. A
+simulation ends as soon as nobody can meet anybody any more (``will_stay_apart``). And it is given up once its harm,
+which never falls again, has reached a bound that the caller names.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.e_v2x_bm.samples import Samples, copy_sample
+from ethbrake_marl.physics.constant_motion import accelerate
+from ethbrake_marl.physics.episode import onset_s
+from ethbrake_marl.physics.impact import record_impacts, resolve_impacts
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.motion import BOUND
+from ethbrake_marl.physics.pieces import pieces_to_come
+from ethbrake_marl.physics.rows import FLAG, LISTED, ROW, builds_up, place_forces, place_obstacle, rows_for
+from ethbrake_marl.physics.segment import move_apart, start_events, to_next_event, to_next_impact
+from ethbrake_marl.physics.state import Bools, Floats
+
+DURATION, RESTITUTION, SHARED_S = range(3)  # columns of a line's clock
+
+CLEAR_M, CLEAR_MPS = 1e-6, 1e-6  # margins, a million times what rounding can do to a gap or a speed
+
+_DIGIT = 1_000.0  # impacts of a pair that are told apart
+
+
+class Line(NamedTuple):
+    """One world as candidates run in it, in tables of ``physics.kernel``; an obstacle ahead stands in column 0."""
+
+    start: Floats  # [rows_for(2 K), N or N + 1] with everybody's command but that of the controlled vehicle
+    shared: Floats  # the same where that vehicle's command takes effect
+    table: Floats  # room
+    clock: Floats  # [3] length of a simulation, restitution, time from the start to ``shared``
+    controlled: int  # column of the vehicle
+    vehicles: int  # column of Vehicle 1
+    harm: int  # the row whose sum is minimised
+    other: int  # the row of the other count
+    no_rows: Floats  # an empty list of impacts
+
+
+@compiled(apart=True)
+def make_line(
+    gap: Floats, speed: Floats, hit: Bools, obstacle: float, obstacle_hit: bool, command: Floats, latency: Floats,
+    mass: Floats, limit: Floats, in_force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats,
+    time: float, restitution: float, horizon: float, vehicle: int, total: bool,
+) -> Line:  # fmt: skip
+    """One world at its ``time``, ready for ``share_start``; an ``obstacle`` that is finitely far is in it."""
+    at = 1 if obstacle < math.inf else 0
+    vehicles = speed.shape[0]
+    table = np.zeros((rows_for(pieces.shape[1]), vehicles + at))
+    place_forces(table, in_force, brake_rate, release_rate, pieces)
+    if at == 1:
+        place_obstacle(table, obstacle, 1.0 if obstacle_hit else 0.0)
+        table[ROW.ONSET, 0] = onset_s(0.0, time)
+    for i in range(vehicles):
+        table[ROW.COMMAND, at + i], table[ROW.SPEED, at + i] = command[i], speed[i]
+        table[ROW.MASS, at + i], table[ROW.LIMIT, at + i] = mass[i], limit[i]
+        table[ROW.ONSET, at + i] = onset_s(latency[i], time)
+    for p in range(vehicles - 1):
+        table[ROW.GAP, at + p] = gap[p]
+        table[ROW.HIT, at + p] = 1.0 if hit[p] else 0.0
+    clock = np.array([horizon - time, restitution, 0.0])
+    rows = (ROW.TOTAL_HARM, ROW.FIRST_HARM) if total else (ROW.FIRST_HARM, ROW.TOTAL_HARM)
+    return Line(
+        table, table.copy(), table.copy(), clock, at + vehicle, at, rows[0], rows[1], np.empty((0, LISTED.WIDTH))
+    )
+
+
+@compiled(apart=True, bare=True)
+def share_start(line: Line) -> int:
+    """Move the line to where its controlled vehicle's command takes effect; DONE, or what went wrong."""
+    table, clock = line.shared, line.clock
+    copy_table(line.start, table)
+    start_events(table, builds_up(table))
+    now = 0.0
+    for _ in range(BOUND.MOST_EVENTS):
+        if table[ROW.ACTIVE, line.controlled] == 1.0 or now >= clock[DURATION]:
+            clock[SHARED_S] = now
+            return FLAG.DONE
+        if resolve_impacts(table, clock[RESTITUTION]):
+            record_impacts(table, now, 0, line.no_rows, 0)
+            continue
+        sound, now = to_next_event(table, now, clock[DURATION], builds_up(table))
+        if not sound:
+            return FLAG.PENETRATED
+    return FLAG.STUCK
+
+
+@compiled(apart=True, bare=True)
+def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -> int:
+    """Fill what the decelerations ``samples.at[first:end]`` do; DONE, or what went wrong with one of them.
+
+    Where the harm reaches ``bound`` it stands for any harm that is not below it, and the other columns mean nothing.
+    """
+    for s in range(first, end):
+        if s > first and samples.at[s] == samples.at[s - 1]:
+            copy_sample(samples, s - 1, samples, s)
+            continue
+        status = _simulate_one(line, -samples.at[s], bound)
+        if status != FLAG.DONE:
+            return status
+        samples.harm[s] = _sum_row(line, line.harm)
+        samples.other[s] = _sum_row(line, line.other)
+        samples.course[s] = _course(line)
+    return FLAG.DONE
+
+
+@compiled(within=True)
+def _simulate_one(line: Line, command: float, bound: float) -> int:
+    """Leave the harm of one candidate in the line's table."""
+    table, duration = line.table, line.clock[DURATION]
+    table[ROW.COMMAND, line.controlled] = command
+    _copy_state(line.start, table)
+    building = builds_up(table)
+    if move_apart(table, duration, building):
+        return FLAG.DONE
+    _copy_state(line.shared, table)
+    now = line.clock[SHARED_S]
+    for _ in range(BOUND.MOST_EVENTS):
+        status, now = to_next_impact(table, line.clock[RESTITUTION], now, duration, building)
+        if status != FLAG.IMPACT:
+            return status
+        record_impacts(table, now, 0, line.no_rows, 0)
+        if _sum_row(line, line.harm) >= bound or will_stay_apart(table):
+            return FLAG.DONE
+    return FLAG.STUCK
+
+
+@compiled(within=True)
+def _copy_state(of: Floats, table: Floats) -> None:
+    """Put the table into the state of another one; both have the same vehicles."""
+    vehicles = table.shape[1]
+    for i in range(vehicles):
+        table[ROW.SPEED, i] = of[ROW.SPEED, i]
+        table[ROW.ACTIVE, i] = of[ROW.ACTIVE, i]
+        table[ROW.FORCE, i] = of[ROW.FORCE, i]
+        if table.shape[0] > ROW.OF_BUILD_UP:
+            table[ROW.NEXT_PIECE, i] = of[ROW.NEXT_PIECE, i]
+            if table[ROW.PIECES, i] < math.inf:
+                table[ROW.COMMAND, i] = of[ROW.COMMAND, i]
+    for p in range(vehicles - 1):
+        table[ROW.GAP, p] = of[ROW.GAP, p]
+        table[ROW.CONTACT_SPEED, p] = of[ROW.CONTACT_SPEED, p]
+        table[ROW.HIT, p] = of[ROW.HIT, p]
+        table[ROW.FIRST_HARM, p] = of[ROW.FIRST_HARM, p]
+        table[ROW.TOTAL_HARM, p] = of[ROW.TOTAL_HARM, p]
+        table[ROW.COUNT, p] = of[ROW.COUNT, p]
+
+
+@compiled(within=True)
+def copy_table(one: Floats, other: Floats) -> None:
+    """Copy a whole table."""
+    for row in range(one.shape[0]):
+        for i in range(one.shape[1]):
+            other[row, i] = one[row, i]
+
+
+@compiled(within=True)
+def will_stay_apart(table: Floats) -> bool:
+    """Whether surely no pair has another impact, however long everybody's command goes on; False when not sure.
+
+    All commands are in full effect, brake or coast, and nobody moves backward. Every vehicle then keeps the
+    acceleration it has (that of its body, where some rest against each other) until it stands. A pair of front ``f``
+    and rear ``r`` with gap g, closing speed w and decelerations d has no impact where
+
+    * r stands, or both are one body;
+    * ``w <= 0`` and ``d_r >= d_f``: w stays so until r stands, in the kernel's rounding, too;
+    * r would stop behind f, ``g + v_f^2 / 2 d_f > v_r^2 / 2 d_r``, the pair is apart (or separates), and if r brakes
+      harder while it closes the least gap is positive, too: ``w^2 < 2 (d_r - d_f) g``. (If r brakes less hard, the gap
+      is concave until f stands, and falls from then on.) All with margins.
+    """
+    vehicles, hardest = table.shape[1], 0.0
+    if pieces_to_come(table):
+        return False
+    for i in range(vehicles):
+        if table[ROW.ACTIVE, i] == 0.0 or table[ROW.COMMAND, i] > 0.0 or table[ROW.SPEED, i] < 0.0:
+            return False
+        if builds_up(table) and table[ROW.FORCE, i] != table[ROW.COMMAND, i]:
+            return False
+        hardest = max(hardest, -table[ROW.COMMAND, i])
+    for p in range(vehicles - 1):  # what surely meets is soon told
+        closing = table[ROW.SPEED, p + 1] - table[ROW.SPEED, p]
+        if closing > 0.0 and closing * closing >= 2.0 * hardest * table[ROW.GAP, p]:
+            return False
+    accelerate(table)
+    for p in range(vehicles - 1):
+        front, rear = table[ROW.SPEED, p], table[ROW.SPEED, p + 1]
+        gap, closing, harder = (
+            table[ROW.GAP, p],
+            rear - front,
+            table[ROW.ACCELERATION, p] - table[ROW.ACCELERATION, p + 1],
+        )
+        if rear == 0.0 or table[ROW.JOINED, p] == 1.0 or (closing <= 0.0 and harder >= 0.0):
+            continue
+        if not (gap > CLEAR_M or closing < -CLEAR_MPS):
+            return False
+        gap -= CLEAR_M
+        if closing > 0.0 and harder > 0.0 and front > 0.0 and not closing * closing < 2.0 * harder * gap:
+            return False
+        if not gap + _way_to_stop(front, table[ROW.ACCELERATION, p]) > _way_to_stop(
+            rear, table[ROW.ACCELERATION, p + 1]
+        ):
+            return False
+    return True
+
+
+@compiled(within=True)
+def _way_to_stop(speed: float, acceleration: float) -> float:
+    """How far a vehicle goes that slows down or coasts; infinitely far if it coasts (m)."""
+    return speed * speed / (2.0 * abs(acceleration)) if speed > 0.0 else 0.0
+
+
+@compiled(within=True)
+def _course(line: Line) -> float:
+    """A number that says how many impacts each pair, and the obstacle, had."""
+    course, digit, table = 0.0, 1.0, line.table
+    for p in range(line.vehicles, table.shape[1] - 1):
+        course += table[ROW.COUNT, p] * digit
+        digit *= _DIGIT
+    return course + table[ROW.COUNT, 0] * digit if line.vehicles == 1 else course
+
+
+@compiled(within=True)
+def _sum_row(line: Line, row: int) -> float:
+    """Sum of a row over the pairs, and the obstacle's entry, in the order in which NumPy adds up a row."""
+    table, first, total = line.table, line.vehicles, 0.0
+    eights = (table.shape[1] - 1 - first) // 8
+    if eights > 0:
+        total = _sum_eights(table, row, first, first + 8 * eights)
+    for p in range(first + 8 * eights, table.shape[1] - 1):
+        total += table[row, p]
+    return total + table[row, 0] if line.vehicles == 1 else total
+
+
+@compiled(apart=True, bare=True)
+def _sum_eights(table: Floats, row: int, first: int, end: int) -> float:
+    """Sum of whole eights of entries: each place of them by itself, then the places two by two."""
+    return (
+        (_sum_place(table, row, first, end) + _sum_place(table, row, first + 1, end))
+        + (_sum_place(table, row, first + 2, end) + _sum_place(table, row, first + 3, end))
+    ) + (
+        (_sum_place(table, row, first + 4, end) + _sum_place(table, row, first + 5, end))
+        + (_sum_place(table, row, first + 6, end) + _sum_place(table, row, first + 7, end))
+    )
+
+
+@compiled(apart=True, bare=True)
+def _sum_place(table: Floats, row: int, first: int, end: int) -> float:
+    """Sum of every eighth entry."""
+    total = table[row, first]
+    for p in range(first + 8, end, 8):
+        total += table[row, p]
+    return float(total)

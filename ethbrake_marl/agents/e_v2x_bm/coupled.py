@@ -1,0 +1,201 @@
+"""E-V2X-BM coupled: the best constant deceleration of one vehicle in the engine's own physics.
+
+The closed form of ``pairwise`` treats the pairs as independent. Here every candidate is simulated to the horizon with
+velocity exchange, second impacts and resting contact, so the harm found is the harm realised: the only one of the
+three baselines that may bound a shield. docs/baselines.md says how close to the true minimum the search comes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.e_v2x_bm.constants import make_line
+from ethbrake_marl.agents.e_v2x_bm.pairwise import CANDIDATES, closed_form, find_breakpoints, onset_s, optimise_pairwise
+from ethbrake_marl.agents.e_v2x_bm.search import make_room, search_line
+from ethbrake_marl.agents.protocol import Agent, Source, fixed_commands
+from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.env.harm import HarmCount, check_harm_count
+from ethbrake_marl.env.memory import Memory, is_state_free
+from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.errors import InvalidInput, renumbered
+from ethbrake_marl.extensions.certified.estimating_agents import Believing
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.jit import by_parts, compiled
+from ethbrake_marl.physics.rows import FLAG
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+
+_MANY = 200  # worlds to search: fewer are neither remembered nor shared between threads
+
+_REMEMBERED = 32  # searches: the baseline's, which a shield around another agent asks for in the same worlds
+
+_FOUND: dict[bytes, Floats] = {}  # by the SHA-256 of all that was asked
+
+
+class CoupledOptimum(NamedTuple):
+    """The best constant deceleration found in each world [n]."""
+
+    deceleration_mps2: Floats  # a*, in [0, braking capacity]
+    harm: Floats  # realised, under the count that was minimised (m2/s2)
+    first_impact_harm: Floats  # realised with a*
+    total_harm: Floats  # realised with a*
+
+
+def optimise_coupled(
+    worlds: Worlds,
+    vehicle: int,
+    *,
+    harm_count: HarmCount = "first",
+    horizon_s: float = 8.0,
+    others_mps2: Floats | None = None,
+) -> CoupledOptimum:
+    """Constant deceleration of ``vehicle`` (index from 0) with the least realised harm until ``horizon_s``.
+
+    The other vehicles follow ``others_mps2`` [n, N], signed accelerations (default: full braking of all; the
+    controlled vehicle's column is ignored). If braking in the middle of the pairwise collision-free interval
+    proves harmless, it is taken. Otherwise an even grid and the pairwise breakpoints are simulated; where the number of
+    impacts changes, one smooth piece of the harm ends, and that border is located to 1e-9 m/s2; so are the best local
+    minima, on the safe side where the harm jumps. Equal harms are decided by the other count, then by the middle one of
+    the equal decelerations. A world's result does not depend on the batch it is in.
+
+    Raises ``InvalidInput`` for an unknown ``vehicle`` or ``harm_count`` or others beyond their capacities,
+    ``PhysicsError`` naming the worlds in which some candidate could not be simulated as far as it was needed.
+    """
+    check_harm_count(harm_count)
+    capacity = worlds.vehicles.braking_capacity_mps2
+    command = -capacity if others_mps2 is None else np.array(others_mps2, dtype=np.float64)
+    # The closed form lets the others brake with all their capacity: it is what they are told. Who is told to coast or
+    # to drive keeps the capacity: the closed form cannot say what that one does.
+    braking = np.where(command < 0.0, -command, capacity)
+    braking[:, vehicle] = capacity[:, vehicle]
+    told = replace(worlds, vehicles=replace(worlds.vehicles, braking_capacity_mps2=braking))
+    best = closed_form(told, vehicle).deceleration_mps2  # where brakes build up, no more than a first guess
+    command[:, vehicle] = -best
+    _, impacts = advance(worlds, command, until_s=horizon_s)
+    first = impacts.first_impact_harm.sum(axis=1) + impacts.obstacle_first_harm
+    total = impacts.total_harm.sum(axis=1) + impacts.obstacle_total_harm
+    hit = np.flatnonzero(total > 0.0)
+    if hit.size:
+        found = _minimise(worlds, told, command, vehicle, hit, harm_count, horizon_s)
+        harms = (first, total) if harm_count == "first" else (total, first)
+        for column, values in zip((best, *harms), found, strict=True):
+            column[hit] = values
+    return CoupledOptimum(best, first if harm_count == "first" else total, first, total)
+
+
+def _minimise(
+    worlds: Worlds, told: Worlds, command: Floats, vehicle: int, rows: Ints, harm_count: HarmCount, horizon_s: float
+) -> Floats:
+    """Best deceleration of worlds ``rows`` [m], its harm and that of the other count: [3, m]."""
+    v = worlds.vehicles
+    lines = (
+        worlds.gaps_m, worlds.speeds_mps, worlds.time_s, worlds.pair_hit, worlds.obstacle_gap_m, worlds.obstacle_hit,
+        command, told.vehicles.braking_capacity_mps2, onset_s(worlds, vehicle), v.latency_s, v.mass_t,
+        v.speed_limit_mps, worlds.command_mps2, v.brake_rate_mps3, v.release_rate_mps3, v.pieces, v.restitution,
+    )  # fmt: skip
+    question = hashlib.sha256(repr((vehicle, harm_count, horizon_s, worlds.speeds_mps.shape)).encode())
+    for column in (rows, *lines):
+        question.update(np.ascontiguousarray(column).tobytes())
+    key = question.digest()
+    if key in _FOUND:
+        return _FOUND[key].copy()
+
+    def search(part: slice) -> tuple[Floats, Ints]:
+        some = rows[part]
+        found, status = np.empty((3, some.size)), np.empty(some.size, np.int64)
+        _search_worlds(*lines, vehicle, some, harm_count == "total", horizon_s, found, status)
+        return found, status
+
+    parts = by_parts(search, rows.size, (os.cpu_count() or 1) if rows.size >= _MANY else 1)
+    found, status = (np.concatenate(each, axis=-1) for each in zip(*parts, strict=True))
+    if (status != FLAG.DONE).any():
+        with renumbered(rows):
+            raise FLAG.failure(status, worlds.time_s[rows], np.full(rows.size, horizon_s))
+    if rows.size >= _MANY:
+        _FOUND[key] = found.copy()
+        for old in list(_FOUND)[:-_REMEMBERED]:
+            _FOUND.pop(old, None)
+    return found
+
+
+@compiled
+def _search_worlds(
+    gaps: Floats, speeds: Floats, time: Floats, hit: Bools, obstacle: Floats, obstacle_hit: Bools, command: Floats,
+    capacity: Floats, onset: Floats, latency: Floats, mass: Floats, limit: Floats, in_force: Floats, brake_rate: Floats,
+    release_rate: Floats, pieces: Floats, restitution: Floats, vehicle: int, rows: Ints, total: bool, horizon: float,
+    found: Floats, status: Ints,
+) -> None:  # fmt: skip
+    """Fill ``found`` [3, m] and ``status`` [m] for worlds ``rows`` [m]."""
+    room, at, best = make_room(), np.empty(CANDIDATES), np.empty(3)
+    for m in range(rows.shape[0]):
+        k = rows[m]
+        line = make_line(
+            gaps[k], speeds[k], hit[k], obstacle[k], obstacle_hit[k], command[k], latency[k], mass[k], limit[k],
+            in_force[k], brake_rate[k], release_rate[k], pieces[k], time[k], restitution[k], horizon, vehicle, total,
+        )  # fmt: skip
+        find_breakpoints(at, vehicle, gaps[k], speeds[k], capacity[k], onset[k])
+        status[m] = search_line(line, room, at, capacity[k, vehicle], best)
+        for c in range(3):
+            found[c, m] = best[c]
+
+
+Mode = Literal["coupled", "pairwise"]
+
+
+class EV2XBM:
+    """The constant deceleration of least harm.
+
+    ``coupled`` minimises the harm realised in the engine's physics until ``horizon_s`` under ``harm_count``, the
+    others following their scripts, and all vehicles without one (learners) braking fully. ``pairwise`` is the paper's
+    closed form: everybody else brakes fully, and no velocities are exchanged. It remembers ``deceleration_mps2`` [n],
+    which is a*, and ``predicted_harm`` [n], what each of them expects (m2/s2). Raises ``InvalidInput`` for an unknown
+    mode or count, and, when an episode begins, in ``coupled`` mode for another vehicle's script whose command is not
+    fixed at the alert.
+    """
+
+    def __init__(self, mode: Mode = "coupled", *, harm_count: HarmCount = "first", horizon_s: float = 8.0) -> None:
+        if mode not in ("coupled", "pairwise"):
+            raise InvalidInput(f"e_v2x_bm mode {mode!r}: must be 'coupled' or 'pairwise'")
+        check_harm_count(harm_count)
+        self.name = "e_v2x_bm" if mode == "coupled" else "e_v2x_bm:pairwise"
+        self.knows = Source.MODEL if mode == "coupled" else Source.STATE
+        self._mode, self._harm_count, self._horizon_s = mode, harm_count, horizon_s
+
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        """Choose a* from the worlds at the alert."""
+        if self._mode == "pairwise":
+            closed = optimise_pairwise(alert, vehicle)
+            return {"deceleration_mps2": closed.deceleration_mps2, "predicted_harm": closed.harm}
+
+        def is_fixed(script: Script) -> bool:
+            """Whether its command does not wait for that of ``vehicle``, which is scripted itself or free to decide."""
+            chooses_first = isinstance(script, EV2XBM) and (script._mode == "pairwise" or vehicle not in scripts)
+            return is_state_free(script) or chooses_first
+
+        others = fixed_commands(
+            scripts, alert, f"agent {self.name!r}", vehicle=vehicle, is_fixed=is_fixed,
+            advice=f" before vehicle_{vehicle + 1} chooses; take e_v2x_bm:pairwise, which needs nobody's command, for"
+            " one of the two",
+        )  # fmt: skip
+        coupled = optimise_coupled(
+            alert, vehicle, harm_count=self._harm_count, horizon_s=self._horizon_s, others_mps2=others
+        )
+        return {"deceleration_mps2": coupled.deceleration_mps2, "predicted_harm": coupled.harm}
+
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        """``-a*``, [n] m/s2."""
+        return -memory["deceleration_mps2"], memory
+
+
+def make_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
+    """``e_v2x_bm``, the same as ``e_v2x_bm:coupled``, or ``e_v2x_bm:pairwise``; ``:believed`` behind: believing."""
+    if argument not in (None, "coupled", "pairwise"):
+        raise InvalidInput(f"agent {settings.spec!r}: the argument must be 'coupled' or 'pairwise', then 'believed'")
+    mode: Mode = "pairwise" if argument == "pairwise" else "coupled"
+    agent = EV2XBM(mode, harm_count=settings.harm_count, horizon_s=settings.horizon_s)
+    return Believing(agent, settings.needed_scenario()) if settings.believes else agent

@@ -1,0 +1,195 @@
+"""E-V2X-BM in closed form: the constant deceleration of one vehicle that minimises its pairs' predicted harm.
+
+The controlled vehicle's neighbours brake at full capacity from their own latencies; its front and its rear pair are
+treated as independent, so each counts its first contact only and no velocity is exchanged. Predicted harm is
+``H(a) = c_front(a)^2 + c_rear(a)^2`` (m2/s2). Between a handful of closed-form breakpoints it is concave in ``a``, so
+its minimum is at one of them: no grid. docs/proofs/constant-deceleration.md derives all of it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ethbrake_marl.agents.e_v2x_bm.contacts import (
+    TOUCH_SQUARED,
+    closing_speed_squared,
+    least_to_spare_front,
+    most_to_spare_rear,
+)
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Floats, Worlds
+
+CANDIDATES = 6  # 0, capacity, the two thresholds, and two more where the vehicle may brake before its front neighbour
+
+_TIE = 1e-12  # harms closer than this, relative to 1 + harm, are one harm
+
+
+class PairwiseOptimum(NamedTuple):
+    """The closed-form optimum of each world [n]."""
+
+    deceleration_mps2: Floats  # a*, in [0, braking capacity]
+    harm: Floats  # predicted H* (m2/s2)
+    spares_front_mps2: Floats  # smallest deceleration that avoids the front vehicle; inf if none
+    spares_rear_mps2: Floats  # largest deceleration that avoids the rear vehicle; inf if all do, -inf if none
+    breakpoints_mps2: Floats  # [n, 6] every deceleration at which the harm may have its minimum, unordered
+
+
+@compiled
+def early_breakpoints(gap: float, w: float, onset_l: float, onset_f: float) -> tuple[float, float]:
+    """Kink and jump of the front pair's harm when the follower may brake before the leader; (0, 0) otherwise.
+
+    Kink: contact exactly at the leader's onset, ``2 (w lead - gap) / lead^2``. Jump: below ``w^2 / (2 gap)`` the
+    follower strikes the coasting leader lightly, above it grazes past and may strike harder once the leader brakes;
+    the lightest contact that still is an impact stands for the open end. [m/s2]
+    """
+    lead = onset_l - onset_f
+    if lead <= 0.0:
+        return 0.0, 0.0
+    gap = gap - w * onset_f
+    return 2.0 * (w * lead - gap) / (lead * lead), (w * w - 4.0 * TOUCH_SQUARED) / (2.0 * gap)
+
+
+@compiled
+def front_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats) -> float:
+    """Predicted harm of vehicle ``i``'s front pair when it brakes with ``a``; 0 for the first vehicle."""
+    if i == 0:
+        return 0.0
+    return closing_speed_squared(gap[i - 1], speed[i - 1], capacity[i - 1], onset[i - 1], speed[i], a, onset[i])
+
+
+@compiled
+def rear_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats) -> float:
+    """Predicted harm of vehicle ``i``'s rear pair when it brakes with ``a``; 0 for the last vehicle."""
+    if i == gap.shape[0]:
+        return 0.0
+    return closing_speed_squared(gap[i], speed[i], a, onset[i], speed[i + 1], capacity[i + 1], onset[i + 1])
+
+
+@compiled
+def find_breakpoints(
+    at: Floats, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats
+) -> tuple[float, float]:
+    """Fill ``at`` [6] with the candidates of one world, all inside [0, capacity]; returns both thresholds."""
+    low, high = 0.0, math.inf
+    at[:] = 0.0
+    at[1] = capacity[i]
+    if i > 0:
+        f = i - 1
+        low = least_to_spare_front(gap[f], speed[f], capacity[f], onset[f], speed[i], onset[i])
+        at[4], at[5] = early_breakpoints(gap[f], speed[i] - speed[f], onset[f], onset[i])
+    if i < gap.shape[0]:
+        r = i + 1
+        high = most_to_spare_rear(gap[i], speed[i], onset[i], speed[r], capacity[r], onset[r])
+    at[2] = low
+    at[3] = high
+    for k in range(at.shape[0]):
+        if not (0.0 <= at[k] <= capacity[i]):
+            at[k] = 0.0
+    return low, high
+
+
+@compiled
+def minimise_over(
+    at: Floats, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats
+) -> tuple[float, float]:
+    """Least predicted harm over the candidates, and where: in the middle if the harm is flat between minimisers."""
+    best, first, last = math.inf, 0.0, 0.0
+    for k in range(at.shape[0]):
+        if k > 0 and at[k] == 0.0:
+            continue
+        harm = front_harm(at[k], i, gap, speed, capacity, onset) + rear_harm(at[k], i, gap, speed, capacity, onset)
+        if harm < best - _TIE * (1.0 + harm):
+            first, last = at[k], at[k]
+        elif harm <= best + _TIE * (1.0 + best):
+            first, last = min(first, at[k]), max(last, at[k])
+        best = min(best, harm)
+    middle = 0.5 * (first + last)
+    harm = front_harm(middle, i, gap, speed, capacity, onset) + rear_harm(middle, i, gap, speed, capacity, onset)
+    if harm <= best + _TIE * (1.0 + best):
+        return middle, harm
+    harm = front_harm(first, i, gap, speed, capacity, onset) + rear_harm(first, i, gap, speed, capacity, onset)
+    return first, harm
+
+
+@compiled
+def optimise_worlds(
+    gaps: Floats, speeds: Floats, capacity: Floats, onset: Floats, i: int, at: Floats, out: Floats
+) -> None:
+    """Candidates of every world into ``at`` [n, 6], its optimum into ``out`` [4, n]: a*, H*, and the two thresholds."""
+    for k in range(gaps.shape[0]):
+        low, high = find_breakpoints(at[k], i, gaps[k], speeds[k], capacity[k], onset[k])
+        top = min(high, capacity[k, i])
+        if low <= top:
+            out[0, k], out[1, k] = 0.5 * (low + top), 0.0
+        else:
+            out[0, k], out[1, k] = minimise_over(at[k], i, gaps[k], speeds[k], capacity[k], onset[k])
+        out[2, k], out[3, k] = low, high
+
+
+@compiled
+def contacts_of_worlds(gaps: Floats, speeds: Floats, deceleration: Floats, onset: Floats, out: Floats) -> None:
+    """Squared closing speed of every pair alone into ``out`` [n, P]."""
+    for k in range(gaps.shape[0]):
+        for p in range(gaps.shape[1]):
+            out[k, p] = closing_speed_squared(
+                gaps[k, p], speeds[k, p], deceleration[k, p], onset[k, p],
+                speeds[k, p + 1], deceleration[k, p + 1], onset[k, p + 1],
+            )  # fmt: skip
+
+
+def optimise_pairwise(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
+    """E-V2X-BM of controlled ``vehicle`` (index from 0) in every world, in closed form.
+
+    Minimises ``H(a) = c_front^2 + c_rear^2`` over ``a`` in [0, capacity]. If the decelerations that avoid both
+    neighbours form a non-empty interval, ``a*`` is its middle, else the best breakpoint. The first and the last
+    vehicle of a line have one pair; pairs further away (N > 3) are not looked at. Needs the gaps, speeds,
+    capacities and latencies of the vehicle and its two neighbours, nothing else.
+
+    Raises ``InvalidInput`` if ``vehicle`` is not in the line, a vehicle moves backward or brakes build up.
+    """
+    worlds.refuse_build_up("the closed form of E-V2X-BM and planner")
+    return closed_form(worlds, vehicle)
+
+
+def closed_form(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
+    """The optimum were every acceleration there at once."""
+    onset, capacity = onset_s(worlds, vehicle), worlds.vehicles.braking_capacity_mps2
+    at, out = np.empty((worlds.n, CANDIDATES)), np.empty((4, worlds.n))
+    optimise_worlds(worlds.gaps_m, worlds.speeds_mps, capacity, onset, vehicle, at, out)
+    deceleration, harm, front, rear = out
+    return PairwiseOptimum(deceleration, harm, front, rear, at)
+
+
+def pairwise_harm(worlds: Worlds, deceleration_mps2: ArrayLike) -> Floats:
+    """Predicted harm of each pair on its own, [n, P] (m2/s2), under constant decelerations [n, N].
+
+    Every vehicle coasts to its latency and then brakes to rest. The prediction of E-V2X-BM is the sum over the
+    controlled vehicle's pairs. Raises ``InvalidInput`` for a deceleration that is negative or not finite, and where
+    brakes build up.
+    """
+    worlds.refuse_build_up("the closed form of E-V2X-BM and planner")
+    onset = onset_s(worlds, 0)
+    deceleration = np.array(np.broadcast_to(np.asarray(deceleration_mps2, np.float64), worlds.speeds_mps.shape))
+    good = (deceleration >= 0.0) & np.isfinite(deceleration)
+    if not good.all():
+        k, i = (int(x) for x in np.argwhere(~good)[0])
+        raise InvalidInput(f"deceleration_mps2[{k}, {i}] = {deceleration[k, i]:g}: must be finite and >= 0")
+    out = np.empty_like(worlds.gaps_m)
+    contacts_of_worlds(worlds.gaps_m, worlds.speeds_mps, deceleration, onset, out)
+    return out
+
+
+def onset_s(worlds: Worlds, vehicle: int) -> Floats:
+    """Time from now until each vehicle may brake, [n, N]; checks that the closed form applies."""
+    if not 0 <= vehicle < worlds.N:
+        raise InvalidInput(f"vehicle {vehicle}: must be an index in 0..{worlds.N - 1}")
+    if not np.all(worlds.speeds_mps >= 0.0):
+        k, i = (int(x) for x in np.argwhere(~(worlds.speeds_mps >= 0.0))[0])
+        raise InvalidInput(f"speeds_mps[{k}, {i}] = {worlds.speeds_mps[k, i]:g}: the closed form needs speeds >= 0")
+    onset: Floats = np.maximum(worlds.vehicles.latency_s - worlds.time_s[:, None], 0.0)
+    return onset

@@ -1,0 +1,272 @@
+"""The coupled search of one world, compiled: an even look, a closer one, borders, minima, one step back.
+
+``coupled`` says what is searched for, docs/baselines.md why in these steps.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, cast
+
+import numpy as np
+
+from ethbrake_marl.agents.e_v2x_bm.constants import Line, share_start, simulate
+from ethbrake_marl.agents.e_v2x_bm.pairwise import CANDIDATES
+from ethbrake_marl.agents.e_v2x_bm.samples import (
+    NARROWEST_MPS2,
+    Samples,
+    bound_cells,
+    choose,
+    copy_sample,
+    find_minima,
+    find_smallest,
+    least_harm,
+    make_samples,
+    merge,
+    put_in_order,
+)
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.rows import FLAG
+from ethbrake_marl.physics.state import Floats, Ints
+
+GRID = 161  # first look: evenly spaced decelerations from 0 to the capacity
+
+CELLS = 24  # cells of the grid that are looked into, at most
+
+INSIDE = 16  # samples inside such a cell
+
+BORDERS = 6  # borders between two courses of impacts that are located, at most
+
+MINIMA = 6  # local minima of all samples that are followed
+
+_JUMP = 1e-6  # a change of harm (m2/s2) between decelerations 1e-9 m/s2 apart that only a jump explains
+
+_LOOKED = GRID + CANDIDATES + CELLS * INSIDE
+
+_NARROWED = _LOOKED + 2 * BORDERS
+
+_MOST = _NARROWED + MINIMA
+
+_FEW = 6
+
+# Bounds that are no literals, for each of which all physics would be compiled once more:
+_ZERO, _ONE, _FIVE, _GRID_END, _CANDIDATES_END = (cast(int, np.int64(k)) for k in (0, 1, 5, GRID, CANDIDATES))
+
+_SHARES = np.linspace(0.0, 1.0, GRID)
+
+_SHARES_INSIDE = np.arange(1, INSIDE + 1) / (INSIDE + 1)
+
+_FIFTHS = np.arange(1, 5) / 5  # new points between the ends of a border
+
+
+class Room(NamedTuple):
+    """What a search works in, the same for every world of a batch."""
+
+    one: Samples  # the grid, later what was looked at
+    two: Samples  # what was looked at, at the end with borders and minima
+    new: Samples
+    few: Samples
+    values: Floats
+    cells: Ints  # [CELLS] places in a list of samples
+    borders: Ints  # [BORDERS]
+    minima: Ints  # [MINIMA]
+
+
+@compiled
+def make_room() -> Room:
+    """Room for the search of any world."""
+    return Room(
+        make_samples(_MOST), make_samples(_MOST), make_samples(_MOST), make_samples(_FEW), np.empty(_MOST),
+        np.empty(CELLS, np.int64), np.empty(BORDERS, np.int64), np.empty(MINIMA, np.int64),
+    )  # fmt: skip
+
+
+@compiled(apart=True, bare=True)
+def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, out: Floats) -> int:
+    """The best deceleration of a line, its harm and that of the other count into ``out`` [3]; DONE, or what went wrong.
+
+    ``breakpoints`` [CANDIDATES] are looked at beside the grid.
+    """
+    status = share_start(line)
+    if status == FLAG.DONE:
+        status = look_evenly(line, room, breakpoints, capacity)
+    if status == FLAG.DONE:
+        status = look_inside(line, room)
+    if status == FLAG.DONE:
+        status = locate_borders(line, room)
+    if status == FLAG.DONE:
+        status = narrow_minima(line, room)
+    if status == FLAG.DONE:
+        status = step_back(line, room.few, choose(room.two, _MOST, room.values), capacity, out)
+    return status
+
+
+@compiled(apart=True, bare=True)
+def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) -> int:
+    """Samples on the grid in ``room.one``, and with those at the breakpoints in ``room.two``."""
+    grid, new = room.one, room.few
+    for k in range(GRID):
+        grid.at[k] = capacity * _SHARES[k]
+    for k in range(CANDIDATES):
+        new.at[k] = breakpoints[k]
+    put_in_order(new, CANDIDATES)
+    status = simulate(line, grid, _ZERO, _GRID_END, math.inf)
+    if status == FLAG.DONE:
+        status = simulate(line, new, _ZERO, _CANDIDATES_END, math.inf)
+    merge(grid, GRID, new, CANDIDATES, room.two)
+    return status
+
+
+@compiled(apart=True, bare=True)
+def look_inside(line: Line, room: Room) -> int:
+    """Samples inside the cells of the grid that hold a border, or may hide less harm than any sample so far.
+
+    Leaves ``_LOOKED`` samples in ``room.one``: where there are fewer cells, the last one stands for those left.
+    """
+    grid, looked, new, cells, bounds = room.one, room.two, room.new, room.cells, room.values
+    best = least_harm(looked, GRID + CANDIDATES)
+    bound_cells(grid, GRID, bounds)
+    for k in range(GRID - 1):
+        if not (bounds[k] < best or grid.course[k] != grid.course[k + 1]):
+            bounds[k] = math.inf
+    find_smallest(bounds, GRID - 1, cells)
+    found = 0
+    while found < CELLS and bounds[cells[found]] < math.inf:
+        found += 1
+    _put_in_order(cells, found)
+    for c in range(found):
+        low = grid.at[cells[c]]
+        width = grid.at[cells[c] + 1] - low
+        for k in range(INSIDE):
+            new.at[INSIDE * c + k] = low + width * _SHARES_INSIDE[k]
+    status = simulate(line, new, _ZERO, INSIDE * found, math.inf)
+    number = GRID + CANDIDATES + INSIDE * found
+    merge(looked, GRID + CANDIDATES, new, INSIDE * found, grid)
+    for k in range(number, _LOOKED):
+        copy_sample(grid, number - 1, grid, k)
+    return status
+
+
+@compiled(bare=True)
+def _put_in_order(places: Ints, n: int) -> None:
+    """Put the first ``n`` in rising order."""
+    for k in range(1, n):
+        place, to = places[k], k
+        while to > 0 and places[to - 1] > place:
+            places[to] = places[to - 1]
+            to -= 1
+        places[to] = place
+
+
+@compiled(apart=True, bare=True)
+def locate_borders(line: Line, room: Room) -> int:
+    """Both sides of the borders between courses of impacts that may hide less harm, 1e-9 m/s2 apart.
+
+    In between, harm is smooth, and what falls toward a border is least there. Leaves all samples in ``room.two``.
+    """
+    looked, new, few, places, bounds = room.one, room.new, room.few, room.borders, room.values
+    best = least_harm(looked, _LOOKED)
+    bound_cells(looked, _LOOKED, bounds)
+    for k in range(_LOOKED - 1):
+        if not (bounds[k] < best and looked.course[k] != looked.course[k + 1]):
+            bounds[k] = math.inf
+    find_smallest(bounds, _LOOKED - 1, places)
+    for b in range(BORDERS):
+        copy_sample(looked, places[b], few, 0)
+        copy_sample(looked, places[b] + 1, few, 5)
+        if bounds[places[b]] < math.inf:
+            status = _cut(line, few)
+            if status != FLAG.DONE:
+                return status
+        copy_sample(few, 0, new, 2 * b)
+        copy_sample(few, 5, new, 2 * b + 1)
+    put_in_order(new, 2 * BORDERS)
+    merge(looked, _LOOKED, new, 2 * BORDERS, room.two)
+    return FLAG.DONE
+
+
+@compiled(bare=True)
+def _cut(line: Line, few: Samples) -> int:
+    """Bring samples 0 and 5 on both sides of a border together, each time to a fifth."""
+    while few.at[5] - few.at[0] > NARROWEST_MPS2:
+        low, width = few.at[0], few.at[5] - few.at[0]
+        for k in range(4):
+            few.at[1 + k] = low + width * _FIFTHS[k]
+        status = simulate(line, few, _ONE, _FIVE, math.inf)
+        if status != FLAG.DONE:
+            return status
+        border, least = 0, math.inf
+        for k in range(5):
+            lower = min(few.harm[k], few.harm[k + 1])
+            if few.course[k] != few.course[k + 1] and lower < least:
+                border, least = k, lower
+        copy_sample(few, border + 1, few, 5)  # first: it may be sample 1 that moves to 0
+        copy_sample(few, border, few, 0)
+    return FLAG.DONE
+
+
+@compiled(apart=True, bare=True)
+def narrow_minima(line: Line, room: Room) -> int:
+    """Follow the lowest local minima of the samples down to brackets of 1e-9 m/s2; adds where they end."""
+    found, minima, last = room.two, room.minima, _NARROWED - 1
+    find_minima(found, _NARROWED, room.values, minima)
+    for m in range(MINIMA):
+        middle, to = minima[m], _NARROWED + m
+        copy_sample(found, middle, found, to)
+        if room.values[middle] < math.inf:
+            low, high = found.at[max(middle - 1, 0)], found.at[min(middle + 1, last)]
+            status = _narrow(line, room.few, low, high, found, to)
+            if status != FLAG.DONE:
+                return status
+    return FLAG.DONE
+
+
+@compiled(bare=True)
+def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, to: int) -> int:
+    """Bring ``low`` and ``high`` together around the least harm, which is that of ``found[to]``.
+
+    Both sides are cut in three each time. Where nothing is lower than the middle, that stays.
+    """
+    while high - low > NARROWEST_MPS2:
+        middle = found.at[to]
+        left, right = (middle - low) / 3, (high - middle) / 3
+        few.at[0], few.at[1], few.at[2], few.at[3] = low + left, middle - left, middle + right, high - right
+        first, end = 0 if left > 0.0 else 2, 4 if right > 0.0 else 2  # the middle itself is known
+        status = simulate(line, few, first, end, found.harm[to])
+        if status != FLAG.DONE:
+            return status
+        pick, least = -1, found.harm[to]
+        for k in range(first, end):
+            if few.harm[k] < least:
+                pick, least = k, few.harm[k]
+        if pick < 0:
+            low, high = few.at[1], few.at[2]
+            continue
+        low, high = (
+            low if pick == 0 else few.at[0] if pick == 1 else middle if pick == 2 else few.at[2],
+            few.at[1] if pick == 0 else middle if pick == 1 else few.at[3] if pick == 2 else high,
+        )
+        copy_sample(few, pick, found, to)
+    return FLAG.DONE
+
+
+@compiled(apart=True, bare=True)
+def step_back(line: Line, around: Samples, best: float, capacity: float, out: Floats) -> int:
+    """Move a minimum that lies on the very edge of a jump 1e-9 m/s2 to its safe side.
+
+    Otherwise the last bits, which differ when the same motion is advanced step by step, would decide the harm.
+    """
+    for k in range(5):
+        around.at[k] = min(max(best + NARROWEST_MPS2 * (k - 2.0), 0.0), capacity)
+    status = simulate(line, around, _ZERO, _FIVE, math.inf)
+    pick, least, middle = 1, math.inf, 0.0
+    for k in range(3):
+        worst = max(max(around.harm[k], around.harm[k + 1]), around.harm[k + 2])
+        if worst < least:
+            pick, least = k, worst
+        if k == 1:
+            middle = worst
+    if middle - least < _JUMP:
+        pick = 1
+    out[0], out[1], out[2] = around.at[pick + 1], around.harm[pick + 1], around.other[pick + 1]
+    return status

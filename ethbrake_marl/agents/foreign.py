@@ -1,0 +1,383 @@
+"""Policies of other libraries, each as one function: ``(observation, state) -> (action, state)``."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.agents.foreign_wrappers import normalisation, training_environment
+from ethbrake_marl.agents.protocol import Source
+from ethbrake_marl.env.actions import LARGEST, action_to_command
+from ethbrake_marl.env.memory import Memory, checked_memory, map_memory, take_memory
+from ethbrake_marl.env.observations import Observation, Observations, ObservationSpec, choose_observation, observe
+from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.errors import AgentFailed, InvalidInput, describe_error, naming_extras
+from ethbrake_marl.physics.state import Floats, Ints, Worlds
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.observed import Appended, full_state, observation_for, row_features
+from ethbrake_marl.scenario.schema import Scenario
+
+State = Any  # arrays whose first axis is the world, or tuples, lists and mappings of such
+
+Infer = Callable[[Observations, State], tuple[Any, State]]
+
+Begin = Callable[[int], State]  # the memory of n episodes that begin
+
+_KINDS = (
+    "a function of observations, an object with predict, a torch module, an ONNX session or the path of an .onnx file"
+)
+
+
+def adapt_policy(policy: Any, name: str, features: int, initial_state: Begin | None) -> tuple[Infer, Begin | None]:
+    """The policy as such a function, and what makes its memory; raises ``InvalidInput`` for what is none."""
+    if isinstance(policy, str | os.PathLike):
+        policy = _open_onnx(Path(policy), name)
+    if not (hasattr(policy, "run") and hasattr(policy, "get_inputs")) and not hasattr(policy, "predict"):
+        if _is_torch_module(policy):
+            return _ask_torch(policy, name, initial_state is not None), initial_state
+        if callable(policy):
+            call = policy if initial_state else lambda seen, _: (_without_memory(policy(seen)), None)
+            return call, initial_state
+        raise InvalidInput(f"agent {name!r}: {policy!r:.80} is no policy; must be {_KINDS}")
+    if initial_state is not None:
+        raise InvalidInput(
+            f"agent {name!r}: initial_state is for a function (observation, state) -> (action, state); write one"
+            " around this model"
+        )
+    return (_ask_onnx(policy), None) if hasattr(policy, "run") else _ask_model(policy, name, features)
+
+
+def _without_memory(action: Any) -> Any:
+    if isinstance(action, tuple):
+        raise InvalidInput(
+            f"gave a tuple of {len(action)} in place of an action; a policy with a memory gives (action, state), and"
+            " needs initial_state"
+        )
+    return action
+
+
+def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | None]:
+    """A model with ``predict``; where that gives a state, too (sb3-contrib's recurrent ones), the agent keeps it.
+
+    Which axis of the state is that of the worlds is found by asking for two worlds and for three.
+    """
+
+    def predict(seen: Observations, **memory: Any) -> tuple[Any, State]:
+        statistics = normalisation(model)
+        given = seen if statistics is None else statistics.normalize_obs(seen)
+        found = model.predict(given, deterministic=True, **memory)
+        return found if isinstance(found, tuple) else (found, None)
+
+    def world_axis(two: Any, three: Any) -> int:
+        shapes = np.shape(two), np.shape(three)
+        found = [axis for axis, sizes in enumerate(zip(*shapes, strict=True)) if sizes == (2, 3)]
+        if len(found) != 1:
+            raise InvalidInput(f"its state has arrays of shape {shapes[0]} for two worlds and {shapes[1]} for three")
+        return found[0]
+
+    try:
+        like, of_three = (predict(np.zeros((n, features), np.float32))[1] for n in (2, 3))
+        axes = map_memory(world_axis, like, of_three)
+    except Exception as error:
+        raise InvalidInput(f"agent {name!r}: predict on {features} features: {describe_error(error)}") from error
+    if like is None:
+        return lambda seen, _: (predict(seen)[0], None), None
+
+    def infer(seen: Observations, state: State) -> tuple[Any, State]:
+        begins, memory = state
+        kept = None if begins.all() else map_memory(lambda array, axis: np.moveaxis(array, 0, axis), memory, axes)
+        action, memory = predict(seen, state=kept, episode_start=begins)
+        after = map_memory(lambda array, axis: np.moveaxis(to_array(array), axis, 0), memory, axes)
+        return action, (np.zeros(len(seen), np.bool_), after)
+
+    def begin(n: int) -> State:
+        shaped = map_memory(lambda array, axis: np.moveaxis(to_array(array), axis, 0), like, axes)
+        return np.ones(n, np.bool_), map_memory(lambda array: np.zeros((n, *array.shape[1:]), array.dtype), shaped)
+
+    return infer, begin
+
+
+def _ask_onnx(session: Any) -> Infer:
+    given, names = session.get_inputs()[0].name, [output.name for output in session.get_outputs()]
+    wanted = "action" if "action" in names else names[0]
+    return lambda seen, _: (session.run([wanted], {given: seen})[0], None)
+
+
+def _ask_torch(module: Any, name: str, with_state: bool) -> Infer:
+    torch = sys.modules["torch"]
+    for layer in module.modules():
+        if layer.training and isinstance(
+            layer, torch.nn.modules.dropout._DropoutNd | torch.nn.modules.batchnorm._NormBase
+        ):
+            raise InvalidInput(
+                f"agent {name!r}: {type(layer).__name__} is in training mode, where it draws, or mixes the worlds of a"
+                " batch; call eval() of the module first"
+            )
+
+    def call(seen: Observations, state: State) -> tuple[Any, State]:
+        parameter = next(iter(module.parameters()), None)
+        with torch.no_grad():
+            given = torch.from_numpy(np.array(seen)).to("cpu" if parameter is None else parameter.device)
+            return module(given, state) if with_state else (module(given), None)
+
+    return call
+
+
+def _is_torch_module(policy: Any) -> bool:
+    """Never imports torch: whoever has a module has it already."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(policy, torch.nn.Module)
+
+
+def _open_onnx(path: Path, name: str) -> Any:
+    if path.suffix != ".onnx" or not path.is_file():
+        what = (
+            "there is no such file" if path.suffix == ".onnx" else f"a path must be that of an .onnx file, not {path}"
+        )
+        raise InvalidInput(f"agent {name!r}: policy {str(path)!r}: {what}")
+    with naming_extras():
+        import onnxruntime
+    return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+
+
+def weights_sha256(policy: Any) -> str | None:
+    """SHA-256 of an .onnx file, or of the weights of a torch module or a Stable-Baselines3 model as they are now.
+
+    What a ``VecNormalize`` has counted belongs to the weights. None for anything else, whose weights nobody can find.
+    """
+    if isinstance(policy, str | os.PathLike):
+        return hashlib.sha256(Path(policy).read_bytes()).hexdigest() if Path(policy).is_file() else None
+    module: Any = policy if _is_torch_module(policy) else getattr(policy, "policy", None)
+    if not _is_torch_module(module):
+        return None
+    arrays, statistics = dict(module.state_dict()), normalisation(policy)
+    if statistics is not None and statistics.norm_obs:
+        counted = statistics.obs_rms
+        arrays |= {"mean": counted.mean, "var": counted.var, "clip": statistics.clip_obs, "eps": statistics.epsilon}
+    digest = hashlib.sha256()
+    for name, tensor in arrays.items():
+        array = to_array(tensor)
+        digest.update(f"{name} {array.dtype} {array.shape}\n".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def to_array(value: Any) -> NDArray[Any]:
+    """An array, of a tensor too; what is masked is no number."""
+    if isinstance(value, np.ma.MaskedArray):
+        return np.ma.filled(value.astype(np.float64), np.nan)
+    return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
+
+
+def policy_agent(
+    policy: Any,
+    *,
+    name: str | None = None,
+    scenario: Scenario | str | None = None,
+    observation: Observation | None = None,
+    initial_state: Callable[[int], State] | None = None,
+    clip: bool = False,
+    appended: Appended | None = None,
+    ignore_wrappers: bool = False,
+) -> PolicyAgent:
+    """An agent that drives by a policy of any library: observations [n, F] float32 -> actions [n, 1] in [-1, 1].
+
+    A policy with a memory is a function ``(observation, state) -> (action, state)`` with an ``initial_state``, or a
+    model whose ``predict`` gives a state.
+
+    Args:
+        policy: a function, a model with ``predict`` (Stable-Baselines3; asked deterministically, its state kept world
+            by world, its observations normalised by its ``VecNormalize``), a torch module (called as it is, without
+            gradients), an ONNX session, or the path of an ``.onnx`` file. Copies share it.
+        name: in tables and messages; None: the name of the function or class.
+        scenario: the policy observes what learners of it do; or its name.
+        observation: what it observes instead, as ``choose_observation`` reads it; None: that of the scenario, or of the
+            policy itself, or of the environment that a Stable-Baselines3 model has, or the usual one.
+        initial_state: makes the memory of ``n`` episodes that begin: an array whose first axis is the world, or tuples
+            and mappings of such. None: a function has no memory.
+        clip: actions beyond -1 and 1 mean -1 and 1; otherwise they are refused.
+        appended: ``number`` or ``state`` of ``make_sb3_vec_env``, where the policy was trained on such rows; needs the
+            scenario with its learners. None: as in the environment that the model has. Who sees the ``state`` knows
+            the true state of the line.
+        ignore_wrappers: drive a model as it is, although wrappers of its training may have changed what it saw or did,
+            its actions have other bounds, or the statistics of its ``VecNormalize`` are missing.
+
+    Raises ``InvalidInput`` for what is no such policy, one for another number of features, and a model that was trained
+    under wrappers that may change what it sees or does.
+
+    >>> import ethbrake_marl as eb
+    >>> agent = eb.policy_agent(lambda observation: -observation[:, :1].clip(0, 1), name="mine")
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> eb.evaluate(scenario.sample(5, 7), {"mine": agent}, scenario=scenario).worlds.n
+    5
+
+    """
+    scenario = load_scenario(scenario) if isinstance(scenario, str) else scenario
+    of_file = isinstance(policy, str | os.PathLike)
+    named = name or (Path(policy).stem if of_file else str(getattr(policy, "__name__", type(policy).__name__)))
+    trained = training_environment(policy, named, ignore_wrappers=ignore_wrappers)
+    spec = _observation_of(policy, scenario, observation, trained)
+    if appended is None and (appended := getattr(trained, "appended", None)) is not None:
+        scenario = trained.engine.scenario if scenario is None else scenario
+    if appended is not None and scenario is None:
+        raise InvalidInput(f"agent {named!r}: appended = {appended!r} needs the scenario that it was trained in")
+    size = spec.size if scenario is None else len(row_features(spec.features, appended, scenario))
+    shape = getattr(getattr(policy, "observation_space", None), "shape", None)
+    if shape not in (None, (size,)):
+        raise InvalidInput(
+            f"agent {named!r}: the policy takes observations of shape {shape}, here are {size} features;"
+            " give what it was trained on: scenario, observation, or appended (number or state, of make_sb3_vec_env)"
+        )
+    seen = spec if trained is None or ignore_wrappers else trained.engine.observation
+    if [f.name for f in spec.features] != [f.name for f in seen.features]:
+        raise InvalidInput(
+            f"agent {named!r}: the model is trained on other features than {spec}: {seen}; leave"
+            " observation out, and give the scenario it was trained in, or none"
+        )
+    actions = getattr(policy, "action_space", None)
+    low, high = (np.asarray(getattr(actions, end, np.nan)) for end in ("low", "high"))
+    if not (actions is None or ignore_wrappers or (low.tolist() == [-1.0] and high.tolist() == [1.0])):
+        raise InvalidInput(
+            f"agent {named!r}: the policy gives actions in {actions}, here they mean [-1, 1]; write a function around"
+            " it that says what they mean"
+        )
+    infer, begin = adapt_policy(policy, named, size, initial_state)
+    more = None if appended is None or scenario is None else _appending(appended, scenario)
+    agent = PolicyAgent(infer, named, spec, begin, clip, lambda: weights_sha256(policy), more)
+    if appended == "state":
+        agent.knows = Source.STATE
+    return agent
+
+
+def _appending(appended: Appended, scenario: Scenario) -> Callable[[Worlds, int], Observations]:
+    """What stands behind the own observation of one learner, from worlds and vehicle: [n, features]."""
+
+    def number(worlds: Worlds, vehicle: int) -> Observations:
+        if vehicle not in scenario.learners:
+            raise InvalidInput(f"appended = 'number': vehicle_{vehicle + 1} is no learner of {scenario.name!r}")
+        return np.full((worlds.n, 1), scenario.learners.index(vehicle), np.float32)
+
+    return number if appended == "number" else lambda worlds, _: full_state(worlds, scenario)
+
+
+def _observation_of(policy: Any, scenario: Scenario | None, given: Observation | None, trained: Any) -> ObservationSpec:
+    if given is not None:
+        return choose_observation(given, None if scenario is None else scenario.time_step_s)
+    if scenario is not None:
+        return observation_for(scenario)
+    own = getattr(policy, "observation", None) if trained is None else trained.engine.observation
+    return own if isinstance(own, ObservationSpec) else ObservationSpec()
+
+
+class PolicyAgent:
+    """Drives one vehicle by a policy of any library; made by ``policy_agent``."""
+
+    knows = Source.MESSAGES
+
+    def __init__(
+        self,
+        infer: Infer,
+        name: str,
+        observation: ObservationSpec,
+        initial_state: Callable[[int], State] | None,
+        clip: bool,
+        weights_sha256: Callable[[], str | None],
+        more: Callable[[Worlds, int], Observations] | None = None,
+    ) -> None:
+        self.name = name
+        self.weights_sha256 = weights_sha256  # of the policy as it is now; None where nobody can find its weights
+        self.observation = observation
+        self._infer, self._initial_state, self._clip = infer, initial_state, clip
+        self._more = more  # what stands behind the own observation
+
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        """No decision was made yet; the policy's own state is the initial one."""
+        n, state = alert.n, None
+        try:
+            if self._initial_state is not None:
+                state = take_memory(checked_memory(self._initial_state(n), n), np.arange(n))
+        except Exception as error:
+            raise AgentFailed(self.name, None, f"initial_state({n}): {describe_error(error)}") from error
+        return {"steps": np.zeros(n, np.int64), "state": state}
+
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        """Wanted signed acceleration [n], m/s2.
+
+        Raises ``AgentFailed`` naming world and step where the policy raises, or gives another shape, no number, or one
+        that is not in [-1, 1].
+        """
+        seen = observe(worlds, vehicle, self.observation).astype(np.float32, copy=False)
+        if self._more is not None:
+            seen = np.concatenate([seen, self._more(worlds, vehicle)], axis=1, dtype=np.float32)
+        steps = memory["steps"]
+        action, state = self._ask(seen, memory["state"], worlds, steps)
+        values = self._checked(action, seen, worlds, steps)
+        return action_to_command(values, worlds.vehicles, vehicle), {"steps": steps + 1, "state": state}
+
+    def _ask(self, seen: Observations, state: State, worlds: Worlds, steps: Ints) -> tuple[NDArray[Any], State]:
+        try:
+            return self._answer(seen, state, np.arange(worlds.n))
+        except Exception as error:
+            k = self._find_failing(seen, state)
+            first, last = steps.min(initial=10**9) + 1, steps.max(initial=0) + 1  # of all running episodes
+            where = f"step {first}" if first >= last else f"steps {first} to {last}"
+            where = where if k is None else _moment_text(k, worlds, steps)
+            reason = f"{where}: observations of shape {seen.shape}: {describe_error(error)}"
+            raise AgentFailed(self.name, k, reason) from error
+
+    def _answer(self, seen: Observations, state: State, rows: Ints) -> tuple[NDArray[Any], State]:
+        """What the policy says in some rows of the batch, and its memory of them then."""
+        if self._initial_state is None:
+            return to_array(self._infer(seen[rows], None)[0]), None
+        action, state = self._infer(seen[rows], take_memory(state, rows))
+        return to_array(action), checked_memory(state, len(rows))
+
+    def _find_failing(self, seen: Observations, state: State) -> int | None:
+        """The row for which alone the policy fails too, found by halves; None where no half fails."""
+
+        def fails(rows: Ints) -> bool:
+            try:
+                self._answer(seen, state, rows)
+            except Exception:
+                return True
+            return False
+
+        rows = np.arange(len(seen))
+        while len(rows) > 1:
+            halves = (rows[: len(rows) // 2], rows[len(rows) // 2 :])
+            found = next((half for half in halves if fails(half)), None)
+            if found is None:
+                return None
+            rows = found
+        return int(rows[0])
+
+    def _checked(self, action: NDArray[Any], seen: Observations, worlds: Worlds, steps: Ints) -> Floats:
+        """The actions [n] in [-1, 1]."""
+        n, what = worlds.n, f"gave {action.dtype} of shape {action.shape} for observations of shape {seen.shape}"
+        if action.shape != (n, 1) or action.dtype.kind not in "fiu":
+            first = len(action) if action.shape[1:] in ((), (1,)) and action.ndim and len(action) < n else 0
+            raise self._refusal(first, worlds, steps, f"{what}; one number per world is needed, shape ({n}, 1)")
+        values: Floats = action[:, 0].astype(np.float64)
+        if not np.isfinite(values).all():
+            k = int(np.argmin(np.isfinite(values)))
+            raise self._refusal(k, worlds, steps, f"{what}, in which stands {values[k]}; must be in [-1, 1]")
+        inside = np.abs(values) <= LARGEST
+        if not (self._clip or inside.all()):
+            k = int(np.argmin(inside))
+            right = "must be in [-1, 1]; with clip=True the nearest is meant"
+            raise self._refusal(k, worlds, steps, f"{what}, in which stands {values[k]:g}; {right}")
+        return values.clip(-1.0, 1.0)
+
+    def _refusal(self, k: int, worlds: Worlds, steps: Ints, reason: str) -> AgentFailed:
+        return AgentFailed(self.name, k, f"{_moment_text(k, worlds, steps)}: {reason}")
+
+
+def _moment_text(k: int, worlds: Worlds, steps: Ints) -> str:
+    return f"step {steps[k] + 1} ({worlds.time_s[k]:.2f} s)"

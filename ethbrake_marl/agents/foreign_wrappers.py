@@ -1,0 +1,143 @@
+"""Under which wrappers a Stable-Baselines3 model was trained, and whether they change what it sees or does.
+
+An agent drives by the model alone, so a wrapper that changed observations or actions would be missing. Neither
+Stable-Baselines3 nor the libraries of the wrappers need be installed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.env.engine import Engine
+from ethbrake_marl.errors import InvalidInput
+
+# By library, the classes whose methods hand on observations and actions as they are. ``VecNormalize`` is applied.
+HARMLESS = {
+    "gymnasium": (
+        "Env", "Wrapper", "RewardWrapper", "NormalizeReward", "OrderEnforcing", "PassiveEnvChecker", "TimeLimit",
+        "RecordEpisodeStatistics", "RecordVideo", "RenderCollection", "HumanRendering",
+    ),
+    "stable_baselines3": (
+        "VecEnv", "VecEnvWrapper", "DummyVecEnv", "SubprocVecEnv", "Monitor", "VecMonitor", "VecCheckNan",
+        "VecVideoRecorder", "VecNormalize",
+    ),
+    "pettingzoo": (
+        "AECEnv", "ParallelEnv", "BaseWrapper", "BaseParallelWrapper", "OrderEnforcingWrapper",
+        "AssertOutOfBoundsWrapper", "CaptureStdoutWrapper", "RecordVideo", "RecordVideoParallel",
+        "aec_to_parallel_wrapper", "parallel_to_aec_wrapper",
+    ),
+    "supersuit": ("SB3VecEnvWrapper", "ConcatVecEnv", "MarkovVectorEnv", "gym_reward_lambda", "aec_reward_lambda"),
+}  # fmt: skip
+
+_METHODS = ("step", "reset", "step_async", "step_wait", "observe", "last")  # through which observations, actions pass
+
+_INSIDE = ("venv", "envs", "vec_envs", "par_env", "aec_env", "env")  # attributes that hold what is wrapped
+
+
+def changes(layer: type[Any]) -> bool:
+    """Whether a wrapper, or an environment, may change what is seen or done: by the class that defines its methods."""
+    for method in _METHODS:
+        definer = next((each for each in layer.__mro__ if method in vars(each)), object)
+        library = definer.__module__.partition(".")[0]
+        if definer is not object and library != "ethbrake_marl" and definer.__name__ not in HARMLESS.get(library, ()):
+            return True
+    return False
+
+
+class _WhatChanges(type):
+    def __instancecheck__(cls, layer: object) -> bool:
+        return changes(type(layer))
+
+
+class _Changing(metaclass=_WhatChanges):
+    """Anything that ``changes``, for ``env_is_wrapped``, which asks in another process."""
+
+
+def training_environment(model: Any, name: str, *, ignore_wrappers: bool = False) -> Any:
+    """The environment of this package in which a Stable-Baselines3 model is trained, inside whatever wraps it.
+
+    None where the model has none. Raises ``InvalidInput`` for a wrapper, in any copy, that may change what the model
+    sees or does, for copies that observe different features, and where the statistics of ``VecNormalize`` are missing.
+    """
+    statistics = normalisation(model)
+    if statistics is None and not ignore_wrappers and _was_normalised(model):
+        raise InvalidInput(
+            f"agent {name!r}: the model was trained under VecNormalize, whose statistics are missing; load them,"
+            " model.set_env(VecNormalize.load(PATH, venv)), or drive without them by ignore_wrappers=True,"
+            " as is right if it normalised rewards alone"
+        )
+    env, bases = getattr(model, "get_env", lambda: None)(), list[Any]()
+    for layer in [] if env is None else _layers(env):
+        wrapper, inside = _look(layer, name)
+        if hasattr(type(layer), "normalize_obs") and layer is not statistics:
+            wrapper = "VecNormalize inside another one"
+        if wrapper is not None and not ignore_wrappers:
+            raise InvalidInput(
+                f"agent {name!r}: the model was trained under {wrapper}, which may change what it sees or does, and"
+                " here it would drive without; write a function around the model that does the same, or say that"
+                " nothing is changed by ignore_wrappers=True"
+            )
+        bases += inside
+    features = [base.engine.observation.features for base in bases]
+    if not ignore_wrappers and any(each != features[0] for each in features):
+        raise InvalidInput(
+            f"agent {name!r}: the copies of the model's environment observe different features; all need the same"
+        )
+    return bases[0] if bases else None
+
+
+def normalisation(model: Any) -> Any:
+    """Stable-Baselines3's ``VecNormalize`` that the model is trained under, as it counts now; None without one."""
+    return getattr(model, "get_vec_normalize_env", lambda: None)()
+
+
+def _was_normalised(model: Any) -> bool:
+    """Whether what a model keeps of its training, also in a file, shows that its observations were normalised.
+
+    The last of them lies outside the space, or its original is there; off-policy algorithms always have an original.
+    """
+    if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
+        return True
+    seen, space = getattr(model, "_last_obs", None), getattr(model, "observation_space", None)
+    low, high = getattr(space, "low", -np.inf), getattr(space, "high", np.inf)
+    return isinstance(seen, np.ndarray) and not np.all((low <= seen) & (seen <= high))
+
+
+def _layers(env: Any) -> Iterator[Any]:
+    """An environment and all that is inside, in every copy, from the outside in; to one of this package."""
+    yield env
+    for name in [] if _is_ours(env) else _INSIDE:
+        inside = _own(env).get(name, [])
+        for each in inside if isinstance(inside, list | tuple) else [inside]:
+            yield from _layers(each)
+
+
+def _look(layer: Any, name: str) -> tuple[str | None, list[Any]]:
+    """What to call a layer that may change something, else None; and the environments of this package that it is."""
+    if changes(type(layer)):
+        modifier = _own(layer).get("modifier_class", type(layer))  # SuperSuit's
+        return getattr(modifier, "__name__", type(layer).__name__), [layer] if _is_ours(layer) else []
+    if "remotes" not in _own(layer):
+        return None, [layer] if _is_ours(layer) else []
+    try:  # a question that fails ends the process, so each is one that all can answer
+        wrapped, ours = layer.env_is_wrapped(_Changing), layer.has_attr("engine")
+        bases = layer.get_attr("unwrapped") if ours else []
+        odd = [k for k, each in enumerate(wrapped) if each or not ours or changes(type(bases[k]))]
+        return layer.env_method("__str__", indices=odd[0])[0] if odd else None, bases
+    except (OSError, EOFError):
+        raise InvalidInput(
+            f"agent {name!r}: the model's environment runs in other processes, which do not answer; ask before they are"
+            " closed, or load the model from its file"
+        ) from None
+
+
+def _is_ours(env: Any) -> bool:
+    return isinstance(_own(env).get("engine"), Engine)
+
+
+def _own(layer: Any) -> dict[str, Any]:
+    """The attributes of a layer itself; wrappers hand on those of what is inside."""
+    return getattr(layer, "__dict__", {})

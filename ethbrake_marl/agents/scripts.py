@@ -1,0 +1,64 @@
+"""Scripts: full braking, coasting, a constant, and two baselines that know only the vehicle in front."""
+
+from __future__ import annotations
+
+from ethbrake_marl.agents.e_v2x_bm.coupled import make_e_v2x_bm
+from ethbrake_marl.agents.protocol import Agent, Source
+from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics.state import Floats, Worlds
+from ethbrake_marl.registry import Part
+from ethbrake_marl.scenario.roles import ScriptSpec
+
+
+class StateFree:
+    """``full_brake``, ``coast`` or ``constant:a`` (deceleration in m/s2): the same command whatever happens.
+
+    Of a ``profile`` it is the first piece's; the engine goes on to the others (``Worlds.play_pieces``).
+
+    ``full_brake`` of every vehicle is the paper's non-ethical strategy. Raises ``InvalidInput`` for any other script
+    and for a constant beyond the vehicle's capacity.
+    """
+
+    state_free = True
+    knows = Source.SENSORS
+
+    def __init__(self, spec: str) -> None:
+        if not ScriptSpec.parse(spec).is_state_free():
+            raise InvalidInput(f"agent {spec!r}: must be full_brake, coast or constant:a")
+        self.name, self.braking_pieces = spec, ScriptSpec.parse(spec).pieces
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """The constant command, [n] m/s2."""
+        vehicles = worlds.vehicles
+        command = ScriptSpec.parse(self.name).command(
+            vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
+        )
+        assert command is not None
+        return command
+
+
+def make_script(argument: str | None, settings: AgentSettings) -> Agent:
+    """The script of that name."""
+    return StateFree(settings.spec)
+
+
+COAST = Part(make_script, form="coast", about="nothing at all", knows=Source.SENSORS)
+
+FULL_BRAKE = Part(
+    make_script, form="full_brake", about="full braking, the paper's non-ethical strategy", knows=Source.SENSORS
+)
+
+CONSTANT = Part(
+    make_script, form="constant:A", about="this deceleration in m/s2; negative drives", knows=Source.SENSORS
+)
+
+PROFILE = Part(make_script, form="profile:0=A,S=B", about="in pieces; of roles alone", knows=Source.SENSORS)
+
+E_V2X_BM = Part(
+    make_e_v2x_bm,
+    form="e_v2x_bm[:pairwise][:believed]",
+    about="the best constant deceleration in this simulation; pairwise: the paper's closed form, from the true state;"
+    " believed: on what was received, and the scenario's ranges for the rest",
+    knows=Source.MODEL,
+)

@@ -1,0 +1,1 @@
+"""The game: engine, actions, observations, rewards, and the interfaces around them."""

@@ -1,0 +1,231 @@
+"""The compiled step of the engine: actions to commands, motion, episode ends, the terms of reward that all share.
+
+Worlds are rows of ``physics.batch``; ``clock`` [n, 4] holds what an episode needs beside them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.env.actions import command_of
+from ethbrake_marl.env.rewards import RewardParams
+from ethbrake_marl.physics.columns import columns
+from ethbrake_marl.physics.episode import onset_s, stands, step_end_s
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.motion import BOUND, command_acts
+from ethbrake_marl.physics.pieces import force_at
+from ethbrake_marl.physics.rows import FLAG, ROW, place_forces, place_obstacle, rows_for
+from ethbrake_marl.physics.segment import advance_table
+from ethbrake_marl.physics.state import Bools, Floats, Ints
+
+# columns of clock
+START = 0  # time of the first decision (s)
+
+STEP = 1  # steps taken
+
+LAST_STEP = 2  # the step that ends at the horizon
+
+ENDED = 3  # 1 once the episode has ended
+
+CLOCK_WIDTH = 4
+
+# rows of outcome: what the step brought to each world
+STEP_FIRST_HARM = 0
+
+STEP_TOTAL_HARM = 1
+
+TERMINATED = 2  # 1 if the step ended the episode in this way, else 0
+
+TRUNCATED = 3
+
+SAFE_END = 4  # without any collision
+
+FAILED = 5  # what went wrong (a status of the kernel) where the world could not be advanced, else 0
+
+OUTCOME_ROWS = 6
+
+# places in settings
+TIME_STEP, HORIZON, HARM_WEIGHT, HARM_IS_TOTAL, TERMINAL_WEIGHT = range(5)
+
+BAD_ACTION = -1
+
+
+class Step(NamedTuple):
+    """What one step brought, for every world of the batch."""
+
+    reward: Floats  # [n, N]
+    outcome: Floats  # [OUTCOME_ROWS, n] as the kernel tells it; read it through the properties
+    params: RewardParams
+    further: dict[str, Floats]  # unweighted reward terms that differ between vehicles or need the motion, each [n, N]
+
+    @property
+    def terminated(self) -> Bools:
+        """Episodes that ended with this step with everything at rest and no command that would move it, [n]."""
+        return self._is(TERMINATED)
+
+    @property
+    def truncated(self) -> Bools:
+        """Episodes that reached the horizon with this step, [n]."""
+        return self._is(TRUNCATED)
+
+    @property
+    def ended(self) -> Bools:
+        """Episodes that ended with this step, [n]."""
+        return self.terminated | self.truncated
+
+    @property
+    def failed(self) -> Ints:
+        """What went wrong in the worlds that could not be advanced (a status of the kernel), 0 elsewhere, [n]."""
+        return np.asarray(self.outcome[FAILED], np.int64)
+
+    @property
+    def safe_end(self) -> Bools:
+        """Episodes that ended with this step without any collision, [n]."""
+        return self._is(SAFE_END)
+
+    @property
+    def first_impact_harm(self) -> Floats:
+        """Of the whole line in this step, [n]."""
+        return np.asarray(self.outcome[STEP_FIRST_HARM], np.float64)
+
+    @property
+    def total_harm(self) -> Floats:
+        """Likewise, every impact counted, [n]."""
+        return np.asarray(self.outcome[STEP_TOTAL_HARM], np.float64)
+
+    @property
+    def shared(self) -> dict[str, Floats]:
+        """Unweighted reward terms that are the same for all vehicles of a world, each [n]."""
+        return self.params.shared(self.counted_harm, self.outcome[SAFE_END])
+
+    @property
+    def counted_harm(self) -> Floats:
+        """Harm of the whole line in this step, as the reward counts impacts, [n]."""
+        return self.first_impact_harm if self.params.harm_count == "first" else self.total_harm
+
+    def _is(self, row: int) -> Bools:
+        return np.asarray(self.outcome[row] == 1.0, np.bool_)
+
+
+@compiled(apart=True, bare=True)
+def place_row(table: Floats, state: Floats, params: Floats, k: int, pieces: Floats) -> None:
+    """``place_forces`` of a row; a function of its own, as worlds without rates would pay for it in their loop."""
+    column, N = columns(state), pieces.shape[0]
+    command, brake_rate, release_rate = column.command, column.brake_rate, column.release_rate
+    place_forces(
+        table, state[k, command : command + N], params[k, brake_rate : brake_rate + N],
+        params[k, release_rate : release_rate + N], pieces,
+    )  # fmt: skip
+
+
+@compiled
+def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to functions costs more than the work
+    state: Floats, params: Floats, clock: Floats, actions: Floats, learners: Ints, settings: Floats, no_rows: Floats,
+    builds_up: bool, pieces: Floats, wanted: Floats, reward: Floats, outcome: Floats,
+) -> tuple[int, int]:  # fmt: skip
+    """Advance every running world by one step, in place (state, clock, wanted); fills the last two arrays.
+
+    ``actions`` [n, L] become the learners' commands in ``wanted`` [n, N]; nothing is moved if one of them is not in
+    [-1, 1]. A world that cannot be advanced stays where it was; its episode is cut off there, without a reward, and
+    marked in ``outcome``. Without ``builds_up`` no world's brakes do, nor come in ``pieces`` [N, 2 K], those of all
+    worlds. Returns a world and what went wrong there (BAD_ACTION, or the status of one that could not be advanced), or
+    (-1, DONE).
+    """
+    n, N = wanted.shape
+    for k in range(n):
+        for c in range(learners.shape[0]):
+            if not -1.0 <= actions[k, c] <= 1.0:
+                return k, BAD_ACTION
+    column = columns(state)
+    speed, command, previous, gap, harm = column.speed, column.command, column.previous, column.gap, column.harm
+    braking, driving, latency, mass, limit = column.braking, column.driving, column.latency, column.mass, column.limit
+    P, obstacle = N - 1, column.obstacle
+    worst, worst_status = -1, FLAG.DONE
+    at = 1 if state.shape[1] > obstacle else 0  # vehicle i stands in column at + i, behind an obstacle
+    table = np.zeros((rows_for(pieces.shape[1]) if builds_up else ROW.OF_SEGMENT, N + at))
+    for k in range(n):
+        if clock[k, ENDED] == 1.0:
+            for f in range(OUTCOME_ROWS):
+                outcome[f, k] = 0.0
+            for i in range(N):
+                reward[k, i] = 0.0
+            continue
+        for c in range(learners.shape[0]):
+            i = learners[c]
+            wanted[k, i] = command_of(actions[k, c], params[k, braking + i], params[k, driving + i])
+        clock[k, STEP] += 1.0
+        at_horizon = clock[k, STEP] >= clock[k, LAST_STEP]
+        time = state[k, column.time]
+        until = step_end_s(clock[k, STEP], clock[k, LAST_STEP], clock[k, START], settings[TIME_STEP], settings[HORIZON])
+        if at == 1:
+            place_obstacle(table, min(state[k, obstacle], BOUND.FAR_AWAY_M), state[k, obstacle + 1])
+        for i in range(N):
+            table[ROW.SPEED, at + i] = state[k, speed + i]
+            table[ROW.COMMAND, at + i] = wanted[k, i]
+            table[ROW.MASS, at + i] = params[k, mass + i]
+            table[ROW.LIMIT, at + i] = params[k, limit + i]
+            table[ROW.ONSET, at + i] = onset_s(params[k, latency + i], time)
+            state[k, previous + i] = state[k, command + i]
+            if not builds_up:
+                state[k, command + i] = wanted[k, i] if command_acts(params[k, latency + i], until) else 0.0
+        if builds_up:
+            place_row(table, state, params, k, pieces)
+        for p in range(P):
+            table[ROW.GAP, at + p] = state[k, gap + p]
+            table[ROW.HIT, at + p] = state[k, gap + P + p]
+        status = advance_table(table, params[k, column.restitution], until - time, time, k, no_rows, 0)[1]
+        outcome[FAILED, k] = 0.0
+        if status != FLAG.DONE:
+            worst, worst_status = k, status
+            for f in range(OUTCOME_ROWS):
+                outcome[f, k] = 0.0
+            outcome[TRUNCATED, k], outcome[FAILED, k] = 1.0, status
+            clock[k, ENDED] = 1.0
+            clock[k, STEP] -= 1.0
+            for i in range(N):
+                state[k, command + i] = state[k, previous + i]
+                reward[k, i] = 0.0
+            continue
+        state[k, column.time] = until
+        at_rest = True
+        for i in range(N):
+            state[k, speed + i] = table[ROW.SPEED, at + i]
+            at_rest = at_rest and stands(table[ROW.SPEED, at + i], wanted[k, i])
+        if builds_up:
+            for i in range(N):
+                state[k, command + i] = force_at(table, at + i, wanted[k, i], params[k, latency + i], until)
+                at_rest = at_rest and state[k, command + i] <= 0.0
+        impacts, first_harm, total_harm = 0.0, 0.0, 0.0
+        if at == 1 and state[k, obstacle] < math.inf:
+            state[k, obstacle] = table[ROW.GAP, 0]
+            state[k, obstacle + 1] = table[ROW.HIT, 0]
+            state[k, obstacle + 2] += table[ROW.FIRST_HARM, 0]
+            state[k, obstacle + 3] += table[ROW.TOTAL_HARM, 0]
+            state[k, obstacle + 4] += table[ROW.COUNT, 0]
+            first_harm = table[ROW.FIRST_HARM, 0]
+            total_harm = table[ROW.TOTAL_HARM, 0]
+            impacts = state[k, obstacle + 4]
+        for p in range(P):
+            state[k, gap + p] = table[ROW.GAP, at + p]
+            state[k, gap + P + p] = table[ROW.HIT, at + p]
+            state[k, harm + p] += table[ROW.FIRST_HARM, at + p]
+            state[k, harm + P + p] += table[ROW.TOTAL_HARM, at + p]
+            state[k, harm + 2 * P + p] += table[ROW.COUNT, at + p]
+            first_harm += table[ROW.FIRST_HARM, at + p]
+            total_harm += table[ROW.TOTAL_HARM, at + p]
+            impacts += state[k, harm + 2 * P + p]
+        outcome[STEP_FIRST_HARM, k] = first_harm
+        outcome[STEP_TOTAL_HARM, k] = total_harm
+        over = at_rest or at_horizon
+        clock[k, ENDED] = 1.0 if over else 0.0
+        outcome[TERMINATED, k] = 1.0 if at_rest else 0.0
+        outcome[TRUNCATED, k] = 1.0 if over and not at_rest else 0.0
+        outcome[SAFE_END, k] = 1.0 if over and impacts == 0.0 else 0.0
+        shared = settings[TERMINAL_WEIGHT] if outcome[SAFE_END, k] == 1.0 else 0.0
+        shared -= settings[HARM_WEIGHT] * (total_harm if settings[HARM_IS_TOTAL] == 1.0 else first_harm)
+        for i in range(N):
+            reward[k, i] = shared
+    return worst, worst_status

@@ -1,0 +1,153 @@
+"""The contact features: what three forecasts of the vehicle's own command say of its next impacts.
+
+The vehicle looks at the part of the line around it whose news it has, as its other features tell it. It goes on, once
+its own latency has elapsed, with full braking, coasting or full driving. Every other vehicle of that part goes on
+with the command that is observed of it; one of which none is in force brakes fully as soon as its latency has
+elapsed, and so does one that brakes where brakes build up: its command is not seen in the force of the moment.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.env.features import CONTACT_COMMANDS, CONTACT_SIDES
+from ethbrake_marl.physics.columns import columns
+from ethbrake_marl.physics.contact_forecast import CONTACT, forecast_contacts
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.motion import BOUND
+from ethbrake_marl.physics.rows import FLAG, ROW, place_obstacle, place_rates
+from ethbrake_marl.physics.state import Bools, Floats, Ints
+
+FORECAST_S = 10.0  # how far the forecasts look; also the time to an impact that never comes
+
+_OF_PAIR, _HARMS = 4, 2  # numbers of each pair; of the line
+
+_OF_COMMAND = len(CONTACT_SIDES) * _OF_PAIR + _HARMS
+
+_NEAR = len(CONTACT_COMMANDS) * _OF_COMMAND  # columns of contact; behind them are those of contact_far
+
+_FAR = len(CONTACT_SIDES) + _HARMS  # numbers of contact_far for each command
+
+
+class Contacts(NamedTuple):
+    """Which contact features are wanted, and how they are scaled."""
+
+    time_step_s: float  # between two decisions
+    commands: Ints  # those to forecast, as places in CONTACT_COMMANDS
+    features: Floats  # [3, 30], with far [3, 42]: 1 / scale, low, high of every contact feature
+
+
+@compiled
+def observe_contacts(
+    state: Floats, params: Floats, observers: Ints, time_step: float, commands: Ints, features: Floats,
+    out: NDArray[np.float32], failed: Bools,
+) -> None:  # fmt: skip
+    """Fill ``out``, and ``failed`` [n] where a check of the kernel failed."""
+    of = columns(state)
+    N, at = (
+        of.vehicles,
+        1 if state.shape[1] > of.obstacle else 0,
+    )  # vehicle i stands in column at + i, behind an obstacle
+    line, table = np.zeros((ROW.OF_BUILD_UP, N + at)), np.zeros((ROW.OF_BUILD_UP, N + at))
+    found, value = np.zeros((CONTACT.WIDTH, N + at)), np.zeros(_OF_COMMAND + _FAR)
+    no_pieces = np.zeros((N, 0))  # nobody is told how another one will brake
+    for k in range(out.shape[0]):
+        for o in range(observers.shape[0]):
+            i = observers[o]
+            first, last = _place_known(line, state, params, k, i, at)
+            brake_rate, release_rate = of.brake_rate, of.release_rate
+            place_rates(
+                table, params[k, brake_rate : brake_rate + N], params[k, release_rate : release_rate + N], no_pieces
+            )
+            for c in commands:
+                for j in range(N + at):
+                    for row in (ROW.SPEED, ROW.COMMAND, ROW.MASS, ROW.LIMIT, ROW.ONSET, ROW.GAP, ROW.HIT):
+                        table[row, j] = line[row, j]
+                    table[ROW.FORCE, j] = line[ROW.FORCE, j]
+                table[ROW.COMMAND, at + i] = 0.0
+                if c == 0:
+                    table[ROW.COMMAND, at + i] = -params[k, of.braking + i]
+                elif c == 2:
+                    table[ROW.COMMAND, at + i] = params[k, of.driving + i]
+                if forecast_contacts(table, params[k, of.restitution], FORECAST_S, found) != FLAG.DONE:
+                    failed[k] = True
+                    break
+                _tell(table, found, at + i, first, last, time_step, value)
+                for f in range(_OF_COMMAND + _FAR if out.shape[2] > _NEAR else _OF_COMMAND):
+                    column = c * _OF_COMMAND + f if f < _OF_COMMAND else _NEAR + c * _FAR + f - _OF_COMMAND
+                    scaled = value[f] * features[0, column]
+                    out[k, o, column] = min(max(scaled, features[1, column]), features[2, column])
+
+
+@compiled
+def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, at: int) -> tuple[int, int]:
+    """Write world k, as vehicle i knows it, into a table; its first and last columns that are known.
+
+    Whoever is not known stands far away. Where an obstacle is known, it is the first column.
+    """
+    of = columns(state)
+    N, speed, command, gap, obstacle = of.vehicles, of.speed, of.command, of.gap, of.obstacle
+    braking, latency, mass, limit, news = of.braking, of.latency, of.mass, of.limit, of.news
+    by_link, time = params.shape[1] > of.own_latency, state[k, of.time]
+    own_part = of.own_latency if by_link else latency
+    first, last = i, i
+    while first > 0 and time >= params[k, news + i * N + first - 1 if by_link else latency + i]:
+        first -= 1
+    while last < N - 1 and time >= params[k, news + i * N + last + 1 if by_link else latency + i]:
+        last += 1
+    for j in range(N):
+        known = first <= j <= last
+        in_force = state[k, command + j]
+        table[ROW.SPEED, at + j] = state[k, speed + j] if known else 0.0
+        table[ROW.MASS, at + j] = params[k, mass + j]
+        table[ROW.LIMIT, at + j] = params[k, limit + j]
+        table[ROW.ONSET, at + j] = 0.0
+        table[ROW.COMMAND, at + j] = in_force if known else 0.0
+        if j == i or in_force == 0.0:
+            table[ROW.ONSET, at + j] = max(params[k, own_part + j] - time, 0.0)
+            table[ROW.COMMAND, at + j] = -params[k, braking + j] if known else 0.0
+        elif known and in_force < 0.0 and params[k, of.brake_rate + j] < math.inf:  # it may build up still
+            table[ROW.COMMAND, at + j] = -params[k, braking + j]
+        table[ROW.FORCE, at + j] = in_force if known else 0.0
+        if j < N - 1:
+            table[ROW.GAP, at + j] = state[k, gap + j] if first <= j < last else BOUND.FAR_AWAY_M
+            table[ROW.HIT, at + j] = state[k, gap + N - 1 + j]
+    if at == 1:
+        seen = first == 0 and state[k, obstacle] < math.inf
+        place_obstacle(table, state[k, obstacle] if seen else BOUND.FAR_AWAY_M, state[k, obstacle + 1])
+        return (0 if seen else 1 + first), 1 + last
+    return first, last
+
+
+@compiled
+def _tell(table: Floats, found: Floats, own: int, first: int, last: int, time_step: float, value: Floats) -> None:
+    """The numbers of one forecast before scaling; 0 for a pair whose other vehicle is not known, or not there.
+
+    An impact at the very end of a decision step belongs to that step, as in the engine.
+    """
+    for side in range(2):
+        p, at = own - 1 + side, side * _OF_PAIR
+        if not first <= p < last:
+            for f in range(_OF_PAIR):
+                value[at + f] = 0.0
+            continue
+        time = found[CONTACT.TIME, p]
+        met = time < math.inf
+        steps = (time if met else FORECAST_S) / time_step
+        whole = max(math.ceil(steps) - 1.0, 0.0)
+        value[at] = time if met else FORECAST_S
+        value[at + 1] = found[CONTACT.CLOSING, p]
+        value[at + 2] = steps - whole if met else 0.0
+        value[at + 3] = whole
+    first_harm, total_harm = 0.0, 0.0
+    for p in range(first, last):
+        first_harm += table[ROW.FIRST_HARM, p]
+        total_harm += table[ROW.TOTAL_HARM, p]
+    value[2 * _OF_PAIR] = first_harm
+    value[2 * _OF_PAIR + 1] = total_harm
+    value[_OF_COMMAND], value[_OF_COMMAND + 1] = value[0], value[_OF_PAIR]
+    value[_OF_COMMAND + 2], value[_OF_COMMAND + 3] = math.sqrt(first_harm), math.sqrt(total_harm)

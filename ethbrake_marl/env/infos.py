@@ -1,0 +1,304 @@
+"""Infos of every interface, computed once for all vehicles of all worlds: the same keys after a reset and a step.
+
+``time_s``, ``command_in_force_mps2`` (in force up to now; 0 up to the latency), ``chosen_command_mps2`` and
+``chosen_action`` (what the vehicle asked for, whoever chose it; 0 before a learner's first step), the vehicle's share
+of the harm so far under both counts, the same for the whole world, and whether anything has collided. Of the last
+step: ``cost`` (the harm it added to the line, as the reward counts impacts; for safe-RL libraries) and
+``reward_NAME``, each term of the reward before its weight; after a reset they are 0. ``world_seed`` and ``world``
+name the world, so that it can be played again (-1: it was given). Where the scenario has a ``v2x`` channel also
+``known_from_s`` [N]: from when on this vehicle acts on news of each one (infinite: never; of itself: its latency);
+and where its messages are periodic ``age_s`` [N]: how old the newest sample is that it was told of each (infinite:
+none). Behind a shield also what that reports, as ``shield_NAME``.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.env.actions import action_of
+from ethbrake_marl.env.compiled_step import Step
+from ethbrake_marl.env.draws import Columns, describe_worlds
+from ethbrake_marl.env.engine import Engine
+from ethbrake_marl.env.harm import front_share
+from ethbrake_marl.env.making import INITIAL_STATE, LISTED_WORLD, chosen_seed, wanted_worlds, warn_of_unknown
+from ethbrake_marl.env.motion import Viewer
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics.columns import Packed, columns
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.messages import Messages
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+
+COLUMNS = (
+    "time_s",
+    "command_in_force_mps2",
+    "first_impact_harm",
+    "total_harm",
+    "world_first_impact_harm",
+    "world_total_harm",
+    "collided",
+    "chosen_command_mps2",
+    "chosen_action",
+)
+
+_FLOAT32 = np.dtype(np.float32)
+
+
+def shield_columns(engine: Engine, rows: Ints | None = None) -> Columns:
+    """What the shield in an engine reports, ``shield_NAME`` -> [n, N]; only of the worlds ``rows`` if given."""
+    if engine.guard is None or engine.guarded is None:
+        return {}
+    every = slice(None) if rows is None else rows
+    return {f"shield_{name}": column[every] for name, column in engine.guard.report(engine).items()}
+
+
+def plain_rows(columns: Columns, vehicles: Ints, count: int) -> list[dict[str, Any]]:
+    """Columns [n, N] as plain values by name, for each of these vehicles, world by world: ``count`` in all."""
+    values = [column.take(vehicles, axis=1).reshape(-1).tolist() for column in columns.values()]
+    return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)] or [{} for _ in range(count)]
+
+
+class Report(NamedTuple):
+    """What there is to tell about n worlds of N vehicles."""
+
+    values: Floats  # [n, N, len(COLUMNS)]
+    cost: Floats  # [n] harm of the step (m2/s2); 0 without one
+    terms: dict[str, Floats]  # reward terms of the step, each [n], shared by all vehicles, or [n, N]; 0 without one
+    world_seed: int
+    world: Ints  # [n] numbers in the stream of that seed
+    known_from_s: Floats | None  # [n, N, N] where there is a channel
+    age_s: Floats | None  # [n, N, N] where its messages are periodic
+    shield: Columns  # each [n, N]; none without a shield
+
+    @classmethod
+    def of(cls, engine: Engine, step: Step | None = None, rows: Ints | None = None) -> Report:
+        """The engine's worlds as they are now, before any of them is renewed; only the worlds ``rows`` if given."""
+        (state, params), wanted, world = engine.packed, engine.wanted_mps2, engine.roster.numbers
+        if rows is not None:
+            state, params, wanted = (array.take(rows, axis=0) for array in (state, params, wanted))
+            world = world.take(rows)
+        values = np.empty((*wanted.shape, len(COLUMNS)))
+        _report_rows(state, params, wanted, values)
+        N = wanted.shape[1]
+        shown = Packed(state, params)
+        known = shown.known_from_s if shown.has_news else None
+        cost = np.zeros(len(world))
+        terms = dict.fromkeys(engine.reward_terms, cost)
+        if step is not None:
+            every = step.shared | step.further
+            terms = {name: every[name] for name in engine.reward_terms}
+            cost = step.counted_harm
+            if rows is not None:
+                cost, terms = cost.take(rows), {name: term.take(rows, axis=0) for name, term in terms.items()}
+        time_s, messages = state[:, shown.column.time], params[:, shown.column.messages :]
+        age = Messages(messages, N).age_s(time_s) if shown.has_messages else None
+        return cls(values, cost, terms, engine.roster.seed, world, known, age, shield_columns(engine, rows))
+
+    def columns(self) -> dict[str, Floats]:
+        """What is told of every vehicle, by name, each [n, N]."""
+        return {name: self.values[:, :, c] for c, name in enumerate(COLUMNS)}
+
+    def plain_infos(self, vehicles: Ints) -> list[dict[str, Any]]:
+        """Infos of these vehicles, world by world, as plain numbers; ``chosen_action`` is an array [1]."""
+        worlds: list[list[list[Any]]] = self.values.take(vehicles, axis=1).tolist()
+        numbers, costs = self.world.tolist(), self.cost.tolist()
+        terms = {
+            f"reward_{name}": (
+                term[:, np.newaxis].repeat(len(vehicles), axis=1) if term.ndim == 1 else term[:, vehicles]
+            ).tolist()
+            for name, term in self.terms.items()
+        }
+        infos: list[dict[str, Any]] = []
+        for k, world in enumerate(worlds):
+            for v, (time, force, first, total, world_first, world_total, collided, chosen, action) in enumerate(world):
+                chosen_action = np.empty(1, _FLOAT32)
+                chosen_action[0] = action
+                info = {
+                    "time_s": time,
+                    "command_in_force_mps2": force,
+                    "first_impact_harm": first,
+                    "total_harm": total,
+                    "world_first_impact_harm": world_first,
+                    "world_total_harm": world_total,
+                    "collided": collided == 1.0,
+                    "chosen_command_mps2": chosen,
+                    "chosen_action": chosen_action,
+                    "cost": costs[k],
+                    "world_seed": self.world_seed,
+                    "world": numbers[k],
+                }
+                infos.append(info | {name: term[k][v] for name, term in terms.items()})
+        for name, news in (("known_from_s", self.known_from_s), ("age_s", self.age_s)):
+            if news is not None:
+                of_these = news.take(vehicles, axis=1)
+                for info, row in zip(infos, of_these.reshape(-1, of_these.shape[2]), strict=True):
+                    info[name] = row.copy()
+        for info, of_shield in zip(infos, plain_rows(self.shield, vehicles, len(infos)), strict=True):
+            info |= of_shield
+        return infos
+
+    def batch_info(self, vehicle: int, rows: Bools, stepped: Bools) -> dict[str, Any]:
+        """One vehicle in many worlds as Gymnasium's vector infos: ``name`` [n] and its mask ``_name`` [n].
+
+        The worlds marked by ``rows`` are told of. What a step brought is 0 but in the worlds marked by ``stepped``.
+        """
+        columns: dict[str, NDArray[Any]] = {name: told[:, vehicle] for name, told in self.columns().items()}
+        columns["collided"] = columns["collided"] == 1.0
+        columns["chosen_action"] = columns["chosen_action"].astype(np.float32)[:, np.newaxis]
+        columns["cost"] = np.where(stepped, self.cost, 0.0)
+        columns["world_seed"], columns["world"] = np.full(len(rows), self.world_seed), self.world
+        for name, term in self.terms.items():
+            columns[f"reward_{name}"] = np.where(stepped, term if term.ndim == 1 else term[:, vehicle], 0.0)
+        if self.known_from_s is not None:
+            columns["known_from_s"] = self.known_from_s[:, vehicle]
+        if self.age_s is not None:
+            columns["age_s"] = self.age_s[:, vehicle]
+        columns |= {name: column[:, vehicle] for name, column in self.shield.items()}
+        masked: dict[str, Any] = {}
+        for name, column in columns.items():
+            masked[name] = np.zeros_like(column, order="C")
+            masked[name][rows] = column[rows]
+            masked[f"_{name}"] = rows.copy()
+        return masked
+
+
+@compiled
+def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> None:
+    """Fill ``out`` [n, N, ...] with the columns of AFTER_A_STEP."""
+    n, N = wanted.shape
+    column = columns(state)
+    P, harm, mass, obstacle = N - 1, column.harm, column.mass, column.obstacle
+    for k in range(n):
+        first, total, impacts = 0.0, 0.0, 0.0
+        for i in range(N):
+            out[k, i, 2] = 0.0
+            out[k, i, 3] = 0.0
+        if state.shape[1] > obstacle:
+            first, total, impacts = state[k, obstacle + 2], state[k, obstacle + 3], state[k, obstacle + 4]
+        for p in range(P):
+            for count in range(2):
+                value = state[k, harm + count * P + p]
+                front = front_share(value, params[k, mass + p], params[k, mass + p + 1])
+                out[k, p, 2 + count] += front
+                out[k, p + 1, 2 + count] += value - front
+            first += state[k, harm + p]
+            total += state[k, harm + P + p]
+            impacts += state[k, harm + 2 * P + p]
+        if state.shape[1] > obstacle:  # after the pairs, as in the ledger
+            out[k, 0, 2] += state[k, obstacle + 2]
+            out[k, 0, 3] += state[k, obstacle + 3]
+        for i in range(N):
+            out[k, i, 0] = state[k, column.time]
+            out[k, i, 1] = state[k, column.command + i]
+            out[k, i, 4] = first
+            out[k, i, 5] = total
+            out[k, i, 6] = 1.0 if impacts > 0.0 else 0.0
+            out[k, i, 7] = wanted[k, i]
+            braking, driving = params[k, column.braking + i], params[k, column.driving + i]
+            out[k, i, 8] = action_of(wanted[k, i], braking, driving)
+
+
+class Begun:
+    """What the interfaces share: an engine in which episodes have begun, or not yet, and the seed of its worlds.
+
+    ``np_random`` and ``np_random_seed`` mean what they mean in ``gymnasium.Env``.
+    """
+
+    engine: Engine
+    _known_options: Sequence[str] = (INITIAL_STATE, LISTED_WORLD)
+    _started = False
+    _goes_on = False  # a reset without a seed goes on in the running stream
+    _np_random: np.random.Generator | None = None
+    _np_random_seed: int | None = None  # -1: nobody knows, since the user set the generator
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """A generator for wrappers to draw from; the worlds come from ``np_random_seed`` alone.
+
+        Once you set another generator, each ``reset`` without a seed draws the seed of its worlds from it, until a
+        ``reset`` with one.
+        """
+        if self._np_random is None:
+            self._set_seed(chosen_seed(None))
+            assert self._np_random is not None
+        return self._np_random
+
+    @np_random.setter
+    def np_random(self, generator: np.random.Generator) -> None:
+        if not isinstance(generator, np.random.Generator):
+            raise InvalidInput(f"np_random = {generator!r}: must be a numpy.random.Generator")
+        self._np_random, self._np_random_seed, self._goes_on = generator, -1, False
+
+    @property
+    def np_random_seed(self) -> int:
+        """Seed of the stream of worlds, from fresh entropy where nobody named one; -1 once ``np_random`` was set."""
+        if self._np_random_seed is None:
+            self._set_seed(chosen_seed(None))
+            assert self._np_random_seed is not None
+        return self._np_random_seed
+
+    def _set_seed(self, seed: int) -> None:
+        self._np_random, self._np_random_seed = np.random.default_rng(seed), seed
+
+    def _restart(self, seed: int | None, options: Mapping[str, Any] | None) -> None:
+        """Start new episodes in all worlds: the stream of ``seed`` from its start, or where the stream stands.
+
+        ``options["initial_state"]`` (see ``Scenario.worlds_from_state``) is the start of every world instead;
+        ``options["listed_world"] = {"seed": 7, "number": 3}`` starts in that world of the list on which agents are
+        evaluated, a batch in that one and those after it. With autoreset, later episodes come from the stream. Other
+        options warn with ``UnknownResetOption`` and are ignored. Raises ``InvalidInput``, with nothing changed, for a
+        seed that is not a whole number >= 0, a bad initial state or listed world, or both of them.
+        """
+        named = None if seed is None else chosen_seed(seed)
+        if not (options is None or isinstance(options, Mapping)):
+            raise InvalidInput(
+                f"reset: options = {options!r}: must be None or a mapping, for instance {{'{INITIAL_STATE}': ...}}"
+            )
+        warn_of_unknown(options or (), self._known_options)
+        self._begin(named, wanted_worlds(self.engine, options or {}))
+
+    def _begin(self, seed: int | None, worlds: Worlds | None) -> None:
+        """Start these worlds, or those of the stream: of ``seed``, of the user's generator, or where it stands."""
+        drawn, used = seed is None and self._np_random_seed == -1, seed
+        if drawn:
+            used = int(copy.deepcopy(self.np_random).integers(2**63))  # a copy: the reset may still be refused
+        elif seed is None and not self._goes_on:
+            used = self.np_random_seed
+        self.engine.reset(seed=used, worlds=worlds)
+        if drawn:
+            self.np_random.integers(2**63)
+        elif seed is not None:
+            self._set_seed(seed)
+        self._started = self._goes_on = True
+
+    def _check_started(self, what: str) -> None:
+        if not self._started:
+            raise InvalidInput(f"{what}: no episode was started; call reset first")
+
+    def describe_worlds(self) -> Columns:
+        """What each running world was drawn as: columns by name, each [worlds]; see ``describe_worlds`` of the file."""
+        self._check_started("describe_worlds")
+        return describe_worlds(self.engine)
+
+
+class OneWorld(Begun):
+    """... of one world, which is shown by a viewer."""
+
+    viewer: Viewer
+
+    def describe_world(self) -> dict[str, Any]:
+        """What the running world was drawn as: flat numbers and texts by name; see ``describe_worlds``."""
+        self._check_started("describe_world")
+        return {name: column[0].item() for name, column in describe_worlds(self.engine).items()}
+
+    def render(self) -> Any:
+        """What the render mode says: a frame [H, W, 3] uint8, a list of new ones, a text, or None for ``human``."""
+        return self.viewer.render()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self.viewer.close()

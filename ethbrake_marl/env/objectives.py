@@ -1,0 +1,276 @@
+"""Objectives, whose harm counts: what each vehicle's objective makes of the harm of the line, from the one ledger.
+
+Every objective but the last is an amount of harm (m2/s2) to be made small; ``H_i`` is what vehicle i bears, ``H``
+what all do:
+
+==================  ================================================================================================
+total               ``H``: everybody's harm alike; the same number for all vehicles
+own                 ``H_i``
+social:phi          ``cos(phi) H_i + sin(phi) (H - H_i)``, social value orientation: phi from 0 (own harm only)
+                    over 45 (prosocial) to 90 degrees (the others' only)
+maximin             ``max_j H_j``: the harm of whoever bears most
+mass-weighted       ``N sum_j m_j H_j / sum_j m_j``: harm in a heavy vehicle counts for more
+weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``: one weight (1e-6 to 1e6) for each vehicle, as for its occupants
+injury:curve        injuries in 1,000 lines, by the pair that injures a vehicle more (``Ledger.speed_changes``)
+==================  ================================================================================================
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.env.harm import INJURY_CURVES, HarmCount, Ledger, injury_probability
+from ethbrake_marl.errors import InvalidInput, describe_error, unknown_name
+from ethbrake_marl.files.yaml import parse_numeral
+from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.registry import Registry
+
+STANDARD = ("total", "own", "social:45", "maximin", "mass-weighted")  # those that need no knowledge of the scenario
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
+
+Declared = str | tuple[str, ...]  # one objective for all vehicles, or one for each
+
+
+class Objective(NamedTuple):
+    """A parsed objective."""
+
+    kind: str
+    angle_deg: float = 0.0
+    weights: tuple[float, ...] = ()
+    curve: str = ""
+
+
+class HarmSoFar(NamedTuple):
+    """What objectives are computed from, for n worlds of N vehicles; it cannot be written to."""
+
+    borne: Floats  # [n, N] what each vehicle bears, m2/s2
+    whole: Floats  # [n] what all do
+    mass_t: Floats  # [n, N]
+    front_change_mps: Floats  # [n, N] change of speed of each vehicle, hit in front
+    rear_change_mps: Floats  # [n, N] likewise, hit at the rear
+
+
+ObjectiveFunction = Callable[[HarmSoFar, int], Floats]
+
+
+class Kind(NamedTuple):
+    """One line of the table of objectives."""
+
+    form: str  # how it is written; without ":" it takes no argument
+    about: str
+    amount: Callable[[Objective, HarmSoFar, int], Floats]  # of a vehicle, [n]: less is better
+    function: ObjectiveFunction | None = None  # what somebody registered
+
+
+@lru_cache(maxsize=256)
+def parse_objective(text: str) -> Objective:
+    """Read ``total``, ``own``, ``social:45``, ``maximin``, ``mass-weighted``, ``weighted:1,4,1`` or ``injury:lr4s``.
+
+    Raises ``InvalidInput`` for an unknown name, an angle outside [0, 90] degrees, a weight outside [1e-6, 1e6], or a
+    curve that is none.
+    """
+    kind, colon, argument = text.partition(":")
+    if ":" not in OBJECTIVES[kind].form:
+        if colon:
+            raise InvalidInput(f"objective {text!r}: {kind} takes no argument")
+        return Objective(kind)
+    if kind == "injury":
+        if argument not in INJURY_CURVES:
+            raise unknown_name("injury curve", argument, INJURY_CURVES)
+        return Objective(kind, curve=argument)
+    written = [parse_numeral(part.strip()) for part in argument.split(",")]
+    numbers = tuple(number for number in written if number is not None) if None not in written else ()
+    if kind == "social":
+        if len(numbers) != 1 or not 0.0 <= numbers[0] <= 90.0:
+            raise InvalidInput(f"objective {text!r}: social needs an angle from 0 to 90 degrees, as in social:45")
+        return Objective(kind, angle_deg=numbers[0])
+    if not numbers or not all(1e-6 <= weight <= 1e6 for weight in numbers):
+        raise InvalidInput(
+            f"objective {text!r}: weighted needs a weight from 1e-6 to 1e6 for each vehicle, as in weighted:1,4,1"
+        )
+    return Objective(kind, weights=numbers)
+
+
+def check_declared(declared: object) -> None:
+    """Refuse, with ``InvalidInput``, what is not an objective or a list of some, however many vehicles there are."""
+    each = [declared] if isinstance(declared, str) else declared
+    if not isinstance(each, list | tuple) or not all(isinstance(text, str) for text in each):
+        raise InvalidInput("objective: must be a name, for instance own or social:45, or a list with one per vehicle")
+    for text in each:
+        parse_objective(text)
+
+
+def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
+    """The objective of each of ``vehicles`` vehicles; ``InvalidInput`` if there are too many or too few."""
+    check_declared(declared)
+    each = (declared,) * vehicles if isinstance(declared, str) else tuple(declared)
+    if len(each) != vehicles:
+        raise InvalidInput(
+            f"objective: {len(each)} entries; {vehicles} vehicles need {vehicles} (one per vehicle), or one for all"
+        )
+    parsed = tuple(parse_objective(text) for text in each)
+    for text, objective in zip(each, parsed, strict=True):
+        if objective.weights and len(objective.weights) != vehicles:
+            given = len(objective.weights)
+            raise InvalidInput(f"objective {text!r}: {given} weights; {vehicles} vehicles need {vehicles}")
+    return parsed
+
+
+def objective_harm(ledger: Ledger, harm_count: HarmCount, objectives: Sequence[Objective]) -> Floats:
+    """What the objective of each vehicle makes of the harm so far, [n, N] (m2/s2, or injuries): less is better."""
+    harms = ledger.vehicle_harm(harm_count), ledger.world_harm(harm_count)
+    told = *harms, ledger.mass_t, *ledger.speed_changes(harm_count)
+    harm = HarmSoFar(*(np.broadcast_to(each, each.shape) for each in told))  # read-only
+    return np.stack([OBJECTIVES[o.kind].amount(o, harm, i) for i, o in enumerate(objectives)], axis=1)
+
+
+def standard_objectives() -> tuple[str, ...]:
+    """The built-in objectives that need no knowledge of the scenario, then those of others that were loaded."""
+    return (*STANDARD, *(name for name, kind in OBJECTIVES.loaded.items() if kind.function is not None))
+
+
+def declared_objectives(texts: Sequence[str], vehicles: int) -> list[str]:
+    """Objectives by name, ``standard`` standing for all that need no knowledge of the scenario.
+
+    Raises ``InvalidInput`` for one that is unknown, given twice, or made for another number of vehicles.
+    """
+    names = [name for text in texts for name in (standard_objectives() if text == "standard" else (text,))]
+    for k, name in enumerate(names):
+        objectives_of(name, vehicles)
+        if name in names[:k]:
+            raise InvalidInput(f"objective {name!r} is given twice")
+    return names
+
+
+def register_objective(name: str, function: ObjectiveFunction) -> None:
+    """Make ``objective: name`` known to every scenario and reward, and to ``--objective``.
+
+    An installed package does the same with an entry point of the group ``ethbrake_marl.objectives`` that names the
+    function.
+
+    Args:
+        name: 1 to 64 of ``a-z``, digits, ``-`` and ``_``.
+        function: from ``HarmSoFar`` and the vehicle (0 = front) to the amount of harm that this vehicle is to make
+            small, [n] (m2/s2); its docstring says what it is.
+
+    Registering the same again changes nothing. Raises ``AlreadyExists`` for another one under a name that is taken,
+    ``InvalidInput`` for a name that is none and for a function without a docstring.
+
+    """
+    if not isinstance(name, str) or _NAME.fullmatch(name) is None:
+        raise InvalidInput(f"objective {name!r:.80}: must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _")
+    if not callable(function) or not (function.__doc__ or "").strip():
+        raise InvalidInput(f"objective {name!r}: needs a function with a docstring that says what it is")
+
+    def amount(_: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
+        try:
+            given = np.asarray(function(harm, vehicle))
+        except Exception as error:
+            raise InvalidInput(f"objective {name!r}: of vehicle_{vehicle + 1}: {describe_error(error)}") from error
+        worlds = len(harm.whole)
+        if given.shape != (worlds,) or given.dtype.kind not in "fiub":
+            raise InvalidInput(
+                f"objective {name!r}: gave {given.dtype} of shape {given.shape}; must be numbers of shape ({worlds},),"
+                " one per world"
+            )
+        if not np.isfinite(given).all():
+            world = int(np.argmin(np.isfinite(given)))
+            raise InvalidInput(
+                f"objective {name!r}: is {given[world]} for vehicle_{vehicle + 1} in world {world}; must be finite"
+            )
+        return given.astype(np.float64)
+
+    entry = Kind(name, " ".join((function.__doc__ or "").split()), amount, function)
+    OBJECTIVES.add(name, entry, lambda kind: kind.function is function)
+
+
+def scored(ledger: Ledger, harm_count: HarmCount, declared: Sequence[Declared] | None = None) -> dict[str, Floats]:
+    """The same ledger under several objectives: objective -> what it is for each vehicle, [n, N] (m2/s2).
+
+    So one policy, whatever it was trained for, is told under all of them. ``InvalidInput`` for a name without its list.
+    """
+    if isinstance(declared, str):
+        raise InvalidInput(f"scored: {declared!r}: must be a list of objectives, for instance [{declared!r}]")
+    vehicles, declared = ledger.mass_t.shape[1], standard_objectives() if declared is None else declared
+    return {
+        each if isinstance(each, str) else ", ".join(each): objective_harm(
+            ledger, harm_count, objectives_of(each, vehicles)
+        )
+        for each in declared
+    }
+
+
+def _social(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
+    own, others = _social_weights(objective.angle_deg)
+    rest = harm.whole - harm.borne[:, vehicle]
+    return own * harm.borne[:, vehicle] + others * rest
+
+
+@lru_cache
+def _social_weights(angle_deg: float) -> tuple[float, float]:
+    """Weights of the own harm and of the others': cosine and sine; exactly 0 and 1 at 90 degrees too.
+
+    By their series in exact fractions, rounded once: the C library's have other last bits on other processors.
+    """
+    if angle_deg == 90.0:
+        return 0.0, 1.0
+    angle, term, sums = Fraction(math.radians(angle_deg)), Fraction(1), [Fraction(0), Fraction(0)]
+    for k in range(28):
+        sums[k % 2] += -term if k % 4 >= 2 else term
+        term = term * angle / (k + 1)
+    return float(sums[0]), float(sums[1])
+
+
+def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
+    """Injuries in 1,000 lines, [n], summed front to rear: the same for all vehicles.
+
+    The larger risk of a vehicle counts, not that of the larger change of speed: no impact may take away from it.
+    """
+    del vehicle
+    front, rear = harm.front_change_mps, harm.rear_change_mps
+    injured = np.zeros(len(front))
+    for j in range(front.shape[1]):
+        by_front = np.where(front[:, j] > 0.0, injury_probability(front[:, j], "front", objective.curve), 0.0)
+        by_rear = np.where(rear[:, j] > 0.0, injury_probability(rear[:, j], "rear", objective.curve), 0.0)
+        injured = injured + 1_000.0 * np.maximum(by_front, by_rear)
+    return injured
+
+
+def _weighted(borne: Floats, weights: Floats) -> Floats:
+    """``N sum_j w_j H_j / sum_j w_j``, summed front to rear: the same bits in any batch."""
+    n, vehicles = borne.shape
+    harm, whole = np.zeros(n), np.zeros(n)
+    for j in range(vehicles):
+        harm = harm + weights[:, j] * borne[:, j]
+        whole = whole + weights[:, j]
+    mean: Floats = vehicles * harm / whole
+    return mean
+
+
+_BUILT_IN: dict[str, Kind] = {
+    "total": Kind("total", "everybody's harm alike", lambda _, harm, vehicle: harm.whole),
+    "own": Kind("own", "what the vehicle itself bears", lambda _, harm, vehicle: harm.borne[:, vehicle]),
+    "social": Kind("social:ANGLE", "social value orientation: own harm at 0, the others' at 90 degrees", _social),
+    "maximin": Kind("maximin", "the harm of whoever bears most", lambda _, harm, vehicle: harm.borne.max(axis=1)),
+    "mass-weighted": Kind(
+        "mass-weighted",
+        "harm in a heavy vehicle counts for more",
+        lambda _, harm, vehicle: _weighted(harm.borne, harm.mass_t),
+    ),
+    "weighted": Kind(
+        "weighted:W1,W2,...",
+        "one weight for each vehicle",
+        lambda objective, harm, vehicle: _weighted(harm.borne, np.full(harm.borne.shape, objective.weights)),
+    ),
+    "injury": Kind("injury:CURVE", "injuries in 1,000 lines, by the impact that injures a vehicle more", _injured),
+}
+
+OBJECTIVES: Registry[Kind] = Registry("objective", "objectives", register_objective, _BUILT_IN)

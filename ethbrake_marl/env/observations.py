@@ -1,0 +1,360 @@
+"""Observations: which features a vehicle observes, and their values in a batch of worlds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from itertools import product
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.env.contact_features import FORECAST_S, Contacts, observe_contacts
+from ethbrake_marl.env.features import (
+    CONTACT_COMMANDS,
+    GROUPS,
+    MOST_NEIGHBOURS,
+    Feature,
+    RegisteredFeature,
+    feature_named,
+    listed_features,
+    registered_in,
+    side_of,
+)
+from ethbrake_marl.errors import InvalidInput, PhysicsError, unknown_name
+from ethbrake_marl.physics.columns import Packed, columns
+from ethbrake_marl.physics.estimates import estimate_rows
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.motion import stopping_distance
+from ethbrake_marl.physics.state import Floats, Ints, Worlds
+
+
+@dataclass(frozen=True, slots=True)
+class ObservationSpec:
+    """How many neighbours an observation holds on each side, and whether place, obstacle and contacts follow.
+
+    With ``chosen`` it holds these features alone, in this order; ``choose_observation`` makes such a one.
+
+    >>> import ethbrake_marl as eb
+    >>> spec = eb.ObservationSpec(front=2, rear=0)
+    >>> spec.size, spec.features[7].name
+    (27, 'front_1.known')
+    >>> eb.choose_observation(["own", "front_1.gap"]).size
+    8
+
+    """
+
+    front: int = 1  # neighbours ahead, 0 to 64
+    rear: int = 1  # neighbours behind
+    role: bool = False  # ROLE_FEATURES
+    obstacle: bool = False  # OBSTACLE_FEATURES
+    chosen: tuple[str, ...] = ()  # full names; the other fields say how far these look
+    contact: bool = False  # CONTACT_FEATURES; those of contact_far must be chosen
+    time_step_s: float | None = None  # between two decisions; contact features need it, others do not look at it
+
+    def __post_init__(self) -> None:
+        """Refuse what is not a number of neighbours, and features that the rest does not fit."""
+        for side, count in (("front", self.front), ("rear", self.rear)):
+            whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
+            if not whole or not 0 <= count <= MOST_NEIGHBOURS:
+                raise InvalidInput(f"observation: {side} = {count!r}; must be a whole number in 0..{MOST_NEIGHBOURS}")
+        for name, shown in (("role", self.role), ("obstacle", self.obstacle), ("contact", self.contact)):
+            if not isinstance(shown, bool):
+                raise InvalidInput(f"observation: {name} = {shown!r}; must be True or False")
+        if self.time_step_s is not None and not 0.0 < self.time_step_s < math.inf:
+            raise InvalidInput(f"observation: time_step_s = {self.time_step_s!r}; must be a positive number of seconds")
+        if self.chosen and _reach(self.chosen) != (self.front, self.rear, self.role, self.obstacle, self.contact):
+            raise InvalidInput("observation: chosen: the other fields do not fit; use eb.choose_observation([...])")
+
+    @property
+    def sides(self) -> tuple[tuple[str, int], ...]:
+        """Neighbours as (prefix, offset in the line), front ones first, nearest first."""
+        fronts = tuple((f"front_{k}", -k) for k in range(1, self.front + 1))
+        return fronts + tuple((f"rear_{k}", k) for k in range(1, self.rear + 1))
+
+    @property
+    def features(self) -> tuple[Feature, ...]:
+        """Every number of an observation in order; names are unique (``own.speed``, ``front_1.gap``)."""
+        return tuple(feature_named(name) for name in self.chosen) or self.whole
+
+    @property
+    def whole(self) -> tuple[Feature, ...]:
+        """The same with all built-in features of every group that it looks at."""
+        groups = [("own", GROUPS.own), *((prefix, GROUPS.neighbour) for prefix, _ in self.sides)]
+        groups += [("role", GROUPS.role)] if self.role else []
+        groups += [("obstacle", GROUPS.obstacle)] if self.obstacle else []
+        groups += [("contact", GROUPS.contact)] if self.contact else []
+        groups += [("contact_far", GROUPS.contact_far)] if self.far else []
+        return tuple(replace(f, name=f"{prefix}.{f.name}") for prefix, group in groups for f in group)
+
+    @property
+    def far(self) -> bool:
+        """Whether any of GROUPS.contact_far is chosen."""
+        return any(name.startswith("contact_far.") for name in self.chosen)
+
+    @property
+    def size(self) -> int:
+        """Length F of an observation."""
+        return len(self.features)
+
+    @property
+    def plan(self) -> Plan:
+        """Offsets of the neighbours and scaling of every feature, in order; what is picked, and what is added.
+
+        Made once for each specification, not to be changed. Raises ``InvalidInput`` for contact features without a
+        time step.
+        """
+        return _plan(self, tuple(registered_in(self.chosen).items()) if self.chosen else ())
+
+    def at_steps_of(self, time_step_s: float) -> ObservationSpec:
+        """The same for decisions every ``time_step_s`` (s), where it needs to know and does not say so itself."""
+        return replace(self, time_step_s=time_step_s) if self.contact and self.time_step_s is None else self
+
+
+Observation = ObservationSpec | Sequence[str] | Mapping[str, Any]  # or a list of groups and features, or the fields
+
+
+def choose_observation(listed: Observation, time_step_s: float | None = None) -> ObservationSpec:
+    """The observation of a list of groups and single features: ``[own, front_1, rear_1.gap, my_feature]``.
+
+    A mapping names the fields of an ``ObservationSpec``, which is what JSON makes of one. ``time_step_s`` (s) is the
+    time between two decisions; an environment knows its own, so only who observes without one gives it, for contact
+    features. Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for what is no such list.
+    """
+    if isinstance(listed, ObservationSpec):
+        spec = listed
+    elif isinstance(listed, Mapping):
+        known = [field.name for field in fields(ObservationSpec)]
+        for name in listed:
+            if name not in known:
+                raise unknown_name("observation", name, known)
+        chosen = listed.get("chosen", ())
+        if not isinstance(chosen, list | tuple):
+            raise InvalidInput(f"observation: chosen = {chosen!r}; must be a list of features")
+        spec = ObservationSpec(**{**listed, "chosen": listed_features(chosen) if chosen else ()})
+    else:
+        names = listed_features(listed)
+        front, rear, role, obstacle, contact = _reach(names)
+        spec = ObservationSpec(front, rear, role, obstacle, contact=contact)
+        if tuple(feature.name for feature in spec.features) != names:
+            spec = replace(spec, chosen=names)
+    return spec if time_step_s is None else spec.at_steps_of(time_step_s)
+
+
+def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool, bool]:
+    """How far features look: neighbours in front and behind, the own place, the obstacle, contacts."""
+    sides = [side for name in names if (side := side_of(name)) is not None]
+    front, rear = (max((k for at, k in sides if at == wanted), default=0) for wanted in ("front", "rear"))
+    groups = {name.partition(".")[0] for name in names}
+    return front, rear, "role" in groups, "obstacle" in groups, bool(groups & {"contact", "contact_far"})
+
+
+Observations = NDArray[np.float32]
+
+_OWN, _NEIGHBOUR = len(GROUPS.own), len(GROUPS.neighbour)
+
+_ROLE, _OBSTACLE = len(GROUPS.role), len(GROUPS.obstacle)
+
+
+def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations:
+    """Observation of ``vehicle`` (0 = front) in every world, [n, F] float32 in its own memory."""
+    if not 0 <= vehicle < worlds.N:
+        raise InvalidInput(f"observe: vehicle index {vehicle}; must be in 0..{worlds.N - 1}")
+    packed = Packed.of(worlds)
+    return spec.plan.observe(packed.state, packed.params, np.array([vehicle]))[:, 0].copy()
+
+
+class Scaling(NamedTuple):
+    """The groups of a specification as the kernel wants them."""
+
+    offsets: Ints  # of the neighbours in the line
+    role: bool
+    obstacle: bool
+    features: Floats  # [3, F] 1 / scale, low, high
+
+
+class Extra(NamedTuple):
+    """A registered feature in an observation."""
+
+    column: int
+    entry: RegisteredFeature
+    offset: int  # of the neighbour in the line; 0: its own
+    known: int  # column of the neighbour's ``known`` in the whole groups
+
+
+class Plan(NamedTuple):
+    """How an observation is made: by kernels, which fill whole groups, and by functions of registered features."""
+
+    scaling: Scaling
+    contacts: Contacts | None  # their group is the last one; None: it holds none
+    picked: Ints | None  # [F] columns of the whole groups; None: all of them
+    extras: tuple[Extra, ...]
+
+    def observe(self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None = None) -> Observations:
+        """Observations of several vehicles in worlds given as rows of ``physics.batch``, [n, len(vehicles), F].
+
+        ``steps`` [n] is how many steps each world has made, for error texts. Over a channel of periodic messages a
+        vehicle sees the worlds as it takes them to be (``physics.messages``). Contact features of commands that are
+        not wanted are 0. Raises ``PhysicsError`` naming the worlds in which a forecast of contacts failed.
+        """
+        if not Packed(state, params).has_messages:
+            return self._observe_present(state, params, vehicles, steps)
+        estimate, seen = np.empty(state.shape), []
+        for vehicle in vehicles.tolist():
+            estimate_rows(state, params, vehicle, estimate)
+            seen.append(self._observe_present(estimate, params, np.array([vehicle]), steps))
+        return np.concatenate(seen, axis=1)
+
+    def _observe_present(self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None) -> Observations:
+        """The same where everything known is known as it is."""
+        shape = len(state), len(vehicles)
+        whole = np.empty((*shape, self.scaling.features.shape[1]), np.float32)
+        _observe_rows(state, params, vehicles, *self.scaling, whole)
+        if self.contacts is not None:
+            found = np.zeros((*shape, self.contacts.features.shape[1]), np.float32)
+            failed = np.zeros(len(state), np.bool_)
+            observe_contacts(state, params, vehicles, *self.contacts, found, failed)
+            if failed.any():
+                reason = f"a forecast of contacts could not look {FORECAST_S:g} s ahead"
+                raise PhysicsError({k: reason for k in np.flatnonzero(failed).tolist()})
+            whole = np.concatenate([whole, found], axis=2)
+        if self.picked is None:
+            return whole
+        out: Observations = whole.take(self.picked, axis=2)
+        if not self.extras:
+            return out
+        worlds = Packed(state, params).worlds().read_only()
+        for extra, (o, vehicle) in product(self.extras, enumerate(vehicles.tolist())):
+            neighbour = vehicle + extra.offset if extra.offset else None
+            counts = np.ones(worlds.n, np.bool_) if neighbour is None else whole[:, o, extra.known] == 1.0
+            if counts.any():  # one of a neighbour tells where the kernel says that it is known
+                values = extra.entry.checked(worlds, vehicle, neighbour, counts, steps)
+            else:  # nobody is there, or nobody is heard
+                values = extra.entry.scaled(np.full(worlds.n, extra.entry.unknown))
+            out[:, o, extra.column] = values
+        return out
+
+
+@cache
+def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature], ...]) -> Plan:
+    whole, entries = spec.whole, dict(registered)
+    usual = whole[: len(whole) - spec.contact * len(GROUPS.contact) - spec.far * len(GROUPS.contact_far)]
+    offsets = np.array([offset for _, offset in spec.sides], np.int64)
+    scaling, contacts = Scaling(offsets, spec.role, spec.obstacle, _scales(usual)), None
+    if spec.contact:
+        if spec.time_step_s is None:
+            raise InvalidInput(
+                "observation: contact features need the time between two decisions; give it as time_step_s, for"
+                " instance eb.choose_observation([...], time_step_s=scenario.time_step_s)"
+            )
+        inside = [name.partition(".") for name in spec.chosen or (feature.name for feature in spec.whole)]
+        names = [own for group, _, own in inside if group in ("contact", "contact_far")]
+        wanted = [c for c, each in enumerate(CONTACT_COMMANDS) if any(n.startswith(f"{each}_") for n in names)]
+        features = GROUPS.contact + GROUPS.contact_far if spec.far else GROUPS.contact
+        contacts = Contacts(spec.time_step_s, np.array(wanted, np.int64), _scales(features))
+    if not spec.chosen:
+        return Plan(scaling, contacts, None, ())
+    place, sides = {feature.name: c for c, feature in enumerate(whole)}, dict(spec.sides)
+    extras = []
+    for column, name in enumerate(spec.chosen):
+        if name not in place:
+            side, _, own = name.rpartition(".")
+            extras.append(Extra(column, entries[own], sides.get(side, 0), place.get(f"{side}.known", 0)))
+    picked = np.array([place.get(name, 0) for name in spec.chosen], np.int64)
+    return Plan(scaling, contacts, picked, tuple(extras))
+
+
+def _scales(features: Sequence[Feature]) -> Floats:
+    """1 / scale, low, high of every feature, [3, F]."""
+    return np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]])
+
+
+@compiled
+def _observe_rows(
+    state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, with_obstacle: bool, features: Floats,
+    out: Observations,
+) -> None:  # fmt: skip
+    """Fill ``out`` with the clipped features of each observer, in the order of the lists of features above.
+
+    One long loop on purpose: handing these arrays on to functions made it four times as slow.
+    """
+    of = columns(state)
+    N, speed, command, gap_column, hit, obstacle = of.vehicles, of.speed, of.command, of.gap, of.hit, of.obstacle
+    braking, driving, latency, mass, news = of.braking, of.driving, of.latency, of.mass, of.news
+    by_link, some_obstacle = params.shape[1] > of.own_latency, state.shape[1] > obstacle
+    own_part = of.own_latency if by_link else latency  # of vehicle j's latency: own_part + j
+    value = np.zeros(out.shape[2])
+    for k in range(out.shape[0]):
+        time = state[k, of.time]
+        for o in range(observers.shape[0]):
+            i = observers[o]
+            own_speed, own_latency = state[k, speed + i], max(params[k, own_part + i] - time, 0.0)
+            own_stop = stopping_distance(own_speed, own_latency, params[k, braking + i])
+            value[0] = own_speed
+            value[1] = state[k, command + i]
+            value[2] = params[k, braking + i]
+            value[3] = params[k, driving + i]
+            value[4] = params[k, mass + i]
+            value[5] = own_latency
+            value[6] = params[k, of.restitution]
+            c = _OWN
+            for offset in offsets:
+                j = i + offset
+                if not (0 <= j < N and time >= params[k, news + i * N + j if by_link else latency + i]):
+                    for absent in range(c, c + _NEIGHBOUR):
+                        value[absent] = 0.0
+                    c += _NEIGHBOUR
+                    continue
+                gap = 0.0
+                for p in range(min(i, j), max(i, j)):
+                    gap += state[k, gap_column + p]
+                in_front = j < i
+                other_speed = state[k, speed + j]
+                other_latency = max(params[k, own_part + j] - time, 0.0)
+                other_stop = stopping_distance(other_speed, other_latency, params[k, braking + j])
+                room = gap + other_stop if in_front else other_stop - gap
+                value[c] = 1.0
+                value[c + 1] = gap
+                value[c + 2] = own_speed - other_speed if in_front else other_speed - own_speed
+                value[c + 3] = state[k, command + j]
+                value[c + 4] = params[k, braking + j]
+                value[c + 5] = params[k, mass + j]
+                value[c + 6] = other_latency
+                value[c + 7] = state[k, hit + (i - 1 if in_front else i)]
+                value[c + 8] = gap + other_stop - own_stop if in_front else gap + own_stop - other_stop
+                value[c + 9] = _fitting_deceleration(own_speed, own_latency, room)
+                c += _NEIGHBOUR
+            if role:
+                value[c] = i
+                value[c + 1] = N - 1 - i
+                c += _ROLE
+            if with_obstacle:
+                told = i == 0 or time >= params[k, news + i * N if by_link else latency + i]
+                for absent in range(c, c + _OBSTACLE):
+                    value[absent] = 0.0
+                if told and some_obstacle and state[k, obstacle] < math.inf:
+                    gap = state[k, obstacle]
+                    for p in range(i):
+                        gap += state[k, gap_column + p]
+                    value[c] = 1.0
+                    value[c + 1] = gap
+                    value[c + 2] = state[k, obstacle + 1]
+                    value[c + 3] = gap - own_stop
+                    value[c + 4] = _fitting_deceleration(own_speed, own_latency, gap)
+            for c in range(out.shape[2]):
+                out[k, o, c] = min(max(value[c] * features[0, c], features[1, c]), features[2, c])
+
+
+@compiled
+def _fitting_deceleration(speed: float, latency_left: float, room: float) -> float:
+    """Constant deceleration that uses up exactly ``room`` after the own latency: ``v^2 / (2 (room - v tau))``.
+
+    Room below 1 mm counts as 1 mm. Without room it therefore reads as the upper clipping bound (20 m/s2) from 0.2 m/s
+    on, and lower for a slower vehicle; at rest it is 0.
+    """
+    speed = max(speed, 0.0)
+    left = max(room - speed * latency_left, 1e-3)
+    return speed * speed / (2.0 * left)

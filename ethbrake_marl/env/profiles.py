@@ -1,0 +1,314 @@
+"""Whole command profiles of some vehicles, and the harm they lead to: the problem that search and shield solve."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.env.harm import HarmCount, check_harm_count
+from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.columns import Packed
+from ethbrake_marl.physics.episode import CLOCK, Decisions, Episode, follow_whole, harm_so_far
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.rows import ROW, place_rates, rows_for
+from ethbrake_marl.physics.state import Bools, Floats, Ints, UInt64s, Worlds
+
+MOST_PHASES = 12
+
+
+class SearchWorld(NamedTuple):
+    """One world as candidates run in it."""
+
+    episode: Episode
+    bounds: Floats  # [C, 2] smallest and largest command (m/s2)
+    random: UInt64s  # [1] state of the world's random numbers
+
+
+@compiled
+def copy_rows(rows: Floats, to_rows: Floats, n: int) -> None:
+    """Copy the first ``n`` rows. (An assignment of slices compiles ten times longer, for its message of an error.)"""
+    for k in range(n):
+        for c in range(rows.shape[1]):
+            to_rows[k, c] = rows[k, c]
+
+
+TIME_STEP_S = 0.1  # between two decisions, where nobody says otherwise
+
+
+class ProfileProblem(NamedTuple):
+    """Whose commands are chosen, in which worlds, on which grid of decisions. Build it with ``profile_problem``."""
+
+    vehicles: Ints  # [C] controlled, index from 0; in lines with an obstacle from 1, it being vehicle 0 of every column
+    start: Floats  # [n, S] at the first decision
+    clock: Floats  # [n, CLOCK_WIDTH]
+    bounds: Floats  # [n, C, 2] m/s2
+    command: Floats  # [n, N] of the others
+    latency: Floats  # [n, N]
+    mass: Floats  # [n, N]
+    limit: Floats  # [n, N]
+    brake_rate: Floats  # [n, N] m/s3
+    release_rate: Floats  # [n, N]
+    pieces: Floats  # [n, N, 2 K]
+    identity: UInt64s  # [n]
+
+    @property
+    def n(self) -> int:
+        """Number of worlds."""
+        return len(self.start)
+
+    def take(self, rows: Ints) -> ProfileProblem:
+        """That of some of the worlds."""
+        arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._fields[1:]}
+        return self._replace(**arrays)
+
+    def put(self, rows: Ints, new: ProfileProblem) -> ProfileProblem:
+        """A copy with the worlds of a ``new`` one in these rows."""
+        arrays: dict[str, Any] = {name: getattr(self, name).copy() for name in self._fields[1:]}
+        for name, array in arrays.items():
+            array[rows] = getattr(new, name)
+        return self._replace(**arrays)
+
+    @property
+    def last_step(self) -> Ints:
+        """Number of decisions up to the horizon, [n]."""
+        return self.clock[:, CLOCK.LAST_STEP].astype(np.int64)
+
+    def constant(self, commands_mps2: Floats) -> Profiles:
+        """Profiles [n * Q] that hold the given commands [n, Q, C], divided into phases for a search to change."""
+        n, Q, C = commands_mps2.shape
+        borders = np.array([2, 5, 9, 14, 20] + (MOST_PHASES - 5) * [np.iinfo(np.int64).max])
+        ends = np.minimum(borders, self.last_step[:, np.newaxis])
+        shape = (n, Q, MOST_PHASES)
+        repeated = np.broadcast_to(commands_mps2[:, :, np.newaxis], (*shape, C))
+        return Profiles(
+            np.broadcast_to(ends[:, np.newaxis], shape).reshape(n * Q, MOST_PHASES).copy(),
+            repeated.reshape(n * Q, MOST_PHASES, C).copy(),
+        )
+
+    def even_grid(self, number: int) -> Floats:
+        """``number`` commands from each vehicle's least to its greatest, evenly spaced, both included.
+
+        [n, number, C] m/s2. ``low + (high - low)`` may lie an ulp beyond ``high``, so the greatest is taken as it is.
+        """
+        low, high = self.bounds[:, np.newaxis, :, 0], self.bounds[:, np.newaxis, :, 1]
+        share = np.linspace(0.0, 1.0, number)[:, np.newaxis]
+        return np.asarray(np.minimum(low + share * (high - low), high), np.float64)
+
+    def follow(self, profiles: Profiles) -> tuple[Floats, Floats]:
+        """First-impact and total harm [n] of one profile per world, as the engine counts it, to the same bits.
+
+        Raises ``InvalidInput`` for profiles that do not fit the problem or exceed a capacity, ``PhysicsError`` naming
+        the worlds in which a check of the kernel failed.
+        """
+        self.check(profiles)
+        n = self.n
+        first, total, failed = np.zeros(n), np.zeros(n), np.zeros(n, np.bool_)
+        ends, commands = np.ascontiguousarray(profiles.ends, np.int64), np.ascontiguousarray(profiles.commands_mps2)
+        follow_worlds(self, ends, commands, first, total, failed)
+        if failed.any():
+            raise PhysicsError({k: "its profile could not be followed" for k in np.flatnonzero(failed).tolist()})
+        return first, total
+
+    def check(self, profiles: Profiles) -> None:
+        """Raise ``InvalidInput`` unless there is one profile per world, within the capacities, its phases in order."""
+        n, C = self.n, len(self.vehicles)
+        K = profiles.ends.shape[-1]
+        if profiles.ends.shape != (n, K) or profiles.commands_mps2.shape != (n, K, C):
+            raise InvalidInput(
+                f"profiles: shapes {profiles.ends.shape} and {profiles.commands_mps2.shape}; ({n}, K) and ({n}, K, {C})"
+                " are needed"
+            )
+        low, high = self.bounds[:, np.newaxis, :, 0], self.bounds[:, np.newaxis, :, 1]
+        good = (profiles.commands_mps2 >= low) & (profiles.commands_mps2 <= high)
+        if not good.all():
+            raise InvalidInput(
+                f"profiles: command {profiles.commands_mps2[~good][0]:g} m/s2 is beyond a vehicle's capacity"
+            )
+        ordered = (np.diff(profiles.ends, axis=1, prepend=0) >= 0).all() and (
+            profiles.ends[:, -1] == self.last_step
+        ).all()
+        if not ordered:
+            raise InvalidInput("profiles: phases must end in order, the last one at the last step")
+
+
+def profile_problem(
+    worlds: Worlds,
+    vehicles: Sequence[int],
+    *,
+    harm_count: HarmCount = "first",
+    horizon_s: float = 8.0,
+    time_step_s: float = TIME_STEP_S,
+    others_mps2: Floats | None = None,
+    deciders: Sequence[int] | None = None,
+    written_out: bool = False,
+) -> ProfileProblem:
+    """The problem of choosing the whole profiles of ``vehicles`` (indices from 0) so as to do the least harm.
+
+    The first decision falls on the smallest latency of the ``deciders`` (default: ``vehicles``) or on the worlds' time,
+    whichever is later; one follows every ``time_step_s``. Where any world has an obstacle ahead, it is written out as a
+    vehicle in front (``Worlds.with_obstacle``; in the others one that nobody reaches): all columns of the problem are
+    those of that line. The other vehicles follow ``others_mps2`` [n, N] (default: full braking; the columns of
+    ``vehicles`` are ignored). Raises ``InvalidInput`` for no vehicle, one given twice or not there, an unknown count, a
+    command beyond capacity, or a horizon before the first decision.
+    """
+    chosen = _checked_vehicles(vehicles, worlds.N)
+    check_harm_count(harm_count)
+    if not (0.0 < time_step_s < math.inf and 0.0 < horizon_s < math.inf):
+        raise InvalidInput(f"time_step_s {time_step_s!r}, horizon_s {horizon_s!r}: must be positive numbers of seconds")
+    v = worlds.vehicles
+    command = -v.braking_capacity_mps2 if others_mps2 is None else np.array(others_mps2, np.float64)
+    if command.shape != worlds.speeds_mps.shape:
+        raise InvalidInput(f"others_mps2: shape {command.shape}; {worlds.speeds_mps.shape} is needed")
+    command[:, chosen] = 0.0
+    obstacle = worlds.obstacle_ahead
+    if obstacle.any() or written_out:
+        found = profile_problem(
+            worlds.with_post_ahead(np.full(worlds.n, horizon_s)).with_obstacle(),
+            [i + 1 for i in chosen.tolist()],
+            harm_count=harm_count,
+            horizon_s=horizon_s,
+            time_step_s=time_step_s,
+            others_mps2=np.concatenate([np.zeros((len(command), 1)), command], axis=1),
+            deciders=None if deciders is None else [i + 1 for i in deciders],
+        )
+        if not obstacle.all():  # a world is searched as it is beside any others
+            free = np.flatnonzero(~obstacle)
+            found.identity[free] = profile_problem(
+                worlds.take(free), vehicles, harm_count=harm_count, horizon_s=horizon_s, time_step_s=time_step_s,
+                others_mps2=command[free], deciders=deciders,
+            ).identity  # fmt: skip
+        return found
+    decide = _checked_vehicles(vehicles if deciders is None else deciders, worlds.N)
+    first = worlds.first_decision_s(decide.tolist())
+    if not (first < horizon_s).all():
+        raise InvalidInput(f"horizon_s {horizon_s:g}: must be after the first decision at {first.max():g} s")
+    clock = np.empty((worlds.n, CLOCK.WIDTH))
+    clock[:, CLOCK.START], clock[:, CLOCK.TIME_STEP], clock[:, CLOCK.HORIZON] = first, time_step_s, horizon_s
+    clock[:, CLOCK.LAST_STEP] = Decisions(first, time_step_s).before(horizon_s)
+    clock[:, CLOCK.RESTITUTION], clock[:, CLOCK.HARM_IS_TOTAL], clock[:, CLOCK.STEPWISE] = (
+        v.restitution,
+        harm_count == "total",
+        0.0,
+    )
+    bounds = np.stack([-v.braking_capacity_mps2[:, chosen], v.driving_capacity_mps2[:, chosen]], axis=2)
+    after, impacts = advance(worlds, command, until_s=first)
+    harm = [impacts.first_impact_harm, impacts.total_harm]
+    start = [after.speeds_mps, after.gaps_m, after.pair_hit, *harm, after.command_mps2]
+    return ProfileProblem(
+        chosen, np.concatenate(start, axis=1), clock, np.ascontiguousarray(bounds), command, v.latency_s, v.mass_t,
+        v.speed_limit_mps, v.brake_rate_mps3, v.release_rate_mps3, v.pieces,
+        identities(worlds, command, clock, chosen),
+    )  # fmt: skip
+
+
+def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -> UInt64s:
+    """What tells one world's problem from another's, [n]: 8 bytes of BLAKE2b over all that the harm depends on.
+
+    State and parameters of the world, the other vehicles' commands, the decisions (first, step, number), the horizon
+    and the controlled vehicles; not the count.
+    """
+    packed = Packed.of(worlds)
+    (state, params), column = packed, packed.column
+    who = np.zeros((worlds.n, worlds.N))
+    who[:, vehicles] = 1.0
+    parts = [
+        state[:, [column.time]],
+        state[:, column.speed : column.command],
+        state[:, column.gap : column.harm],
+        params[:, : column.brake_rate],  # the news of others changes no harm
+        command,
+        clock[:, [CLOCK.START, CLOCK.TIME_STEP, CLOCK.LAST_STEP, CLOCK.HORIZON]],
+        who,
+    ]
+    rows = np.ascontiguousarray(np.concatenate(parts, axis=1) + 0.0, "<f8")  # + 0.0: one zero, not two
+    slow = worlds.vehicles.build_up  # others have the names that they had before there were rates
+    forces = np.concatenate(
+        [state[:, column.command : column.previous], params[:, column.brake_rate : column.own_latency]], 1
+    )
+    further = [forces[k].tobytes() if slow[k] else b"" for k in range(worlds.n)]
+    for k in np.flatnonzero(worlds.vehicles.in_pieces):
+        pieces = worlds.vehicles.pieces[k]
+        there = np.isfinite(pieces)  # not how many others of the batch have
+        further[k] += there.sum(axis=1).astype("<i8").tobytes() + pieces[there].astype("<f8").tobytes()
+    digests = [hashlib.blake2b(row.tobytes() + further[k], digest_size=8).digest() for k, row in enumerate(rows)]
+    return np.frombuffer(b"".join(digests), "<u8").astype(np.uint64)
+
+
+def _checked_vehicles(vehicles: Sequence[int], N: int) -> Ints:
+    chosen = list(vehicles)
+    if not chosen or len(set(chosen)) != len(chosen) or not all(0 <= i < N for i in chosen):
+        raise InvalidInput(f"vehicles {tuple(chosen)}: at least one is needed, each once, from 0 to {N - 1}")
+    return np.array(chosen, np.int64)
+
+
+class Profiles(NamedTuple):
+    """One profile per world: ``commands_mps2[k, j]`` from step ``ends[k, j - 1]`` to ``ends[k, j]`` of the decisions.
+
+    Phases beyond a world's last one are empty: they too end at the last step.
+    """
+
+    ends: Ints  # [n, K]
+    commands_mps2: Floats  # [n, K, C]
+
+    def at(self, step: Ints) -> Floats:
+        """The commands in force in these steps [n]: [n, C] m/s2; beyond the last step its command goes on."""
+        phase = np.minimum((self.ends <= step[:, np.newaxis]).sum(axis=1), self.ends.shape[1] - 1)
+        return np.asarray(self.commands_mps2[np.arange(len(phase)), phase], np.float64)
+
+    def take(self, rows: Ints | slice) -> Profiles:
+        """Those of some worlds."""
+        return Profiles(self.ends[rows], self.commands_mps2[rows])
+
+    @staticmethod
+    def padded(parts: Sequence[Profiles], least: int) -> list[Profiles]:
+        """The same profiles, all with as many phases (at least ``least``): empty ones are added.
+
+        In their own memory.
+        """
+        width = max([least, *(part.ends.shape[1] for part in parts)])
+        return [
+            Profiles(
+                np.pad(part.ends, ((0, 0), (0, width - part.ends.shape[1])), mode="edge"),
+                np.pad(part.commands_mps2, ((0, 0), (0, width - part.ends.shape[1]), (0, 0)), mode="edge"),
+            )
+            for part in parts
+        ]
+
+    def grown(self, n: int) -> Profiles:
+        """These and as many meaningless ones as make ``n`` in all; in their own memory."""
+        more = n - len(self.ends)
+        return Profiles(np.pad(self.ends, ((0, more), (0, 0))), np.pad(self.commands_mps2, ((0, more), (0, 0), (0, 0))))
+
+
+@compiled
+def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> SearchWorld:
+    """The surroundings of world k, with room to work in; ``random`` [n]: the states of all worlds' random numbers."""
+    N = problem.mass.shape[1]
+    table = np.zeros((rows_for(problem.pieces.shape[2]), N))
+    for i in range(N):
+        table[ROW.COMMAND, i], table[ROW.LATENCY, i] = problem.command[k, i], problem.latency[k, i]
+        table[ROW.MASS, i], table[ROW.LIMIT, i] = problem.mass[k, i], problem.limit[k, i]
+    place_rates(table, problem.brake_rate[k], problem.release_rate[k], problem.pieces[k])
+    return SearchWorld(Episode(table, problem.clock[k].copy(), problem.vehicles), problem.bounds[k], random[k : k + 1])
+
+
+@compiled
+def follow_worlds(
+    problem: ProfileProblem, ends: Ints, commands: Floats, first: Floats, total: Floats, failed: Bools
+) -> None:
+    """Fill ``first`` and ``total`` [n] with the harm of one profile per world, and ``failed`` [n] where it ended."""
+    start, no_random = problem.start, np.zeros(problem.start.shape[0], np.uint64)
+    for k in range(start.shape[0]):
+        episode = make_search_world(problem, k, no_random).episode
+        states = np.zeros((ends.shape[1] + 1, start.shape[1]))
+        copy_rows(start[k : k + 1], states, 1)
+        episode.clock[CLOCK.STEPWISE] = 1.0
+        if follow_whole(episode, ends[k], commands[k], states, math.inf)[1] < 0:
+            failed[k] = True
+            continue
+        first[k], total[k] = harm_so_far(episode.table, 0.0), harm_so_far(episode.table, 1.0)

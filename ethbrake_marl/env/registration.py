@@ -1,0 +1,26 @@
+"""Ids under which Gymnasium and PettingZoo know this environment. Naming an interface does not import it."""
+
+from __future__ import annotations
+
+GYMNASIUM_ID = "EthBrake-v0"
+
+PETTINGZOO_ID = "ethbrake/ethbrake-v0"
+
+
+def register_environments() -> None:
+    """Register every id that is not registered yet; calling it again changes nothing."""
+    import gymnasium  # takes longer than the command line may take for --help
+    import pettingzoo
+
+    for id_ in (GYMNASIUM_ID, f"ethbrake/{GYMNASIUM_ID}"):
+        if id_ in gymnasium.registry:
+            continue
+        gymnasium.register(
+            id_,
+            entry_point="ethbrake_marl.env.gymnasium:EthBrakeEnv",
+            vector_entry_point="ethbrake_marl.env.vector:EthBrakeVectorEnv",
+        )
+    if PETTINGZOO_ID not in pettingzoo.parallel_registry:
+        pettingzoo.register("parallel", PETTINGZOO_ID, "ethbrake_marl.ethbrake_v0:parallel_env")
+    if PETTINGZOO_ID not in pettingzoo.aec_registry:
+        pettingzoo.register("aec", PETTINGZOO_ID, "ethbrake_marl.ethbrake_v0:env")

@@ -1,0 +1,313 @@
+"""Stable-Baselines3's interface: a native ``VecEnv`` whose rows are learners. Importing this file imports torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
+
+from ethbrake_marl.env.actions import own_actions
+from ethbrake_marl.env.compiled_step import Step
+from ethbrake_marl.env.draws import Columns
+from ethbrake_marl.env.engine import Engine
+from ethbrake_marl.env.infos import Begun, Report, plain_rows, shield_columns
+from ethbrake_marl.env.making import (
+    INITIAL_STATE,
+    AnyScenario,
+    action_box,
+    chosen_seed,
+    feature_box,
+    make_engine,
+    warn_of_unknown,
+)
+from ethbrake_marl.env.memory import Arrays, renew_memory
+from ethbrake_marl.env.motion import Viewer
+from ethbrake_marl.env.observations import Observation, Observations
+from ethbrake_marl.env.rewards import Reward
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics.columns import Packed
+from ethbrake_marl.physics.state import Bools, Ints, Worlds
+from ethbrake_marl.scenario.observed import Appended, full_state, row_features
+
+Rewards = NDArray[np.float32]
+
+
+def make_sb3_vec_env(
+    scenario: AnyScenario,
+    n_envs: int,
+    seed: int | None = None,
+    learners: Sequence[str | int] | None = None,
+    reward: Reward = "harm",
+    observation: Observation | None = None,
+    horizon_is_end: bool = True,
+    appended: Appended | None = None,
+    step_infos: bool = False,
+    render_mode: str | None = None,
+) -> EthBrakeVecEnv:
+    """``n_envs`` worlds for Stable-Baselines3.
+
+    Args:
+        scenario: a shipped name, the path of a YAML file, or a ``Scenario``.
+        n_envs: worlds that are advanced together, at least 1.
+        seed: of the stream of worlds; None: fresh entropy.
+        learners: vehicles that learn instead of the scenario's, by name (``vehicle_2``) or index from 0; any number.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        observation: what the learners observe; None: ``observation_for(scenario)``.
+        horizon_is_end: infos report no truncation, so that an algorithm does not add the value it expects beyond the
+            horizon. Harm is counted to the horizon: nothing lies beyond it, and what is imagined there can grow without
+            limit (docs/exploits.md). False: ``TimeLimit.truncated`` says which episodes the horizon cut off.
+        appended: numbers of a row behind the vehicle's own observation. ``number``: the learner's place among the
+            learners (0 = the foremost); ``state``: the full state of the line (``observations.state``), for a central
+            critic.
+        step_infos: infos tell what the other interfaces tell in every step, not at the end of an episode alone; that
+            costs time.
+        render_mode: ``rgb_array`` or None; ``render`` and ``VecVideoRecorder`` show all worlds side by side.
+
+    >>> import ethbrake_marl as eb
+    >>> eb.make_sb3_vec_env("paper-random", 4, seed=7).reset().shape
+    (4, 27)
+
+    """
+    begin = chosen_seed(seed)
+    engine = make_engine(scenario, n_envs, learners=learners, reward=reward, observation=observation)
+    return EthBrakeVecEnv(
+        engine, begin, horizon_is_end=horizon_is_end, appended=appended, step_infos=step_infos, render_mode=render_mode
+    )
+
+
+class EthBrakeVecEnv(Begun, VecEnv):
+    """Rows are learners: row ``k * L + l`` is learner l (front to rear) of world k, for L learners in each world.
+
+    With several learners all rows share one policy, and the rows of a world end together. All worlds take their
+    episodes from one stream. At the end of an episode its rows' infos hold
+    ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return ``r``, steps ``l``; ``t`` is always 0, no
+    clock is read), and harm under both counts; all other infos are empty, unless ``step_infos``. Attributes and
+    methods belong to the whole batch: there are no environments inside.
+
+    Args:
+        engine: the running worlds; ``make_sb3_vec_env`` makes them.
+        seed: of the stream of worlds.
+        horizon_is_end: as in ``make_sb3_vec_env``.
+        appended: as in ``make_sb3_vec_env``.
+        step_infos: as in ``make_sb3_vec_env``.
+        render_mode: as in ``make_sb3_vec_env``.
+
+    >>> import ethbrake_marl as eb
+    >>> import numpy as np
+    >>> env = eb.make_sb3_vec_env("paper-random", 4, learners=["vehicle_2", "vehicle_3"])
+    >>> env.num_envs
+    8
+    >>> observations = env.reset()
+    >>> observations, rewards, dones, infos = env.step(np.full((8, 1), -1.0))
+    >>> rewards.shape, dones.any()
+    ((8,), np.False_)
+
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        seed: int,
+        *,
+        horizon_is_end: bool = True,
+        appended: Appended | None = None,
+        step_infos: bool = False,
+        render_mode: str | None = None,
+    ) -> None:
+        features = row_features(engine.observation.features, appended, engine.scenario)
+        if not engine.learners:
+            raise InvalidInput(f"scenario {engine.scenario.name!r} has no learner; pass learners=['vehicle_2']")
+        self.engine = engine
+        self.horizon_is_end = horizon_is_end
+        self.appended = appended
+        self.step_infos = step_infos
+        if render_mode not in (None, "rgb_array"):
+            raise InvalidInput(f"render_mode = {render_mode!r}: must be 'rgb_array', or None")
+        self.render_mode, self.viewer = render_mode, Viewer(engine, render_mode, batch=True)
+        self._set_seed(seed)
+        self._learners = np.array(engine.learners, np.int64)
+        self._actions: NDArray[Any] | None = None
+        rows = engine.n * len(engine.learners)
+        self._return = np.zeros(rows)
+        self._steps = np.zeros(rows, np.int64)
+        self._begun = np.zeros(0)  # values of the report at each episode's beginning
+        self._begun_shield: Columns = {}  # ... and what a shield reported then
+        super().__init__(rows, feature_box(features), action_box())
+        self.metadata = {**self.viewer.metadata, "render_modes": ["rgb_array"]}
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Start the stream of ``seed`` at the next reset (None: fresh entropy); one stream serves all rows."""
+        self._set_seed(chosen_seed(seed))
+        self._goes_on = False
+        return [self.np_random_seed] * self.num_envs
+
+    def reset(self) -> Observations:
+        """Start an episode in every world, with the seed and options set before (``seed``, ``set_options``).
+
+        Options hold for one reset; unusable ones are an ``InvalidInput`` of that reset, and the next one is without.
+        """
+        try:
+            worlds = self._read_options()
+        finally:
+            self._reset_options()
+        self._begin(None, worlds)
+        self._return[:], self._steps[:] = 0.0, 0
+        report = Report.of(self.engine)
+        self._begun, self._begun_shield = report.values, report.shield
+        return self._observe()
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Keep actions [rows, 1] for ``step_wait``."""
+        self._actions = own_actions(actions, "the learners")
+
+    def step_wait(self) -> tuple[Observations, Rewards, Bools, list[dict[str, Any]]]:
+        """Advance every world by one time step; worlds that end start their next episode at once."""
+        if not self._started or self._actions is None:
+            raise InvalidInput("step: no episode is running; call reset first")
+        actions, self._actions = self._actions, None
+        engine, learners = self.engine, self._learners
+        if actions.size != self.num_envs:
+            raise InvalidInput(
+                f"step: actions of shape {actions.shape}; one for each row, ({self.num_envs}, 1), is needed"
+            )
+        step = engine.step(actions.reshape(engine.n, len(learners)))
+        reward = step.reward.take(learners, axis=1).reshape(-1)
+        self._return += reward
+        self._steps += 1
+        infos = (
+            Report.of(engine, step).plain_infos(learners)
+            if self.step_infos
+            else plain_rows(shield_columns(engine), learners, self.num_envs)
+        )
+        over = engine.ended  # all that have ended: an interrupted step may have left some that nobody renewed
+        ended = np.flatnonzero(over)
+        if len(ended):
+            self._close_episodes(ended, step, infos)
+            engine.renew(ended)
+            told = Report.of(engine, rows=ended)
+            self._begun[ended] = told.values
+            self._begun_shield = renew_memory(self._begun_shield, ended, told.shield) if told.shield else {}
+        return self._observe(), reward.astype(np.float32), self._by_row(over), infos
+
+    def get_images(self) -> list[NDArray[np.uint8]]:
+        """A frame [H, W, 3] of each world."""
+        return list(self.viewer.render())
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def snapshot(self) -> Arrays:
+        """Copies of everything that changes while it runs, between two steps."""
+        arrays = {f"engine.{name}": array for name, array in self.engine.snapshot().items()}
+        return arrays | {"return": self._return.copy(), "steps": self._steps.copy(), "begun": self._begun.copy()}
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from a ``snapshot`` of the same scenario and size, without a reset; raises ``InvalidInput``."""
+        prefix = "engine."
+        self.engine.restore({n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)})
+        rows = {"return": self._return, "steps": self._steps, "begun": Report.of(self.engine).values}
+        for name, like in rows.items():
+            have = arrays[name]
+            if (have.shape, have.dtype) != (like.shape, like.dtype) or not np.isfinite(have).all():
+                raise InvalidInput(f"environment snapshot: {name}: {like.shape} finite {like.dtype} are needed")
+        self._return, self._steps = arrays["return"].copy(), arrays["steps"].copy()
+        self._begun, self._begun_shield = arrays["begun"].copy(), {}
+        self._set_seed(self.engine.seed)
+        self._started = self._goes_on = True
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """The batch's attribute, once per row asked for."""
+        return [getattr(self, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set the batch's attribute; for some rows only is an ``InvalidInput``."""
+        self._refuse_some_rows("set_attr", indices)
+        setattr(self, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
+        """Call the batch's method once, and return its result once per row; for some rows only is an error."""
+        self._refuse_some_rows("env_method", indices)
+        return [getattr(self, method_name)(*args, **kwargs)] * self.num_envs
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
+        """False for every row: nothing is wrapped."""
+        return [False for _ in self._get_indices(indices)]
+
+    def _close_episodes(self, ended: Ints, step: Step, infos: list[dict[str, Any]]) -> None:
+        """Fill in the infos of the rows whose world has ended, before the next episodes start."""
+        rows, final = self._rows(ended), self._observe(ended)
+        told = Report.of(self.engine, step, ended).plain_infos(self._learners)
+        truncated = self._by_row(step.truncated[ended]).tolist()
+        gained, steps = self._return.take(rows).tolist(), self._steps.take(rows).tolist()
+        for row, info, cut, seen, gain, count in zip(rows.tolist(), told, truncated, final, gained, steps, strict=True):
+            info["TimeLimit.truncated"] = cut and not self.horizon_is_end
+            info["terminal_observation"] = seen.copy()
+            info["episode"] = {"r": gain, "l": count, "t": 0.0}
+            infos[row] = info
+        self._return[rows], self._steps[rows] = 0.0, 0
+
+    def _rows(self, worlds: Ints) -> Ints:
+        """Rows of all learners of these worlds, in order."""
+        width = len(self.engine.learners)
+        return (worlds[:, np.newaxis] * width + np.arange(width)).reshape(-1)
+
+    @property
+    def reset_infos(self) -> list[dict[str, Any]]:
+        """The infos with which the running episodes began, row by row; made when they are asked for."""
+        if not self._started:
+            return [{} for _ in range(self.num_envs)]
+        begun = Report.of(self.engine)._replace(values=self._begun, shield=self._begun_shield)
+        return begun.plain_infos(self._learners)
+
+    @reset_infos.setter
+    def reset_infos(self, infos: list[dict[str, Any]]) -> None:
+        """Nothing: SB3's constructor assigns empty ones."""
+
+    def _observe(self, worlds: Ints | None = None) -> Observations:
+        """Observations of all learners, row by row, in their own memory; only of some worlds if given."""
+        every = self.engine.observe_all(self._learners, worlds)
+        rows = every.reshape(-1, every.shape[2])
+        if self.appended is None:
+            return rows
+        count, width = every.shape[:2]
+        if self.appended == "number":
+            more = np.tile(np.arange(width, dtype=np.float32), count)[:, np.newaxis]
+        else:
+            state, params = self.engine.packed
+            some = slice(None) if worlds is None else worlds
+            more = full_state(Packed(state[some], params[some]).worlds(), self.engine.scenario).repeat(width, axis=0)
+        return np.concatenate([rows, more], axis=1, dtype=np.float32)
+
+    def _by_row(self, worlds: Bools) -> Bools:
+        return worlds.repeat(len(self._learners))
+
+    def _read_options(self) -> Worlds | None:
+        """The worlds that the options of the rows ask for; None for the stream's."""
+
+        def bytes_of(start: Worlds) -> list[bytes]:
+            return [part.tobytes() for part in Packed.of(start)]
+
+        options = [row or {} for row in self._options]
+        if len(options) != self.num_envs:
+            raise InvalidInput(f"set_options: {len(options)} entries; one for each of {self.num_envs} rows is needed")
+        warn_of_unknown((name for row in options for name in row), (INITIAL_STATE,))
+        if not any(INITIAL_STATE in row for row in options):
+            return None
+        width, starts = len(self.engine.learners), list[Worlds]()
+        for k, row in enumerate(options):
+            start = self.engine.scenario.worlds_from_state(row[INITIAL_STATE]) if INITIAL_STATE in row else None
+            if start is None or (k % width and bytes_of(start) != bytes_of(starts[-1])):
+                raise InvalidInput(
+                    f"set_options: row {k} has {row!r}; if one row has an {INITIAL_STATE}, every row needs one, and the"
+                    " learners of a world the same options"
+                )
+            starts += [] if k % width else [start]
+        return Worlds.concatenate(starts)
+
+    def _refuse_some_rows(self, what: str, indices: VecEnvIndices) -> None:
+        if list(self._get_indices(indices)) != list(range(self.num_envs)):
+            raise InvalidInput(f"{what}: indices {indices!r}; rows share one batch, so leave indices out")

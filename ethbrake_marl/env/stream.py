@@ -1,0 +1,192 @@
+"""The stream of episodes: worlds at the alert, made ready for their first decision."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.env.compiled_step import CLOCK_WIDTH, LAST_STEP, START
+from ethbrake_marl.env.harm import Ledger
+from ethbrake_marl.env.memory import ask_script, begin_script, is_state_free, within_capacity
+from ethbrake_marl.env.scripts import SAMPLED_AT_ONCE, Script
+from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.columns import Packed
+from ethbrake_marl.physics.episode import Decisions
+from ethbrake_marl.physics.left_out import Impacts, leaving_out_failed
+from ethbrake_marl.physics.rows import FLAG, LISTED
+from ethbrake_marl.physics.state import Floats, Ints, Worlds
+from ethbrake_marl.scenario.schema import Scenario
+
+
+class Start(NamedTuple):
+    """Worlds ready for their first decision."""
+
+    origin: Worlds  # at t = 0: these worlds are its ``first``, ``first + 1``, ...
+    first: int
+    packed: Packed  # at the first decision
+    clock: Floats  # [n, CLOCK_WIDTH]
+    wanted: Floats  # [n, N] commands of the state-free scripts, 0 for all others
+
+    @property
+    def alert(self) -> Worlds:
+        """These worlds at the alert, t = 0."""
+        return self.origin.take(np.arange(self.first, self.first + len(self.clock)))
+
+    def part(self, first: int, count: int) -> Start:
+        """``count`` worlds of these, from ``first`` on."""
+        rows = slice(first, first + count)
+        packed = Packed(self.packed.state[rows], self.packed.params[rows])
+        return Start(self.origin, self.first + first, packed, self.clock[rows], self.wanted[rows])
+
+
+class FailedWorld(UserWarning):
+    """A running episode was cut off: its world could not be advanced. (The rest of the batch goes on.)"""
+
+
+class Roster:
+    """Which world of the stream stands in each row of a batch, and which of them could not be advanced.
+
+    ``first`` is the number of row 0's world, the others follow; None: the worlds were given, and have no number.
+    """
+
+    def __init__(self, n: int, seed: int, first: int | None, given: Worlds | None = None) -> None:
+        self.failed: dict[int, str] = {}  # by row, and why; until a new episode begins there
+        self.warns = True  # with a ``FailedWorld`` that names the world; off: the caller looks at ``failed``
+        self.seed = seed
+        self.given = given  # the worlds that were given, at the alert: where ``numbers`` are -1
+        self.numbers = np.full(n, -1, np.int64) if first is None else first + np.arange(n)  # by row; -1: given
+
+    def apart(self) -> Roster:
+        """One that goes on from here without changing this one."""
+        new = copy.copy(self)
+        new.failed, new.numbers = dict(self.failed), self.numbers.copy()
+        return new
+
+    def renew(self, rows: Ints, first: int) -> None:
+        """World ``first`` of the stream and those after it now stand in these rows."""
+        self.numbers[rows] = first + np.arange(len(rows))
+        for row in self.failed.keys() & rows.tolist() if self.failed else ():
+            del self.failed[row]
+
+    def mark(self, status: Ints, from_s: Floats, until_s: Floats) -> None:
+        """Enter the worlds with a ``status``: a step from ``from_s`` to ``until_s`` [n] could not advance them."""
+        new = FLAG.failure(np.where(status == 0, FLAG.DONE, status), from_s, until_s).worlds
+        self.failed |= new
+        for row, reason in new.items() if self.warns else ():
+            number = int(self.numbers[row])
+            name = f"world {number} of seed {self.seed}" if number >= 0 else f"the world of row {row}"
+            warnings.warn(FailedWorld(f"{name}: {reason}; its episode was cut off there"), stacklevel=4)
+
+
+class Stream:
+    """The training worlds of a seed, one after the other, each ready for its first decision.
+
+    Learners and scripts with a memory coast until then: whoever uses them moves their worlds anew (``moved``).
+    """
+
+    def __init__(self, scenario: Scenario, deciders: Sequence[int], scripts: Mapping[int, Script], seed: int) -> None:
+        self._scenario = scenario
+        self._deciders = list(deciders)
+        self._state_free = {i: script for i, script in scripts.items() if is_state_free(script)}
+        self._pieces = {i: getattr(script, "braking_pieces", ()) for i, script in scripts.items()}
+        self.known = {i: script for i, script in scripts.items() if i not in self._deciders}  # to who looks ahead
+        self.restart(seed)
+
+    def restart(self, seed: int, position: int = 0) -> None:
+        """Go to a world of ``seed``, the first one where no other is named."""
+        self.seed, self._drawn = seed, position
+        self._pool: Start | None = None
+        self._next = 0
+
+    @property
+    def position(self) -> int:
+        """Number of the next world in the stream."""
+        return self._drawn - (0 if self._pool is None else len(self._pool.clock) - self._next)
+
+    def take(self, count: int) -> Start:
+        """The next ``count`` worlds."""
+        if self._pool is None or self._next + count > len(self._pool.clock):
+            self._fill(count)
+        assert self._pool is not None
+        taken = self._pool.part(self._next, count)
+        self._next += count
+        return taken
+
+    def _fill(self, count: int) -> None:
+        """Draw and prepare more worlds behind those that are left.
+
+        One that cannot be advanced to its first decision gives its place to the next one that can; a ``FailedWorld``
+        warning names it. So worlds keep their places in the stream, and a training goes on.
+        """
+        first, size = self.position, max(4 * count, SAMPLED_AT_ONCE)
+        alert = self._scenario.sample(size, self.seed, first=self._drawn, channel="training").worlds
+        if self._pool is not None:
+            alert = Worlds.concatenate([self._pool.part(self._next, self._drawn - first).alert, alert])
+        start, kept, failed = leaving_out_failed(lambda rows: self.prepare(alert.take(rows)), np.arange(alert.n))
+        if start is None:
+            raise PhysicsError(failed)
+        for row, reason in failed.items():
+            warnings.warn(FailedWorld(f"world {first + row} of seed {self.seed}: {reason}; left out"), stacklevel=2)
+        if failed:
+            later = np.searchsorted(kept, np.arange(alert.n)) % len(kept)
+            start = self.prepare(alert.take(kept[later]))
+        self._pool, self._next = start, 0
+        self._drawn += size
+
+    def prepare(self, alert: Worlds) -> Start:
+        """Worlds at t = 0, made ready for their first decision. Raises ``InvalidInput`` if nobody may ever decide."""
+        alert = alert.play_pieces(self._pieces)
+        clock = np.zeros((alert.n, CLOCK_WIDTH))
+        clock[:, START] = alert.first_decision_s(self._deciders)
+        step, horizon = self._scenario.time_step_s, self._scenario.horizon_s
+        if not (clock[:, START] < horizon).all():
+            late = float(clock[:, START].max())
+            raise InvalidInput(f"reset: nobody decides before the horizon ({late:g} s >= {horizon:g} s)")
+        clock[:, LAST_STEP] = Decisions(clock[:, START], step).before(horizon)
+        wanted = np.zeros(alert.speeds_mps.shape)
+        for vehicle, script in self._state_free.items():
+            memory = begin_script(script, alert, vehicle, self.known)
+            command, _ = ask_script(script, alert, memory, vehicle)
+            wanted[:, vehicle] = within_capacity(command, alert, vehicle, script)
+        return Start(alert, 0, moved(alert, wanted, clock[:, START]), clock, wanted)
+
+
+def check_alert(worlds: Worlds, n: int, vehicles: int) -> None:
+    """Refuse worlds, with ``InvalidInput``, that are not ``n`` lines of ``vehicles`` at the alert: t = 0, no impact."""
+    if (worlds.n, worlds.N) != (n, vehicles):
+        raise InvalidInput(
+            f"reset: {count_of(worlds.n, 'world')} of {worlds.N} vehicles are given; {n} of {vehicles} vehicles needed"
+        )
+    at_alert = (worlds.time_s == 0.0) & ~worlds.pair_hit.any(axis=1) & ~worlds.obstacle_hit
+    if not at_alert.all():
+        k = int(np.argmin(at_alert))
+        what = "after an impact" if worlds.time_s[k] == 0.0 else f"at {worlds.time_s[k]:g} s"
+        raise InvalidInput(f"reset: world {k} is {what}; episodes start at the alert, t = 0, without any impact")
+
+
+def moved(alert: Worlds, wanted: Floats, start_s: Floats) -> Packed:
+    """Worlds at t = 0 moved to their first decision, harm on the way included."""
+    after, impacts = advance(alert, wanted, until_s=start_s)
+    return packed_with(after, impacts)
+
+
+def packed_with(worlds: Worlds, harm: Impacts | Ledger) -> Packed:
+    """Worlds, and the harm so far, as rows."""
+    packed = Packed.of(worlds)
+    column, pairs = packed.column, worlds.N - 1
+    for group, values in enumerate((harm.first_impact_harm, harm.total_harm, harm.count)):
+        packed.state[:, column.harm + group * pairs : column.harm + (group + 1) * pairs] = values
+    if packed.has_obstacle:
+        obstacle = (harm.obstacle_first_harm, harm.obstacle_total_harm, harm.obstacle_count)
+        packed.state[:, column.obstacle + 2 :] = np.column_stack(obstacle)
+    return packed
+
+
+NO_ROWS = np.empty((0, LISTED.WIDTH))  # no list of impacts is kept
+
+RUNNING = ("_state", "_params", "_clock", "_wanted", "_potential")  # arrays of an engine that every step changes

@@ -1,0 +1,142 @@
+"""Two results compared: the same worlds of the same scenario, or no comparison."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput, count_of
+from ethbrake_marl.evaluation.exploits import MARK, Exploits
+from ethbrake_marl.evaluation.per_world import COMPARED, HARMS, SAME, Result, told_of
+from ethbrake_marl.evaluation.statistics import paired_difference, unpaired_difference
+from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.physics.state import Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """What one agent does more in the second result than in the first, mean per world (m2/s2)."""
+
+    agent: str
+    policy: Literal["same", "other", "none"]  # whether both drove by the same one
+    harms: Mapping[str, Estimate]  # by the name of the harm
+    exploits: tuple[Exploits, Exploits]  # in the first result and in the second: what harm does not count
+
+    @property
+    def marked(self) -> str:
+        """Its agent, marked where it exploits what harm does not count, in either result."""
+        return f"{self.agent} {MARK}" if any(each.names for each in self.exploits) else self.agent
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        harms = {f"{name}_difference": estimate for name, estimate in self.harms.items()}
+        exploits = [list(each.names) for each in self.exploits]
+        return {"agent": self.agent, "policy": self.policy, **Estimate.side_by_side(harms), "exploits": exploits}
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Two results on the same worlds, the second minus the first, agent by agent."""
+
+    differences: tuple[Difference, ...]
+    unpaired_because: str | None  # None: intervals are paired by world
+    left_over: tuple[tuple[str, ...], tuple[str, ...]]  # agents of the first alone, and of the second
+    other_settings: Mapping[
+        str, tuple[str | None, str | None]
+    ]  # of the agents of the first and of the second, likewise
+    other_versions: Mapping[str, tuple[str | None, str | None]]  # of the first and of the second, where they differ
+
+    @property
+    def exploits_line(self) -> str:
+        """Who exploits in which result what harm does not count, as a sentence; empty where nobody does."""
+        found: dict[str, Exploits] = {}
+        for each in self.differences:
+            first, second = each.exploits
+            same = {each.agent: first}
+            apart = {f"{each.agent} in the first": first, f"{each.agent} in the second": second}
+            found |= same if first == second else apart
+        return Exploits.sentence(found)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return {
+            "intervals": "paired" if self.unpaired_because is None else "unpaired",
+            "unpaired_because": self.unpaired_because,
+            "agents": [difference.to_json() for difference in self.differences],
+            "only_in_first": list(self.left_over[0]),
+            "only_in_second": list(self.left_over[1]),
+            "other_settings": {name: list(both) for name, both in self.other_settings.items()},
+            "other_versions": {name: list(both) for name, both in self.other_versions.items()},
+        }
+
+
+def compare_results(first: Result, second: Result) -> Comparison:
+    """What agents of the same name did in both, the second minus the first.
+
+    Paired by world where both have every world beside them. Raises ``InvalidInput`` for results of different kinds, on
+    different worlds or scenarios, or without a common agent.
+    """
+    for key, what in SAME.items():
+        told, told_second = (told_of(result.about, key) for result in (first, second))
+        if told != told_second:
+            raise InvalidInput(
+                f"{second.path}: is about {what} than {first.path} ({key} {told_second!s:.12} and {told!s:.12}):"
+                " no comparison"
+            )
+    common = [agent for agent in first.rows if agent in second.rows]
+    left_over = [tuple(agent for agent in one.rows if agent not in common) for one in (first, second)]
+    if not common:
+        agents = " and ".join(f"{', '.join(names)}" for names in left_over)
+        raise InvalidInput(f"{first.path} and {second.path} have no agent in common: {agents}")
+    worlds, because = _worlds_of_both(first, second, common)
+    differences = []
+    for agent in common:
+        one, other = first.rows[agent], second.rows[agent]
+        if worlds is None:
+            sizes = other["episodes"], one["episodes"]
+            harms = {
+                harm: unpaired_difference(second.estimate(agent, harm), sizes[0], first.estimate(agent, harm), sizes[1])
+                for harm in COMPARED[first.about["kind"]]
+            }
+        else:
+            before, after = worlds[agent]
+            harms = {name: paired_difference(after[:, k], before[:, k]) for k, name in enumerate(HARMS)}
+        policies = one["policy_sha256"], other["policy_sha256"]
+        same: Literal["same", "other"] = "same" if policies[0] == policies[1] else "other"
+        exploits = Exploits.of_json(one), Exploits.of_json(other)
+        differences.append(Difference(agent, same if any(policies) else "none", harms, exploits))
+    changed = []
+    for key in ("agent_settings", "versions"):
+        one, other = (each if isinstance(each := of.about.get(key), dict) else {} for of in (first, second))
+        names = [name for name in dict.fromkeys([*one, *other]) if one.get(name) != other.get(name)]
+        changed.append({name: (one.get(name), other.get(name)) for name in names})
+    return Comparison(tuple(differences), because, (left_over[0], left_over[1]), *changed)
+
+
+Worlds = dict[str, tuple[Floats, Floats]]  # agent -> harms [n, 2] of the first and of the second, world by world
+
+
+def _worlds_of_both(first: Result, second: Result, common: Sequence[str]) -> tuple[Worlds | None, str | None]:
+    """The harms to pair, or why there are none."""
+    try:
+        one, other = first.harms(), second.harms()
+    except InvalidInput as error:
+        return None, f"one row per world is needed of both; {error}"
+    found = {}
+    for agent in common:
+        worlds = sorted(one.get(agent, {}))
+        if len(worlds) != first.rows[agent]["episodes"] or worlds != sorted(other.get(agent, {})):
+            return None, f"the rows per world of {agent} are not those of {count_of(len(worlds), 'same world')}"
+        found[agent] = tuple(np.array([side[agent][world] for world in worlds]) for side in (one, other))
+        for result, harms in zip((first, second), found[agent], strict=True):
+            for name, mean in zip(HARMS, harms.mean(axis=0), strict=True):
+                told = result.rows[agent].get(name)
+                if told is not None and not math.isclose(told, mean, rel_tol=1e-9, abs_tol=1e-9):
+                    raise InvalidInput(
+                        f"{result.path}: {agent}: {name} = {told:g}, but the mean of its worlds is {mean:g}"
+                    )
+    return found, None  # type: ignore[return-value]  # two of them each

@@ -1,0 +1,298 @@
+"""``Evaluation``: the outcomes of several agents in the same worlds."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.env.harm import HARM_COUNTS
+from ethbrake_marl.env.objectives import Declared, scored
+from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, unknown_name
+from ethbrake_marl.evaluation.agent_tally import AgentTally
+from ethbrake_marl.evaluation.conditions import Conditions
+from ethbrake_marl.evaluation.measures import BASELINE, COUNTED, measures
+from ethbrake_marl.evaluation.outcome import IncompleteTable, LeftOut, Outcome, none_for_nan
+from ethbrake_marl.evaluation.rescores import Rescored, Rescores
+from ethbrake_marl.evaluation.statistics import Moments, exact_sum, mean, rate
+from ethbrake_marl.extensions.search.regret import KNOWN_OF_WORLDS, Regrets
+from ethbrake_marl.extensions.search.shipped import Limits, Unproven, known_limits
+from ethbrake_marl.files.sheet import Column, Sheet
+from ethbrake_marl.physics.messages import Messages
+from ethbrake_marl.physics.state import Bools, Ints, Worlds
+from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.task import Task
+
+_SHOWN_AGENTS = 5  # by name, in ``repr``
+
+Columns = dict[str, list[Any]]  # of one row per world
+
+_TEXT_COLUMNS = {"agent", "scenario", "unavoidable_reason", "best_known_source", "ended", "knows"}
+
+_ALWAYS_TOLD = (
+    "gaps_m",
+    "speeds_mps",
+    "obstacle_gap_m",
+)  # quantities of those files that may be the same in all worlds
+
+_LIBRARIES = ("pandas", "polars", "columns")  # of a frame, in the order of preference
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Outcomes of agents that drove the same vehicles in the same worlds, row k of every array being world k.
+
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> agents = {name: eb.make_agent(name) for name in ("full_brake", "coast")}
+    >>> evaluation = eb.evaluate(scenario.sample(3, seed=7), agents, scenario=scenario)
+    >>> list(evaluation.outcomes), evaluation.vehicle, evaluation.index
+    (['full_brake', 'coast'], 1, array([0, 1, 2]))
+
+    """
+
+    scenario: Scenario  # of the worlds
+    vehicles: tuple[int, ...]  # indices (0 = front) of the vehicles that were driven; the others followed scripts
+    worlds: Worlds  # at the alert
+    index: Ints  # [n] number of each world in its list
+    seed: int | None  # of the list; None for worlds that were given
+    outcomes: dict[str, Outcome]  # by the agent's name
+    left_out: tuple[LeftOut, ...] = ()  # worlds of the list that are in none of the arrays, the same for all agents
+    kinds: Mapping[str, NDArray[np.str_]] = field(default_factory=dict)  # ``scenario``, ``vehicle_2_type``: each [n]
+    host: str = ""  # that moved the worlds; else the physics here, of which something is proven
+
+    def __repr__(self) -> str:
+        drivers = [f"{agent!r:.42}" for agent in list(self.outcomes)[:_SHOWN_AGENTS]]
+        more = len(self.outcomes) - len(drivers)
+        drivers += [f"{more} more"] if more else []
+        seed = "" if self.seed is None else f" of seed {self.seed}"
+        return (
+            f"Evaluation({self.scenario.name!r}, {count_of(self.worlds.n, 'world')}{seed}, {self.task.names:.80} driven"
+            f" by {', '.join(drivers)})"
+        )
+
+    def telling(self, names: Collection[str]) -> Evaluation:
+        """The same, of registered measures with these alone."""
+        outcomes = {}
+        for agent, outcome in self.outcomes.items():
+            kept = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
+            outcomes[agent] = replace(outcome, metrics=kept)
+        return replace(self, outcomes=outcomes)
+
+    @property
+    def vehicle(self) -> int:
+        """The vehicle that was driven; raises ``InvalidInput`` if it is not exactly one."""
+        return self.task.vehicle
+
+    @property
+    def task(self) -> Task:
+        """What was asked of the agents."""
+        return Task(self.scenario, self.vehicles)
+
+    @cached_property
+    def limits(self) -> Limits | Unproven:
+        """What is known of each world whoever drives: found once, for everything that tells of this evaluation.
+
+        Warns (``IncompleteTable``) where a table of best known harm holds some of the worlds, and not the others.
+        """
+        if self.host:
+            return Unproven(f"{self.host} moved these worlds, and what is proven is of the physics here")
+        found = known_limits(self.worlds, self.task)
+        if isinstance(found, Limits) and found.warning:
+            warnings.warn(found.warning, IncompleteTable, stacklevel=2)
+        return found
+
+    @classmethod
+    def join(cls, parts: Sequence[Evaluation]) -> Evaluation:
+        """One from those of consecutive worlds of a list; raises ``PhysicsError`` if every world was left out."""
+        left_out = tuple(left for part in parts for left in part.left_out)
+        some = [part for part in parts if part.worlds.n]
+        if not some:
+            raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in left_out})
+        if len(parts) == 1:
+            return parts[0]
+        return replace(
+            some[0],
+            worlds=Worlds.concatenate([part.worlds for part in some]),
+            index=np.concatenate([part.index for part in some]),
+            outcomes={name: Outcome.join([part.outcomes[name] for part in some]) for name in some[0].outcomes},
+            left_out=left_out,
+            kinds={name: np.concatenate([part.kinds[name] for part in some]) for name in some[0].kinds},
+        )
+
+    def take(self, rows: Ints | Bools) -> Evaluation:
+        """That of some of the worlds; nobody is left out of them."""
+        outcomes = {name: outcome.take(rows) for name, outcome in self.outcomes.items()}
+        kinds = {name: column[rows] for name, column in self.kinds.items()}
+        return replace(
+            self, worlds=self.worlds.take(rows), index=self.index[rows], outcomes=outcomes, left_out=(), kinds=kinds
+        )
+
+    def tally(
+        self, *, baseline: str = "full_brake", limits: bool = True, objectives: Sequence[str] | None = None
+    ) -> dict[str, AgentTally]:
+        """The tally of every agent.
+
+        Args:
+            baseline: what is compared with, but for regrets, which are compared with full braking.
+            limits: with what needs the best known harm of each world.
+            objectives: also sum up what each vehicle bears, and these of it; None: neither.
+
+        """
+        regrets, values = self.regrets if limits else None, {}
+        for agent, outcome in self.outcomes.items():
+            told = ((m.name, m.values(outcome, regrets)) for m in (*measures(outcome.metrics), *COUNTED))
+            values[agent] = {name: column for name, column in told if column is not None}
+            values[agent] |= {} if objectives is None else outcome.borne(objectives)
+        paired = {str(m.of): BASELINE if m.limits else baseline for m in measures() if m.against}
+        found = {}
+        for agent, own in values.items():
+            truths = {name: column for name, column in own.items() if column.dtype == np.bool_}
+            found[agent] = AgentTally(
+                {name: (int(column.sum()), len(column)) for name, column in truths.items()},
+                {name: Moments.of(column) for name, column in own.items() if name not in truths},
+                {
+                    name: exact_sum(own[name], values[other][name])
+                    for name, other in paired.items()
+                    if name in own and other in values
+                },
+            )
+        return found
+
+    @staticmethod
+    def check_group(kinds: Collection[str], by: str) -> None:
+        """Raise what ``summarise_by`` would for worlds with these columns of ``kinds``."""
+        if not kinds:
+            raise InvalidInput(
+                f"by {by!r}: these worlds have no groups; those of a mixture have scenario, those with vehicle_types"
+                " have vehicle_1_type and so on"
+            )
+        if by not in kinds:
+            raise unknown_name("group", by, kinds)
+
+    @property
+    def hidden(self) -> Bools:
+        """Worlds in which the channel hides something of the line from a driven vehicle, [n]; see ``v2x``."""
+        from_each = [self.worlds.vehicles.hide_from(i) | Messages.of(self.worlds).periodic for i in self.vehicles]
+        hidden: Bools = np.logical_or.reduce([np.zeros(self.worlds.n, np.bool_), *from_each])
+        return hidden
+
+    @cached_property
+    def regrets(self) -> Regrets | None:
+        """Best known harm of every world, the agents of this evaluation included; None where nothing is proven."""
+        limits = self.limits
+        if isinstance(limits, Unproven):
+            return None
+        outcomes = self.outcomes.values()
+        first = np.fmin.reduce([limits.first_impact_harm, *(outcome.first_impact_harm for outcome in outcomes)])
+        total = np.fmin.reduce([limits.total_harm, *(outcome.total_harm for outcome in outcomes)])
+        regrets = Regrets(limits, first, total, np.zeros(0, np.str_))
+        below = np.logical_or.reduce([regrets.below(outcome) for outcome in outcomes])
+        avoidable = limits.proof.avoidable
+        witness = np.zeros(below.shape, np.bool_) if avoidable is None else avoidable
+        source = np.select([witness, ~limits.known, below], ["witness", "agents", "below_table"], "table")
+        return replace(regrets, source=source)
+
+    @property
+    def conditions(self) -> Conditions:
+        """Under which these are the results, with all quantities of the worlds."""
+        because = self.limits.because if isinstance(self.limits, Unproven) else None
+        return Conditions.of_test(self.task, self.seed, self.worlds.n, because, Conditions.of(self.worlds))
+
+    def per_world(self, objectives: Sequence[Declared] = ()) -> Columns:
+        """One row per agent and world; docs/per-world.md lists the columns. None where there is no value.
+
+        Initial quantities are named as in a table of initial states: ``gap_1_m``, ``speed_1_mps``, ``latency_2_s``,
+        ``restitution``.
+        """
+        n, regrets = self.worlds.n, self.regrets
+        initial: Columns = {"world": self.index.tolist()}
+        initial |= {name: column.tolist() for name, column in self.kinds.items()}
+        for key, rule in QUANTITY.of(self.worlds).items():
+            values = rule.of(self.worlds)
+            if key in _ALWAYS_TOLD or np.ptp(values, axis=0).any():
+                initial |= {rule.column_of(i): none_for_nan(values[:, i]) for i in range(values.shape[1])}
+        found: Columns = {}
+        for agent, outcome in self.outcomes.items():
+            told = outcome.columns()
+            for name, of in KNOWN_OF_WORLDS.items():
+                told[name] = None if regrets is None else of(regrets, outcome)
+            told |= {name: column for name, column in outcome.borne(objectives).items() if name not in told}
+            columns: Columns = {
+                "agent": [agent] * n,
+                **initial,
+                **{name: [None] * n if column is None else none_for_nan(column) for name, column in told.items()},
+                "knows": [outcome.knows.text] * n,
+                "hidden": self.hidden.astype(int).tolist(),
+            }
+            for left in self.left_out:
+                told_of = {"agent": agent, "world": left.world, "ended": f"left out: {left.agent}: {left.reason}"}
+                columns = {name: [*values, told_of.get(name)] for name, values in columns.items()}
+            found = {name: [*found.get(name, ()), *values] for name, values in columns.items()}
+        return found
+
+    def arrays(self, objectives: Sequence[Declared] = ()) -> dict[str, NDArray[Any]]:
+        """``per_world`` as arrays: NaN for no number, the empty text for no text."""
+        found = {}
+        for name, values in self.per_world(objectives).items():
+            texts = name in _TEXT_COLUMNS or (name.startswith("vehicle_") and name.endswith("_type"))
+            found[name] = np.array([("" if texts else np.nan) if value is None else value for value in values])
+        return found
+
+    def to_frame(self, library: str | None = None) -> Any:
+        """One row per agent and world: the columns of ``--per-world`` (docs/per-world.md), NaN for no number.
+
+        A pandas ``DataFrame`` where pandas is installed, else one of polars, else a mapping of column names to arrays.
+        ``library`` asks for one of them: ``pandas``, ``polars`` or ``columns``. Raises ``UnknownName`` for another, and
+        ``InvalidInput`` for one that is not installed.
+        """
+        if library is not None and library not in _LIBRARIES:
+            raise unknown_name("library", library, _LIBRARIES)
+        chosen = library or next((name for name in _LIBRARIES[:-1] if find_spec(name) is not None), _LIBRARIES[-1])
+        if chosen == _LIBRARIES[-1]:
+            return self.arrays()
+        if find_spec(chosen) is None:
+            raise InvalidInput(f"to_frame: {chosen} is not installed: {sys.executable} -m pip install {chosen}")
+        return import_module(chosen).DataFrame(self.arrays())
+
+    def rescore(self, declared: Sequence[Declared] | None = None) -> Rescores:
+        """Every agent under every objective and both counts, in that order."""
+        return Rescores(
+            [
+                Rescored(agent, objective, harm_count, tuple(mean(column) for column in values.T))
+                for agent, outcome in self.outcomes.items()
+                for harm_count in HARM_COUNTS
+                for objective, values in scored(outcome.ledger, harm_count, declared).items()
+            ]
+        )
+
+    def _repr_html_(self) -> str:
+        """What each agent did, for a notebook."""
+        share = Column("Collisions", digits=1, scale=100.0, unit=" %")
+        rows = [
+            (agent, rate(int(each.collided.sum()), self.worlds.n), mean(each.first_impact_harm), mean(each.total_harm))
+            for agent, each in self.outcomes.items()
+        ]
+        note = "Means per world in m²/s², with their 95 % intervals. eb.summarise tells more."
+        return Sheet(repr(self), ("Agent", share, Column("First-impact harm"), Column("Total harm")), rows, note).html()
+
+    def complete(self) -> Evaluation:
+        """The evaluation itself, for who needs every world; raises ``PhysicsError`` if some were left out."""
+        if self.left_out:
+            raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
+        return self
+
+    def outcome(self, agent: str) -> Outcome:
+        """The outcome of one agent; raises ``InvalidInput`` naming those that were evaluated."""
+        if agent not in self.outcomes:
+            raise InvalidInput(f"agent {agent!r} was not evaluated; evaluated: {', '.join(self.outcomes)}")
+        return self.outcomes[agent]

@@ -1,0 +1,37 @@
+"""An evaluation by group: the worlds of each scenario of a mixture, or those in which a vehicle is of one type."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.measures import BASELINE
+from ethbrake_marl.evaluation.summary import SummaryTable, summarise
+
+NO_TYPE = "no type"  # of a vehicle of a mixture's member without types
+
+
+def summarise_by(evaluation: Evaluation, by: str, *, baseline: str = BASELINE) -> dict[str, SummaryTable]:
+    """Rows as ``summarise`` for each group of worlds, by the group's name, sorted.
+
+    Args:
+        evaluation: of a mixture, or of a scenario with types of vehicles.
+        by: ``scenario``, or whose type: ``vehicle_2_type``.
+        baseline: as in ``summarise``.
+
+    Raises ``InvalidInput`` for worlds that were drawn without such, ``UnknownName`` for another column.
+
+    >>> import ethbrake_marl as eb
+    >>> delays = eb.load_scenario("mixture-delays")
+    >>> agents = {"full_brake": eb.make_agent("full_brake")}
+    >>> found = eb.summarise_by(eb.evaluate(delays.sample(30, seed=7), agents, scenario=delays), "scenario")
+    >>> {name: rows[0].episodes for name, rows in found.items()}
+    {'paper-delay-high': 11, 'paper-delay-low': 8, 'paper-delay-middle': 11}
+
+    """
+    Evaluation.check_group(evaluation.kinds, by)
+    column = evaluation.kinds[by]
+    return {
+        name or NO_TYPE: summarise(evaluation.take(column == name), baseline=baseline)
+        for name in np.unique(column).tolist()
+    }

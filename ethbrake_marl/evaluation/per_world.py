@@ -1,0 +1,250 @@
+"""One row per agent and world: its columns, and its file, written whole and never over another by accident."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+from ethbrake_marl.env.objectives import Declared
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras, unknown_name
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.identity import Kind
+from ethbrake_marl.evaluation.rescores import Rescored
+from ethbrake_marl.evaluation.summary import SummaryRow
+from ethbrake_marl.files.sheet import Estimate, parquet_file
+from ethbrake_marl.files.store import check_target, parse_strict_json, read_plain, write_output
+
+CSV, PARQUET = ".csv", ".parquet"
+
+HARMS = ("first_impact_harm", "total_harm")
+
+_HARMS = ("agent", "world", *HARMS)
+
+
+def write_per_world(
+    path: str | Path, evaluation: Evaluation, *, objectives: Sequence[Declared] = (), force: bool = False
+) -> None:
+    """Write one row per agent and world: Parquet where the name ends in ``.parquet``, else CSV.
+
+    docs/per-world.md lists the columns; ``objectives`` adds theirs. A world that was left out has a row with nothing
+    but its number and, in ``ended``, why. The file appears whole or not at all. Raises ``AlreadyExists`` unless
+    ``force``, ``InvalidInput`` without a folder or for another ending, ``MissingExtra`` without pyarrow for Parquet.
+    """
+    ending = Path(path).suffix.lower()
+    if ending not in (CSV, PARQUET):
+        raise InvalidInput(f"{path}: must end in {CSV} or {PARQUET}")
+    if ending == PARQUET:
+        with naming_extras():
+            import pyarrow
+        columns = evaluation.arrays(objectives)
+        with parquet_file(check_target(path, force=force)) as write:
+            write({name: pyarrow.array(values, from_pandas=True) for name, values in columns.items()})
+        return
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    told = evaluation.per_world(objectives)
+    writer.writerow(told)
+    writer.writerows(zip(*told.values(), strict=True))
+    write_output(path, text.getvalue().encode(), force=force)
+
+
+def read_harms(path: Path, data: bytes) -> dict[str, dict[int, tuple[float, ...]]]:
+    """Agent -> world -> harm (m2/s2) under both counts, of ``data``, what ``write_per_world`` wrote to ``path``.
+
+    Worlds that were left out are not among them. Raises ``InvalidInput`` for a file without these columns.
+    """
+    try:
+        if path.suffix.lower() == PARQUET:
+            with naming_extras():
+                from pyarrow.parquet import read_table
+            table = read_table(io.BytesIO(data), columns=list(_HARMS)).to_pydict()
+            rows = list(zip(*(table[name] for name in _HARMS), strict=True))
+        else:
+            lines = csv.DictReader(data.decode("utf-8").splitlines())
+            rows = [tuple(line[name] for name in _HARMS) for line in lines]
+        found: dict[str, dict[int, tuple[float, ...]]] = {}
+        for agent, world, *harms in rows:
+            if harms[0] not in (None, ""):
+                values = tuple(map(float, harms))
+                if not all(0.0 <= value <= _MOST_HARM for value in values):
+                    raise ValueError(f"world {world}: harm {harms}")
+                found.setdefault(agent, {})[int(world)] = values
+        return found
+    except (KeyError, TypeError, ValueError, NotImplementedError, OSError, csv.Error) as error:
+        raise InvalidInput(f"{path}: is no file of --per-world: {error}") from None
+
+
+USUAL: Mapping[str, str] = {"harm_count": "first"}  # settings of agents
+
+COMPARED: dict[Kind, tuple[str, ...]] = {  # harms of each
+    "evaluate": HARMS,
+    "shield": ("harm",),
+}
+
+_LIMIT_BYTES, _MOST_BYTES = 64 << 20, 4 << 30  # of a results file, and of one with every world
+
+_MOST_EPISODES = 10**12
+
+_MOST_HARM = 1e100  # m2/s2; a number that can be squared
+
+_HASHES = {"worlds_sha256": "another list of worlds", "scenario_sha256": "another scenario"}
+
+SAME = {  # all but the hashes: where they are told
+    "kind": "another kind of results",
+    "worlds_sha256": _HASHES["worlds_sha256"],
+    "controlled_vehicle": "another driven vehicle",
+    "scenario_sha256": _HASHES["scenario_sha256"],
+    "harm_count": "another harm",
+}
+
+_NEEDED = {
+    "agent": str,
+    "episodes": int,
+    **dict.fromkeys(_HASHES, str),
+    "policy_sha256": dict,
+    "versions": dict,
+    "horizon_ends": int,
+}
+
+
+def results_to_json(
+    rows: Sequence[SummaryRow],
+    *,
+    told: Sequence[Rescored] = (),
+    groups: Mapping[str, Sequence[SummaryRow]] | None = None,
+    per_world: Path | None = None,
+    settings: Mapping[str, str] = USUAL,
+) -> list[dict[str, Any]]:
+    """What a results file holds: one object per row, with what was ``told`` of it under other objectives.
+
+    ``settings`` are those of all agents: the harm that they minimise.
+
+    ``groups``, by name, are rows of the same agents on parts of the worlds (``summarise_by``).
+    ``per_world`` is the file with one row per world, written before; its name and hash go into every object.
+    """
+    found = [row.to_json() | {"agent_settings": dict(settings)} for row in rows]
+    if told:
+        found = [row | {"objectives": [t.to_json() for t in told if t.agent == row["agent"]]} for row in found]
+    for row in found if groups else ():
+        row["groups"] = {
+            name: each.to_json() for name, part in (groups or {}).items() for each in part if each.agent == row["agent"]
+        }
+    if per_world is None:
+        return found
+    beside = {"file": per_world.name, "sha256": hashlib.sha256(per_world.read_bytes()).hexdigest()}
+    return [row | {"per_world": beside} for row in found]
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """One results file."""
+
+    path: Path
+    rows: Mapping[str, Mapping[str, Any]]  # by agent; of ``ethbrake shield`` by agent and mode
+
+    @property
+    def about(self) -> Mapping[str, Any]:
+        """Any of the rows: what they say of the worlds is the same in all."""
+        return next(iter(self.rows.values()))
+
+    def estimate(self, agent: str, harm: str) -> Estimate:
+        """The mean of a harm, with its interval."""
+        row = self.rows[agent]
+        mean, interval = row[harm], row.get(f"{harm}_interval")
+        return Estimate(float(mean), None if interval is None else (float(interval[0]), float(interval[1])))
+
+    def harms(self) -> dict[str, dict[int, tuple[float, ...]]]:
+        """Those of every world; raises ``InvalidInput`` where the file that holds them is not to be had."""
+        beside = self.about.get("per_world")
+        if not isinstance(beside, dict) or not isinstance(beside.get("file"), str):
+            raise InvalidInput(f"{self.path} has none (--per-world)")
+        file = self.path.parent / Path(beside["file"]).name
+        if not file.is_file():
+            raise InvalidInput(f"{file} is not there")
+        data = read_plain(file, _MOST_BYTES)
+        if hashlib.sha256(data).hexdigest() != beside.get("sha256"):
+            raise InvalidInput(f"{file} is not the one that was written with {self.path}")
+        return read_harms(file, data)
+
+
+def read_result(path: Path) -> Result:
+    """Read what ``evaluate`` or ``shield`` printed with ``--json``, or ``ethbrake run`` wrote.
+
+    Raises ``InvalidInput`` for anything else, also for other kinds of results, in which no agents stand beside each
+    other, and for a result without hashes.
+    """
+    try:
+        content = parse_strict_json(read_plain(path, _LIMIT_BYTES))
+    except ValueError as error:
+        if isinstance(error, EthBrakeError):
+            raise
+        raise InvalidInput(f"{path}: is no JSON, or was not written to its end: {error}") from None
+    rows = _rows_of(path, content)
+    for row in rows:
+        for key, kind in _NEEDED.items():
+            if not isinstance(row.get(key), kind):
+                raise InvalidInput(f"{path}: {key} is missing or no {kind.__name__}: evaluate again")
+        who = f"{path}: {row['agent']}"
+        if not 1 <= row["episodes"] <= _MOST_EPISODES or isinstance(row["episodes"], bool):
+            raise InvalidInput(f"{who}: episodes = {row['episodes']!s:.40}: must be 1 to {_MOST_EPISODES:,}")
+        if not 0 <= row["horizon_ends"] <= row["episodes"]:
+            raise InvalidInput(f"{who}: horizon_ends = {row['horizon_ends']!s:.40}: must be 0 to {row['episodes']:,}")
+        shoved = row.get("vehicle_1_shoved_m")
+        if shoved is not None and not (type(shoved) in (int, float) and abs(shoved) <= _MOST_HARM):
+            raise InvalidInput(f"{who}: vehicle_1_shoved_m = {shoved!r:.40}: must be metres, or null")
+        for harm in COMPARED[row["kind"]]:
+            if not _is_mean(row.get(harm), row.get(f"{harm}_interval"), row["episodes"]):
+                raise InvalidInput(f"{who}: {harm} is no mean with an interval [low, high] around it")
+    if len({tuple(told_of(row, key) for key in SAME) for row in rows}) > 1:
+        raise InvalidInput(f"{path}: its agents drove different worlds; each test needs a file of its own")
+    named = [
+        f"{row['agent']} ({row['mode']})" if row["kind"] == "shield" and "mode" in row else str(row["agent"])
+        for row in rows
+    ]
+    if twice := {name for name in named if named.count(name) > 1}:
+        raise InvalidInput(f"{path}: {min(twice)} stands in it twice")
+    return Result(path, dict(zip(named, rows, strict=True)))
+
+
+def told_of(row: Mapping[str, Any], key: str) -> str | None:
+    """What a row says of itself, or its parameters do; None for neither."""
+    parameters = row.get("parameters")
+    told = row.get(key, parameters.get(key) if isinstance(parameters, dict) else None)
+    return None if told is None else str(told)
+
+
+def _is_mean(mean: Any, interval: Any, episodes: int) -> bool:
+    """Whether these are a mean harm and its interval, which no single episode has."""
+    ends = [mean, mean] if interval is None else interval
+    if not isinstance(ends, list) or len(ends) != 2 or (interval is not None and episodes == 1):
+        return False
+    low, high = ends
+    are_numbers = all(type(each) in (int, float) for each in (low, mean, high))
+    return are_numbers and -_MOST_HARM <= low <= mean <= high <= _MOST_HARM and mean >= 0
+
+
+def _rows_of(path: Path, content: Any) -> list[dict[str, Any]]:
+    """The objects of a results file, one for each agent; ``InvalidInput`` where it is none, or of a kind without."""
+    several = [content] if isinstance(content, dict) else content
+    if not isinstance(several, list) or not several or not all(isinstance(row, dict) for row in several):
+        raise InvalidInput(f"{path}: is no results file, as ethbrake evaluate --json prints one")
+    for row in several:
+        kind = row.get("kind")
+        if not isinstance(kind, str):
+            raise InvalidInput(f"{path}: is no results file, as ethbrake evaluate --json prints one (kind is missing)")
+        if kind not in get_args(Kind):
+            raise InvalidInput(f"{path}: {unknown_name('kind of results', kind, get_args(Kind))}")
+        if kind not in COMPARED:
+            raise InvalidInput(f"{path}: results of {kind} cannot be compared; those of {', '.join(COMPARED)} can")
+    if not isinstance(content, dict):
+        return several
+    about = {key: value for key, value in content.items() if key != "agents"}
+    agents = content.get("agents")
+    if not isinstance(agents, list) or not agents or not all(isinstance(row, dict) for row in agents):
+        raise InvalidInput(f"{path}: agents is missing or no list of objects: it is not whole")
+    return [row | about for row in agents]

@@ -1,0 +1,71 @@
+"""Sums over some worlds of a list, added up chunk by chunk to the same bits in any order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ethbrake_marl.env.harm import HARM_COUNTS
+from ethbrake_marl.evaluation.agent_tally import AgentTally
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.identity import HASHES, hash_of_chunks
+from ethbrake_marl.evaluation.outcome import LeftOut
+from ethbrake_marl.evaluation.rescores import Rescored, Rescores
+from ethbrake_marl.scenario.fields import QUANTITY
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """The statistics of some worlds of a list, added in any order; ``worlds_hash`` as in ``worlds_sha256``."""
+
+    worlds: int = 0  # that count, driven by all agents
+    hidden: int = 0  # in which the channel hides something from a driven vehicle
+    worlds_hash: int = 0
+    ranges: Mapping[str, tuple[Range, ...]] = field(default_factory=dict)  # least and largest of every quantity
+    left_out: tuple[LeftOut, ...] = ()
+    agents: Mapping[str, AgentTally] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, part: Evaluation, objectives: Sequence[str] | None = None, *, limits: bool = False) -> Tally:
+        """Those of a part of a list; ``objectives`` and ``limits`` as in ``Evaluation.tally``."""
+        worlds = part.worlds
+        if not worlds.n:
+            return cls(left_out=part.left_out)
+        ranges = {
+            name: tuple((float(np.nanmin(c)), float(np.nanmax(c))) for c in rule.of(worlds).T)
+            for name, rule in QUANTITY.of(worlds).items()
+        }
+        agents = part.tally(limits=limits, objectives=objectives)
+        hashed = hash_of_chunks(worlds, part.index)
+        return cls(worlds.n, int(part.hidden.sum()), hashed, ranges, part.left_out, agents)
+
+    def __add__(self, other: Tally) -> Tally:
+        ranges, agents = dict(self.ranges), dict(self.agents)
+        for name, entries in other.ranges.items():
+            both = zip(ranges.get(name, entries), entries, strict=True)
+            ranges[name] = tuple((min(a[0], b[0]), max(a[1], b[1])) for a, b in both)
+        return Tally(
+            self.worlds + other.worlds,
+            self.hidden + other.hidden,
+            (self.worlds_hash + other.worlds_hash) % HASHES,
+            ranges,
+            tuple(sorted((*self.left_out, *other.left_out))),
+            agents | {name: agents.get(name, AgentTally()) + each for name, each in other.agents.items()},
+        )
+
+    def rescore(self, objectives: Sequence[str], vehicles: int) -> Rescores:
+        """Every agent under these objectives and both counts, as ``Evaluation.rescore``."""
+        return Rescores(
+            [
+                Rescored(
+                    name, each, count, tuple(own.moments[f"{each}_{count}_{i + 1}"].estimate for i in range(vehicles))
+                )
+                for name, own in self.agents.items()
+                for count in HARM_COUNTS
+                for each in objectives
+            ]
+        )

@@ -1,0 +1,62 @@
+"""Every shipped scenario in which somebody learns as a task of BenchMARL's own registry; needs the extra ``marl``.
+
+``python -m ethbrake_marl.extensions.benchmarl.tasks algorithm=mappo task=ethbrake/paper_random`` is BenchMARL's command
+line with these tasks: everything else, Hydra's overrides included, is its own. BenchMARL looks for tasks in its own
+folder only, so that they have to be entered into its tables before it reads its command line.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from benchmarl.environments import task_config_registry
+from benchmarl.environments.common import Task
+from hydra.core.config_store import ConfigStore
+
+from ethbrake_marl.extensions.benchmarl.task import LineTask
+from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
+
+
+class _Scenarios(Task):  # type: ignore[misc]  # untyped where the extra is missing
+    """What all tasks share."""
+
+    @staticmethod
+    def associated_class() -> type[LineTask]:
+        """A scenario as a task."""
+        return LineTask
+
+    def get_from_yaml(self, path: str | None = None) -> LineTask:
+        """The scenario as it is shipped, or that of the file ``path``; the reward is minus the harm."""
+        return LineTask(self.name, _settings(SCENARIOS[self.name] if path is None else path))
+
+
+def _settings(scenario: str) -> dict[str, Any]:
+    return {"scenario": scenario, "reward": "harm", "horizon_is_end": True, "shield": None}
+
+
+def _task_name(scenario: str) -> str:
+    return scenario.replace("-", "_").upper()
+
+
+_SHIPPED = [entry.name for entry in list_scenarios()]
+
+SCENARIOS = {_task_name(name): name for name in _SHIPPED if load_scenario(name).learners}
+
+EthBrakeTask = _Scenarios("EthBrakeTask", list(SCENARIOS))
+
+
+def register_tasks() -> None:
+    """Enter the tasks, as ``ethbrake/paper_random`` and so on; entering them again changes nothing."""
+    store = ConfigStore.instance()
+    for task in EthBrakeTask:
+        name = task.name.lower()
+        task_config_registry[f"ethbrake/{name}"] = task
+        store.store(group="task/ethbrake", name=name, node=_settings(SCENARIOS[task.name]), package="task")
+
+
+register_tasks()
+
+if __name__ == "__main__":
+    from benchmarl.run import hydra_experiment
+
+    hydra_experiment()

@@ -1,0 +1,1 @@
+"""Shields for what is not known: uncertain worlds, estimated worlds, their bounds."""

@@ -1,0 +1,274 @@
+"""Shields over a believed world: what is certified is certified on what was received, and nothing else is looked at.
+
+``step``: every action is certified in the world that the vehicle believes in, with what is not known in the middle of
+its range. That promises nothing of the world as it is. ``robust``: in every corner of the ranges of what is not
+known. If the world is such a corner, its harm up to the horizon is at most the first bound: what is heard later
+leaves those corners standing that it agrees with, and the plan that was held is held on unless a better one for them
+is found.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+
+from ethbrake_marl.agents.driving import script_agents
+from ethbrake_marl.env.harm import HarmCount
+from ethbrake_marl.env.memory import renew_memory, take_memory
+from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.errors import InvalidInput, count_of
+from ethbrake_marl.extensions.certified.enclosure import CORNERS, INTERIOR, checked_robust
+from ethbrake_marl.extensions.certified.estimated import Ranges, Told
+from ethbrake_marl.extensions.certified.estimating_agents import Odometer
+from ethbrake_marl.extensions.certified.uncertainty import MOST_CORNERS, Uncertainty
+from ethbrake_marl.physics.columns import Packed
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.comparison import seen_columns, worlds_at
+from ethbrake_marl.shield.members import Decision, plan_harm, put
+from ethbrake_marl.shield.rollouts import Proposer
+from ethbrake_marl.shield.step import StepShield
+
+PER_WORLD = ("predicted_harm", "interventions", "_heard", "_asked_s", "_wanted", "_impact_s")  # arrays [n, ...]
+
+SURPRISE = 1e-6  # by more than this (m, m/s) what is measured is not what was foretold
+
+
+def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
+    """Where it began anew, count the members' harm so far, and hold the old plan's rest if that harms no more."""
+    running, old = shield.running, before.running
+    assert running is not None and old is not None
+    at, plan, width = running.rows_of(rows), shield.backup.plan[rows].copy(), before.backup.plan.shape[1]
+    N, states = running.problem.mass.shape[1], running.states.copy()
+    states[at, 3 * N - 2 : 5 * N - 4] = old.states[at, 3 * N - 2 : 5 * N - 4]  # harm
+    shield.running = running._replace(states=states)
+    column = np.arange(width) + old.steps[rows, np.newaxis]
+    rest = np.take_along_axis(before.backup.plan[rows], np.minimum(column, width - 1), axis=1)
+    rest = np.where(column < width, rest, -1.0)  # full braking after the plan
+    part = shield.running.take(rows)
+    harm, still = plan_harm(part, plan), plan_harm(part, rest)
+    plan[still <= harm] = rest[still <= harm]
+    shield.backup = shield.backup._replace(
+        plan=put(shield.backup.plan, rows, plan), harm=put(shield.backup.harm, rows, np.minimum(still, harm))
+    )
+
+
+class BelievedShield:
+    """A ``StepShield`` that certifies what one vehicle proposes on what was really received.
+
+    It begins at the first decision, and anew whenever another vehicle is heard for the first time, is heard to react,
+    or moves otherwise than was foretold; what is left of its plan is a candidate for the next one. After the first
+    decision ``predicted_harm`` [n] is the first bound; infinite where the vehicle had an impact before, whose harm
+    nobody told it. ``robust`` says in which worlds it certifies: None in the middle of what is not known, ``corners``
+    also in all corners of its range, and ``interior`` in all worlds of the box around them, once, at the first
+    decision. Raises ``InvalidInput`` for a mixture, a scenario with more than ``MOST_CORNERS`` corners, and what
+    interior mode cannot certify. ``others`` are scripts of the other vehicles, by index; None: those of the scenario.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        vehicle: int,
+        *,
+        harm_count: HarmCount = "first",
+        robust: str | None = None,
+        others: Mapping[int, Script] | None = None,
+    ) -> None:
+        self.scenario, self.vehicle = scenario, vehicle
+        self.robust = None if robust is None else checked_robust(robust, "believed")
+        self.predicted_harm: Floats = np.zeros(0)
+        self.interventions: Ints = np.zeros(0, np.int64)  # [n] so far in the running episodes
+        self.decision: Decision | None = None  # the last one
+        self._harm_count: HarmCount = harm_count
+        self._others = script_agents(scenario, except_for=vehicle) if others is None else others
+        self._odometer: tuple[Floats, ...] = ()  # an ``Odometer``
+        self._heard: Floats = np.zeros((0, 0))  # what the shield began on; NaN where it has not begun
+        self._asked_s: Floats = np.zeros(0)  # [n] time of the last decision
+        self._wanted: Floats = np.zeros(0)  # [n] actions
+        self._totals: Floats = np.zeros((0, 0, 0))  # [n, M, pairs] foretold total harm at the last decision (m2/s2)
+        self._impact_s: Floats = np.zeros((0, 0))  # [n, N] last time at which an impact of this vehicle was foretold
+        self._ranges = Ranges.of(scenario, vehicle, self._others)
+        numbers = len(self._ranges.uncertain)
+        if self.robust is not None and 2**numbers > MOST_CORNERS:
+            raise InvalidInput(
+                f"robust:believed: scenario {scenario.name!r} leaves {numbers} numbers of the other vehicles open,"
+                f" which make {2**numbers} corners; at most {MOST_CORNERS} can be certified"
+            )
+        self.shield = self._make()
+
+    def _make(self) -> StepShield:
+        certain = self.robust or CORNERS
+        return StepShield(self.scenario, self.vehicle, harm_count=self._harm_count, others=self._others, robust=certain)
+
+    @property
+    def members(self) -> int:
+        """Worlds that are certified for each one: the middle, and all corners."""
+        return 1 + len(self._corners())
+
+    def __copy__(self) -> BelievedShield:
+        """One that goes on apart: what it decides leaves this one as it is."""
+        apart = object.__new__(BelievedShield)
+        apart.__dict__.update(self.__dict__)
+        apart.shield = copy.copy(self.shield)
+        for name in PER_WORLD:
+            setattr(apart, name, getattr(self, name).copy())
+        return apart
+
+    def take(self, rows: Ints) -> BelievedShield:
+        """The shield of some rows, which goes on apart."""
+        apart = copy.copy(self)
+        if self.shield.running is not None:
+            apart.shield = self.shield.take(rows)
+        apart._odometer = take_memory(self._odometer, rows)
+        for name in (*PER_WORLD, *(("_totals",) if len(self._totals) else ())):
+            setattr(apart, name, getattr(self, name)[rows])
+        return apart
+
+    def begin(self, worlds: Worlds, rows: Ints) -> None:
+        """Remember where these episodes start; nothing has been received yet."""
+        if len(rows) >= len(self._wanted):
+            self.shield, self._wanted, self._totals = self._make(), np.zeros(0), np.zeros((0, 0, 0))
+        n, N, fresh = len(rows), worlds.N, self._wanted.size == 0
+        begun = {
+            "_odometer": Odometer.begun(worlds, self.vehicle), "predicted_harm": np.full(n, np.nan),
+            "_heard": np.full((n, 2 * N), np.nan), "_impact_s": np.full((n, N), -1.0), "_asked_s": np.full(n, np.nan),
+            "_wanted": np.zeros(n), "interventions": np.zeros(n, np.int64),
+        }  # fmt: skip
+        for name, part in begun.items():
+            setattr(self, name, part if fresh else renew_memory(getattr(self, name), rows, part))
+
+    def decide(
+        self, worlds: Worlds, proposed: Floats, proposer: Proposer | None = None, *, only: Bools | None = None
+    ) -> Floats:
+        """The certified actions [n], 0 before the vehicle's latency has elapsed; the same if asked again.
+
+        Args:
+            worlds: as they are; of them only what the vehicle received is read.
+            proposed: actions [n].
+            proposer: is rolled out in the believed worlds where nothing else certifies a proposal.
+            only: worlds that decide now; None: all.
+
+        Raises ``InvalidInput`` if an episode never began.
+
+        """
+        shield, vehicle = self.shield, self.vehicle
+        if worlds.n > len(self._heard):
+            raise InvalidInput(
+                f"shield: believed: act on {count_of(worlds.n, 'world')}, but begin was not called for each"
+            )
+        self._odometer = odometer = Odometer(*self._odometer).look(worlds, vehicle)
+        past = worlds.vehicles.latency_s[:, vehicle] <= worlds.time_s
+        due = past & (worlds.time_s != self._asked_s) & (worlds.time_s < self.scenario.horizon_s)
+        due &= True if only is None else only
+        if due.any():
+            believed = self._believe(worlds, odometer.way_m, None)
+            self._begin_anew(worlds, believed, odometer.way_m, due)
+            proposer = None if proposer is None else proposer._replace(worlds=believed)
+            self.decision = decision = shield.decide(proposed, only=due, proposer=proposer)
+            self._wanted[due] = decision.applied[due]
+            self.interventions = self.interventions + (decision.intervened & due)
+            self._asked_s[due] = worlds.time_s[due]
+        return self._wanted.copy()
+
+    def _begin_anew(self, worlds: Worlds, believed: Worlds, way_m: Floats, due: Bools) -> None:
+        """Let the shield begin where it has not, or where what was heard was not foretold."""
+        shield, vehicle = self.shield, self.vehicle
+        told = Told.to(worlds, vehicle)
+        heard = np.concatenate([told.known, told.reacts], axis=1).astype(np.float64)
+        fresh, begun = np.isnan(self._heard[:, 0]), shield.running is not None
+        keeps, anew = np.zeros_like(told.known), fresh
+        if self.robust != INTERIOR:  # its plans are certified from the first decision on, whatever is heard later
+            if begun:
+                self._note_impacts(worlds)
+            keeps = self._keeps(told, worlds.time_s)
+            surprised = self._is_surprised(believed, told.known & ~keeps) if begun else fresh
+            anew = fresh | surprised | (heard != self._heard).any(axis=1)
+        rows = np.flatnonzero(due & anew)
+        rows = rows if begun else np.arange(worlds.n)
+        if not rows.size:
+            return
+        before = copy.copy(shield) if begun and self.robust != INTERIOR else None
+        keeps = keeps & ~fresh[:, np.newaxis]
+        self._begin_shield(worlds.take(rows), believed.take(rows), way_m[rows], rows, keeps[rows], before)
+        if before is not None and (held_before := rows[~fresh[rows]]).size:
+            _hold_better(shield, held_before, before)
+        rows = rows[due[rows]]  # the others begin anew at their own first decision
+        first, self._heard[rows] = rows[fresh[rows]], heard[rows]
+        felt = worlds.pair_hit[first, max(vehicle - 1, 0) : vehicle + 1].any(axis=1)
+        felt |= worlds.obstacle_hit[first] & (vehicle == 0)
+        self.predicted_harm[first] = np.where(felt, np.inf, shield.backup.harm[first])
+
+    def _begin_shield(
+        self, worlds: Worlds, believed: Worlds, way_m: Floats, rows: Ints, keeps: Bools, before: StepShield | None
+    ) -> None:
+        """Begin in ``rows``: in the middle of what is open, and for a robust shield in its corners."""
+        parts = []
+        for m, share in enumerate([None, *self._corners()]):
+            foretold = None
+            if before is not None:
+                assert before.running is not None
+                expected = worlds_at(believed, before.running.states[rows * before.running.members + m])
+                known = keeps.any(axis=1, keepdims=True)
+                foretold = (replace(expected, pair_hit=expected.pair_hit & known), keeps)
+            parts.append(self._believe(worlds, way_m, share, foretold))
+        self.shield.begin(parts[0], rows, possible=Uncertainty.interleaved(parts))
+
+    def _keeps(self, told: Told, time_s: Floats) -> Bools:
+        """Whose foretold state tells more than what was told, [n, N]: nobody told anything, or not since an impact."""
+        running = self.shield.running
+        if running is None:
+            return np.zeros(told.known.shape, np.bool_)
+        n, N = told.known.shape
+        whole = running.problem.mass.shape[1]  # vehicles of the columns, an obstacle ahead included
+        gaps = running.states.reshape(n, running.members, -1)[:, :, whole : 2 * whole - 1]
+        touching: Bools = np.any(gaps == 0.0, axis=1)
+        pressed = np.zeros((n, whole), np.bool_)
+        pressed[:, :-1], pressed[:, 1:] = touching, pressed[:, 1:] | touching
+        since = (told.at_s < self._impact_s) | (pressed[:, whole - N :] & (told.at_s < time_s[:, np.newaxis]))
+        keeps: Bools = ~told.known | ((self._heard[:, :N] == 1.0) & since)
+        keeps[:, self.vehicle] = False
+        return keeps
+
+    def _note_impacts(self, worlds: Worlds) -> None:
+        """Write down which vehicles met in some member since the last decision."""
+        running = self.shield.running
+        assert running is not None
+        pairs = running.problem.mass.shape[1] - 1
+        totals = running.states[:, 4 * pairs + 1 : 5 * pairs + 1].reshape(worlds.n, running.members, pairs)
+        if self._totals.shape == totals.shape:
+            met: Bools = np.any(totals > self._totals, axis=1)
+            for p in range(pairs):
+                for j in {p - pairs + worlds.N - 1, p - pairs + worlds.N} & set(range(worlds.N)):
+                    self._impact_s[met[:, p], j] = worlds.time_s[met[:, p]]
+        self._totals = totals.copy()
+
+    def _is_surprised(self, believed: Worlds, heard: Bools) -> Bools:
+        """Where somebody of whom was ``heard`` [n, N] is not within what the shield foretold, [n]."""
+        assert self.shield.running is not None
+        seen, wrong = seen_columns(Packed.of(believed)), np.zeros(believed.n, np.bool_)
+        first = (seen.shape[1] + 4) // 5 - believed.N  # 1: an obstacle ahead is vehicle 0 of the columns
+        foretold = self.shield.running.states[:, : seen.shape[1]].reshape(believed.n, self.shield.running.members, -1)
+        outside: Bools = (seen < foretold.min(axis=1) - SURPRISE) | (seen > foretold.max(axis=1) + SURPRISE)
+        for i in range(believed.N):
+            wrong |= heard[:, i] & outside[:, first + i]
+        for p in range(believed.N - 1):
+            wrong |= heard[:, p] & heard[:, p + 1] & outside[:, 2 * first + believed.N + p]
+        return wrong
+
+    def _corners(self) -> list[dict[tuple[str, int], float]]:
+        uncertain = self._ranges.uncertain
+        shares = [] if self.robust is None else product((0.0, 1.0), repeat=len(uncertain))
+        return [dict(zip(uncertain, each, strict=True)) for each in shares]
+
+    def _believe(
+        self,
+        worlds: Worlds,
+        way_m: Floats,
+        share: dict[tuple[str, int], float] | None,
+        foretold: tuple[Worlds, Bools] | None = None,
+    ) -> Worlds:
+        return self._ranges.believe(worlds, way_m, share, foretold)

@@ -1,0 +1,280 @@
+"""Pairs of a box of worlds that stay in contact: they bounce a little, then move as one, then part.
+
+A pair in contact is told by the motion of its centre of mass, as forms, and by bounds on how far the two are from it.
+While both of them move forward, their commands are the only forces on the pair, so its centre of mass moves by the
+commands alone, however often the two collide. A world *creeps* once one of the two stands or moves backwards: its
+brakes then hold instead of pulling, and nothing but bounds on its speeds is known of it.
+"""
+
+from __future__ import annotations
+
+import math
+
+from ethbrake_marl.extensions.certified.affine import (
+    CLOSING,
+    CREEP,
+    HARDEST,
+    MOVES,
+    OPENING,
+    PARTS,
+    REACH,
+    SINCE,
+    SOFTEST,
+    SPREAD,
+    STANDS,
+    WIDE,
+    Cell,
+    Motion,
+    Path,
+    add,
+    between,
+    difference,
+    high,
+    hold,
+    low,
+    product,
+    radius,
+    stop,
+)
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.motion import BOUND
+from ethbrake_marl.physics.state import Floats
+
+SHARP = 0.1  # m/s: a pair that opens moves alone once its speeds are known to this
+
+UNEVEN = 3.0  # times its separating speed: more than a flight may close with is not bounded by flights, if forces move
+
+
+@compiled(apart=True)
+def common(cell: Cell, p: int, front: Floats, rear: Floats) -> Floats:
+    """Of two quantities of a pair, that of its centre of mass."""
+    out = product(cell.share[p, 1], front)
+    add(out, 1.0, product(cell.share[p, 0], rear))
+    return out
+
+
+@compiled(apart=True)
+def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
+    """Least and largest closing acceleration of a pair whose commands act on both."""
+    vague = motion.vague[p] + motion.vague[p + 1]
+    least = low(motion.pull[p + 1]) - high(motion.pull[p]) - vague
+    return least, high(motion.pull[p + 1]) - low(motion.pull[p]) + vague
+
+
+@compiled(apart=True)
+def apart(touch: Floats) -> float:
+    """Largest difference of speeds of a pair in contact."""
+    return float(max(touch[OPENING], touch[CLOSING], 0.0))
+
+
+@compiled(apart=True)
+def faster(cell: Cell, p: int) -> float:
+    """How many times the rear one's speed its impacts may give the front one, at least 1."""
+    return float(max(1.0, (1.0 + cell.restitution) * high(cell.share[p, 0])))
+
+
+@compiled(apart=True)
+def backwards(cell: Cell, p: int) -> float:
+    """How many times its speed the rear one may have backwards after an impact, at least 0."""
+    return float(max(0.0, (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0))
+
+
+@compiled(apart=True)
+def stray(cell: Cell, touch: Floats, p: int) -> float:
+    """Largest difference between the speed of a pair's centre of mass and its form.
+
+    In a world that creeps the form's speed is between 0 and ``CREEP``, the rear one's between minus ``backwards`` and 1
+    times that, the front one's between 0 and ``faster`` times that: no impact makes a rear one faster.
+    """
+    return float(max(faster(cell, p), 1.0 + backwards(cell, p)) * touch[CREEP])
+
+
+@compiled(apart=True)
+def blur(cell: Cell, path: Path, p: int, side: int) -> float:
+    """By how much the speed of one of a pair may differ from the form at any time in the present piece."""
+    return float(high(cell.share[p, side]) * path.touch[p, SPREAD] + stray(cell, path.touch[p], p))
+
+
+@compiled(apart=True)
+def begin_touch(touch: Floats) -> None:
+    """Forget what a pair did when it was in contact before."""
+    spread, reach = touch[SPREAD], touch[REACH]  # of the present piece
+    touch[:] = 0.0
+    touch[SPREAD], touch[REACH], touch[SOFTEST] = spread, reach, math.inf
+
+
+@compiled(apart=True)
+def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
+    """A pair in contact through one piece of time; ``motion`` holds both as if alone, and then as one."""
+    touch, front, rear = path.touch[p], p, p + 1
+    touch[SPREAD], touch[REACH] = apart(touch), touch[WIDE]
+    if motion.rest[front] == STANDS and motion.rest[rear] == STANDS:
+        come_to_rest(cell, path, motion, p, length)
+        return
+    least, most = pressing_together(motion, p)
+    opens = most < 0.0 and touch[CLOSING] <= 0.0 and touch[OPENING] + touch[CLOSING] <= SHARP
+    if opens and (touch[CREEP] <= 0.0 or backwards(cell, p) <= 0.0):
+        part(cell, path, motion, p, length)
+        return
+    vague = max(motion.vague[front], motion.vague[rear])
+    weakest, hardest = own_pulls(motion, p)
+    for rows in (motion.pull, motion.onward, motion.reach):
+        rows[front] = common(cell, p, rows[front], rows[rear])
+    slowest = min(low(path.forms[front]), low(motion.onward[front])) - dip_of(cell, vague, length)
+    bounce(cell, touch, p, least, most, length, vague)
+    creep(cell, touch, p, slowest, weakest, hardest, length)
+    settle(touch, cell.restitution, length)
+    motion.rest[front], motion.vague[front] = MOVES, vague
+    if cell.moving:
+        hold(path.forms[front], front, length, motion)
+    motion.speed[front], motion.way[front] = motion.onward[front], motion.reach[front]
+    if low(motion.onward[front]) < 0.0 and weakest < 0.0:
+        stop(cell.moving, path.forms[front], front, length, motion)
+    motion.way[front, -1] += stray(cell, touch, p) * length
+    for rows in (motion.pull, motion.onward, motion.reach, motion.speed, motion.way):
+        rows[rear] = rows[front]
+    motion.rest[rear], motion.vague[rear] = motion.rest[front], vague
+
+
+@compiled(apart=True)
+def dip_of(cell: Cell, vague: float, length: float) -> float:
+    """By how much a speed may be below its values at both ends of a piece in which a force passes 0."""
+    return 0.5 * vague * length if cell.moving else 0.0
+
+
+@compiled(apart=True)
+def own_pulls(motion: Motion, p: int) -> tuple[float, float]:
+    """Least and largest acceleration that a command of a pair gives."""
+    weakest = min(low(motion.pull[p]) - motion.vague[p], low(motion.pull[p + 1]) - motion.vague[p + 1])
+    return weakest, max(high(motion.pull[p]) + motion.vague[p], high(motion.pull[p + 1]) + motion.vague[p + 1])
+
+
+@compiled(apart=True)
+def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, hardest: float, length: float) -> None:
+    """Note that worlds may creep by now, the pair's centre of mass being as slow as ``slowest`` in this piece."""
+    largest = max(high(cell.share[p, 0]), high(cell.share[p, 1]))  # share of one against their centre of mass
+    if weakest < 0.0 and touch[SPREAD] > 0.0 and slowest <= largest * touch[SPREAD]:
+        touch[CREEP] = max(touch[CREEP], touch[SPREAD])
+    if touch[CREEP] > 0.0:
+        touch[CREEP] += max(hardest, 0.0) * length
+        touch[CLOSING] = max(touch[CLOSING], 0.0)
+        if backwards(cell, p) > 0.0:
+            most = (faster(cell, p) + backwards(cell, p)) * touch[CREEP]
+            touch[OPENING] = max(touch[OPENING], most)
+            touch[CLOSING], touch[SPREAD] = max(touch[CLOSING], touch[CREEP]), max(touch[SPREAD], most)
+            touch[WIDE] = max(touch[WIDE], touch[REACH] + most * length)
+            touch[SOFTEST] = math.inf
+    touch[REACH] = max(touch[REACH], touch[WIDE])
+
+
+@compiled(apart=True)
+def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
+    """A pair whose form stands: each of its worlds stands, or creeps and is braked.
+
+    The rear one's speed falls by the brakes b, the front one's is at most ``faster`` times what the rear one's was.
+    """
+    touch = path.touch[p]
+    touch[CREEP] = max(touch[CREEP], touch[SPREAD])
+    for i in range(p, p + 2):
+        motion.way[i, -1] += stray(cell, touch, p) * length
+    touch[WIDE] += max(touch[OPENING], 0.0) * length
+    touch[REACH], touch[SOFTEST] = touch[WIDE], math.inf
+    brakes = max(-own_pulls(motion, p)[1], 0.0)
+    touch[CREEP] = max(touch[CREEP] - brakes * length / faster(cell, p), 0.0)
+    touch[OPENING] = min(touch[OPENING], (faster(cell, p) + backwards(cell, p)) * touch[CREEP])
+    touch[CLOSING] = min(max(touch[CLOSING], 0.0), touch[CREEP])
+
+
+@compiled(apart=True)
+def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
+    """A pair that was in contact opens in this piece: from now on each moves alone."""
+    N, P = cell.speed.shape[0], cell.gap.shape[0]
+    touch, width = path.touch[p], cell.speed.shape[1]
+    opening, wide, astray = max(touch[OPENING], 0.0), touch[WIDE], stray(cell, touch, p)
+    path.marks[P + p] = PARTS
+    touch[REACH] = wide + opening * length
+    path.forms[N + p] = between(0.0, touch[REACH], width)  # by its speeds alone; commands act on top
+    for side in range(2):
+        share = (2.0 * side - 1.0) * high(cell.share[p, side])
+        speed = between(min(-share * opening, 0.0) - astray, max(-share * opening, 0.0) + astray, width)
+        for rows in (motion.onward, motion.speed):
+            add(rows[p + side], 1.0, speed)
+        for rows in (motion.reach, motion.way):
+            rows[p + side, -1] += (abs(share) * opening + astray) * length
+        neighbour = p - 1 + 2 * side
+        if 0 <= neighbour < P:
+            add(path.forms[N + neighbour], 1.0, between(-abs(share) * wide, 0.0, width))
+
+
+@compiled(apart=True)
+def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length: float, vague: float) -> None:
+    """What becomes of the difference of speeds and of the gap of a pair in contact within one piece.
+
+    Its closing acceleration is between ``least`` and ``most``. No impact makes the difference larger, so it grows by
+    what the commands give. While the pair is pressed together by b between b- and b+, it does not grow: from gap g and
+    difference w a flight is never higher than h = g + w^2 / (2 b-), and closes with at most sqrt(2 b+ h), which leaves
+    the share e of it: less than before, if e sqrt(b+ / b-) < 1. (Where a vehicle creeps, its brakes that hold make a
+    flight lower and slower.)
+    """
+    e, fastest, wide = cell.restitution, apart(touch), touch[WIDE]
+    if fastest == 0.0 and wide == 0.0 and least >= 0.0:
+        touch[CLOSING], touch[OPENING] = 0.0, 0.0
+        return
+    certain = most < UNEVEN * UNEVEN * least if cell.moving else vague == 0.0
+    if least > 0.0 and certain and (touch[CREEP] <= 0.0 or backwards(cell, p) <= 0.0):
+        if least < touch[SOFTEST] or most > touch[HARDEST]:
+            begin_run(touch, e, min(least, touch[SOFTEST]), max(most, touch[HARDEST]), least, most)
+        if touch[SOFTEST] < math.inf:
+            fastest = apart(touch)
+            height = 0.5 * fastest * fastest / touch[HARDEST]
+            touch[SPREAD] = fastest
+            touch[WIDE] = max(wide, min(height, wide + fastest * length))
+            touch[SINCE] += length
+            return
+    closing = max(touch[CLOSING] + most * length, 0.0) if most > 0.0 else touch[CLOSING]
+    struck = max(touch[CLOSING], closing, 0.0)
+    opening = max(touch[OPENING], e * struck) - min(least, 0.0) * length
+    touch[CLOSING] = closing if most > 0.0 else touch[CLOSING] + most * length
+    touch[OPENING], touch[SOFTEST], touch[HARDEST] = opening, math.inf, 0.0
+    touch[SPREAD] = max(touch[SPREAD], struck, opening)
+    touch[WIDE] += max(opening, 0.0) * length
+
+
+@compiled(apart=True)
+def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: float, most: float) -> None:
+    """A pair is pressed together in another way than before: between both ways, or if need be in the new one alone."""
+    if not e * math.sqrt(hardest / softest) < 1.0:
+        softest, hardest = least, most
+    fastest = apart(touch)
+    if not e * math.sqrt(hardest / softest) < 1.0:
+        touch[SOFTEST], touch[HARDEST] = math.inf, 0.0
+        return
+    height = touch[WIDE] + 0.5 * fastest * fastest / softest
+    touch[SOFTEST], touch[HARDEST], touch[SINCE] = softest, hardest, 0.0
+    touch[OPENING] = math.sqrt(2.0 * hardest * height)
+    touch[CLOSING] = touch[OPENING]
+
+
+@compiled(apart=True)
+def settle(touch: Floats, e: float, length: float) -> None:
+    """Whether a pair moves as one by the end of the piece.
+
+    A flight that begins with separating speed s ends after at most 2 s / b-, with a closing speed of at most
+    s sqrt(b+ / b-). So after 2 s / (b- (1 - e sqrt(b+ / b-))) the two move as one, if none of them creeps.
+    """
+    if touch[SOFTEST] == math.inf or touch[CREEP] > 0.0:
+        touch[SINCE] = 0.0
+        return
+    fastest = touch[OPENING]
+    ratio = 0.0 if fastest < BOUND.PLASTIC_SPEED_MPS else e * math.sqrt(touch[HARDEST] / touch[SOFTEST])
+    if touch[SINCE] * touch[SOFTEST] * (1.0 - ratio) > 2.0 * fastest * (1.0 + 1e-9) + 1e-9:
+        begin_touch(touch)
+
+
+@compiled(apart=True)
+def is_blurred(path: Path, motion: Motion, N: int, p: int, length: float) -> bool:
+    """Whether a moving pair may meet again at so many different times that they are better taken together."""
+    if motion.rest[p] != MOVES or motion.rest[p + 1] != MOVES:
+        return False
+    closing = difference(path.forms[p + 1], path.forms[p])
+    return radius(path.forms[N + p]) > max(high(closing), 0.0) * length

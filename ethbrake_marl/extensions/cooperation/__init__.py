@@ -1,0 +1,1 @@
+"""Levels of cooperation, compared: ``ethbrake study ablate``."""

@@ -1,0 +1,135 @@
+"""The comparison of levels: harm of each, what each step is worth, who pays, the distance to the joint optimum.
+
+Intervals hold for other training seeds and other worlds: both are drawn anew (``evaluation.statistics``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from ethbrake_marl.env.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.evaluation.seeds import interquartile_mean, mean_over_seeds, share_over_seeds
+from ethbrake_marl.extensions.cooperation.joint_optimum import Goal, Harms, Measured
+from ethbrake_marl.extensions.cooperation.levels import TOLERANCE, Json
+from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.shield.drivers import Shielded
+
+
+def compare(measured: Sequence[Measured], searched: int) -> Json:
+    """Plain data for JSON: ``levels``, ``steps`` of the ladder, ``channels``; see docs/ablate-cooperation.md.
+
+    ``undertrained`` has a sentence for each level in which everybody braking fully does better than what was trained.
+
+    The joint optimum is known in the first ``searched`` worlds; what stands beside it is of these worlds too. Each
+    algorithm has a ladder of its own; levels in which nobody learns are in all of them.
+    """
+    algorithms = [m.algorithm for m in measured if m.algorithm is not None]
+    steps, channels = [], []
+    for algorithm in dict.fromkeys(algorithms):
+        own = [m for m in measured if m.algorithm in (None, algorithm)]
+        ladder = [m for m in own if m.level.clear is None]
+        steps += [_change(before, after, algorithm) for before, after in pairwise(ladder)]
+        by_name = {m.level.name: m for m in own}
+        channels += [_change(by_name[m.level.clear], m, algorithm) for m in own if m.level.clear is not None]
+    return {
+        "kind": "ablate",
+        "levels": [_level(one, searched) for one in measured],
+        "steps": steps,
+        "channels": channels,
+        "undertrained": [_undertrained(one, one.goal) for one in measured if one.goal is not None and one.goal.missed],
+    }
+
+
+def _undertrained(one: Measured, goal: Goal) -> str:
+    return (
+        f"{one.level.name} ({one.algorithm}) is not trained enough to say anything: its {goal.name} is"
+        f" {goal.reached:.2f}, and {goal.full_brake:.2f} if everybody brakes fully."
+    )
+
+
+def _level(one: Measured, searched: int) -> Json:
+    """What one level reached under one algorithm; harm (m2/s2) in all worlds, and in the ``searched`` ones.
+
+    There also the joint optimum, and the share of its reduction that is realised.
+    """
+    scenario = one.level.scenario
+    found: Json = {
+        **one.identity,
+        "policy_sha256": [dict(seed) for seed in one.reached.policies],
+        "level": one.level.name,
+        "title": scenario.title,
+        "algorithm": one.algorithm,
+        "clear": one.level.clear,
+        "learners": [scenario.vehicle_names[i] for i in scenario.learners],
+        "seeds": len(one.reached.collided),
+        "worlds": one.reached.collided.shape[1],
+        "collision_rate": mean_over_seeds(one.reached.collided).to_json(),
+        "goal": None if one.goal is None else {**one.goal._asdict(), "missed": one.goal.missed},
+    }
+    for harm_count in HARM_COUNTS:
+        reached, braking = one.reached.world[harm_count], one.full_brake.world[harm_count]
+        best = None if one.best is None else one.best[harm_count]
+        share = None if best is None else share_over_seeds(reached[:, :searched], braking[:, :searched], best)
+        found[harm_count] = {
+            "full_brake": mean_over_seeds(braking).to_json(),
+            "harm": mean_over_seeds(reached).to_json(),
+            "each_seed": reached.mean(axis=1).tolist(),
+            "interquartile_mean": interquartile_mean([reached.mean(axis=1)], resamples=2000).to_json(),
+            "vehicles": [mean_over_seeds(column).to_json() for column in _columns(one.reached, harm_count)],
+            "searched": {
+                "worlds": min(searched, reached.shape[1]),
+                "full_brake": mean_over_seeds(braking[:, :searched]).to_json(),
+                "harm": mean_over_seeds(reached[:, :searched]).to_json(),
+                "each_seed": reached[:, :searched].mean(axis=1).tolist(),
+                "best_known": None if best is None else mean_over_seeds(best).to_json(),
+                "share_of_possible_reduction": None if share is None else share.to_json(),
+            },
+            "shielded": None if one.shielded is None else _behind(one, one.shielded[harm_count], harm_count, searched),
+        }
+    return found
+
+
+def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: int) -> Json:
+    """The same teams in the same worlds behind the shield that guards this count, beside what they do without it."""
+    before, after = one.reached.vehicle[harm_count], shielded.vehicle_harm
+    actions = shielded.decisions * shielded.replaced.shape[2]
+    return {
+        "harm": mean_over_seeds(shielded.harm).to_json(),
+        "each_seed": shielded.harm.mean(axis=1).tolist(),
+        "difference": mean_over_seeds(shielded.harm - one.reached.world[harm_count]).to_json(),
+        "bound": mean_over_seeds(shielded.bound).to_json(),
+        "above_bound": int((shielded.harm > shielded.bound).sum()),
+        "replaced": float(shielded.replaced.sum() / actions.sum()),
+        "replaced_vehicles": (shielded.replaced.sum(axis=(0, 1)) / shielded.decisions.sum()).tolist(),
+        "stepped_in": mean_over_seeds((shielded.replaced > 0).any(axis=2)).to_json(),
+        "vehicles": [mean_over_seeds(column).to_json() for column in np.moveaxis(after - before, 2, 0)],
+        "worse_off": mean_over_seeds((after > before + TOLERANCE).any(axis=2)).to_json(),
+        "above_baseline": mean_over_seeds((after > shielded.baseline + TOLERANCE).any(axis=2)).to_json(),
+        "moving": int(shielded.moving.sum()),
+        "searched": {"harm": mean_over_seeds(shielded.harm[:, :searched]).to_json()},
+    }
+
+
+def _change(before: Measured, after: Measured, algorithm: str) -> Json:
+    """From one level to another on the same worlds: positive is more harm."""
+    found: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
+    for harm_count in HARM_COUNTS:
+        pairs = zip(_columns(after.reached, harm_count), _columns(before.reached, harm_count), strict=True)
+        # seed k against seed k, or against the only one
+        old, new = before.reached.vehicle[harm_count], after.reached.vehicle[harm_count]
+        worse = new > old + TOLERANCE
+        found[harm_count] = {
+            "difference": mean_over_seeds(after.reached.world[harm_count], before.reached.world[harm_count]).to_json(),
+            "vehicles": [mean_over_seeds(new, old).to_json() for new, old in pairs],
+            "worse_off": mean_over_seeds(worse.any(axis=2)).to_json(),
+            "worse_off_vehicles": [float(share) for share in worse.mean(axis=(0, 1))],
+        }
+    return found
+
+
+def _columns(harms: Harms, harm_count: HarmCount) -> list[Floats]:
+    """[seeds, worlds] of each vehicle."""
+    return [harms.vehicle[harm_count][:, :, i] for i in range(harms.vehicle[harm_count].shape[2])]

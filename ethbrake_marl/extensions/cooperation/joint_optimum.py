@@ -1,0 +1,233 @@
+"""The joint optimum of every level: the least harm known that its learners can do together, world by world.
+
+It depends on the worlds, on who learns, and on the scripts of the others; not on who knows what, nor on objectives.
+So levels that differ in these only ask one question, which is searched once, and what is known of one level is known
+of every other whose learners can do the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.protocol import Driver, Team
+from ethbrake_marl.env.harm import HARM_COUNTS, HarmCount, Ledger
+from ethbrake_marl.env.objectives import objective_harm
+from ethbrake_marl.errors import OnProgress, Progress
+from ethbrake_marl.evaluation.identity import result_identity
+from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.extensions.cooperation.levels import HARM, TOLERANCE, Level, Plan, common_worlds
+from ethbrake_marl.extensions.search.best_harm import search_list, task_problem
+from ethbrake_marl.extensions.search.tables import BestHarmTable
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.shield.drivers import Shielded
+from ethbrake_marl.training.run_folder import RunDirectory, Training
+
+
+@dataclass(frozen=True, slots=True)
+class LevelOptimum:
+    """What is known of one level: its search, and what its teams (of all recipes and seeds) do in the same worlds."""
+
+    level: Level
+    worlds: Worlds
+    searched: BestHarmTable
+    teams: tuple[Team, ...]
+
+
+def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample, list[Level]]]:
+    """Each question once: the first level that asks it, its worlds to be searched, and all levels that ask it."""
+    found: dict[bytes, tuple[Level, Sample, list[Level]]] = {}
+    rows = np.arange(plan.search_episodes)
+    for level, sample in zip(plan.levels, samples, strict=True):
+        if level.scenario.learners:
+            part = sample.take(rows)
+            identity = task_problem(part.worlds, Task(level.scenario, level.scenario.learners)).identity.tobytes()
+            found.setdefault(identity, (level, part, []))[2].append(level)
+    return list(found.values())
+
+
+def search_all(plan: Plan, samples: Sequence[Sample], jobs: int, tell: OnProgress) -> dict[str, BestHarmTable]:
+    """The search of every level with learners, by its name; parts that were found earlier are kept."""
+    found: dict[str, BestHarmTable] = {}
+    for level, part, alike in questions(plan, samples):
+        table = search_list(
+            level.scenario,
+            part,
+            budget=plan.budget,
+            threads=jobs,
+            chunks=plan.optimum_folder(level),
+            on_progress=partial(_tell, tell, f"joint optimum of {level.name}"),
+        )
+        found |= {each.name: table for each in alike}
+    return found
+
+
+def _tell(tell: OnProgress, name: str, done: int, total: int) -> None:
+    tell(Progress(name, done, total))
+
+
+def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmCount, Floats]:
+    """The least harm [n] of each count in all ``answers`` (its own is among them) that these learners can give too."""
+    best = {harm_count: np.full(own.worlds.n, np.inf) for harm_count in HARM_COUNTS}
+    for other in answers:
+        rows = np.flatnonzero(_can_imitate(own, other))
+        if rows.size:
+            for harms in _harms(own, other, rows):
+                for harm_count in HARM_COUNTS:
+                    best[harm_count][rows] = np.minimum(best[harm_count][rows], harms[harm_count])
+    return best
+
+
+def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
+    """In which worlds the learners of ``own`` can do what those of ``other`` do, [n].
+
+    They are the same vehicles or more, all others follow the same scripts, latencies are equal, and the decisions of
+    ``other`` fall on theirs. What an obstacle ahead does to it is found by driving, so ``other`` may lack one.
+    """
+    mine, theirs = own.level.scenario, other.level.scenario
+    same_scripts = all(theirs.scripts.get(i) == script for i, script in mine.scripts.items())
+    if not (set(theirs.learners) <= set(mine.learners) and same_scripts):
+        return np.zeros(own.worlds.n, np.bool_)
+    latency_s, obstacle_m = own.worlds.vehicles.latency_s, other.worlds.obstacle_gap_m
+    later_s = own.worlds.first_decision_s(theirs.learners) - own.worlds.first_decision_s(mine.learners)
+    steps = later_s / mine.time_step_s
+    same = (latency_s == other.worlds.vehicles.latency_s).all(axis=1)
+    on_grid = np.abs(steps - np.rint(steps)) < 1e-9
+    return np.asarray(same & on_grid & ((obstacle_m == own.worlds.obstacle_gap_m) | np.isinf(obstacle_m)), np.bool_)
+
+
+def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[HarmCount, Floats]]:
+    """Harm of both counts that the search and every team of ``other`` do in some worlds of ``own``."""
+    scenario, task = other.level.scenario, Task(other.level.scenario, other.level.scenario.learners)
+    worlds = replace(other.worlds, obstacle_gap_m=own.worlds.obstacle_gap_m).take(rows)
+    for best in other.searched.best.values():
+        kept = best._replace(harm=best.harm[rows], profiles=best.profiles.take(rows))
+        yield dict(zip(HARM_COUNTS, task_problem(worlds, task).follow(kept.profiles), strict=True))
+    for team in other.teams:
+        driven = evaluate(worlds, {team.name: team}, scenario=scenario, aftermath=False).complete()
+        ledger = driven.outcome(team.name).ledger
+        yield {harm_count: ledger.world_harm(harm_count) for harm_count in HARM_COUNTS}
+
+
+@dataclass(frozen=True, slots=True)
+class Harms:
+    """What several trainings (or one script) did, on the same worlds."""
+
+    world: dict[HarmCount, Floats]  # [seeds, worlds] harm of all vehicles (m2/s2)
+    vehicle: dict[HarmCount, Floats]  # [seeds, worlds, N] harm of each
+    collided: Bools  # [seeds, worlds]
+    policies: tuple[Mapping[str, str], ...] = ()  # of each seed: vehicle -> SHA-256 of its policy's manifest
+    ledgers: tuple[Ledger, ...] = ()  # of each seed
+
+
+class Goal(NamedTuple):
+    """What the trainings of a level make small: mean over seeds, worlds and learners; of full braking, too."""
+
+    name: str
+    reached: float
+    full_brake: float
+
+    @classmethod
+    def of(cls, training: Training, reached: Harms, full_brake: Harms) -> Goal:
+        """The goal that the training's reward counts: the harm of the line, or the objective of each learner."""
+        reward, scenario = training.recipe.reward, training.scenario
+        objectives = reward.settled(scenario.objective, scenario.vehicles)[1]
+
+        def mean(harms: Harms) -> float:
+            if not objectives:
+                return float(harms.world[reward.harm_count].mean())
+            each = [objective_harm(ledger, reward.harm_count, objectives) for ledger in harms.ledgers]
+            return float(np.stack(each)[:, :, list(scenario.learners)].mean())
+
+        return cls("objective" if objectives else HARM[reward.harm_count], mean(reached), mean(full_brake))
+
+    @property
+    def missed(self) -> bool:
+        """Whether full braking of everybody does better than what was trained."""
+        return self.reached > self.full_brake + TOLERANCE
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """One level under one algorithm."""
+
+    level: Level
+    algorithm: str | None  # None: nobody learns
+    reached: Harms
+    full_brake: Harms  # of all vehicles, whatever their roles
+    best: dict[HarmCount, Floats] | None  # [1, search_episodes] joint optimum, best known; None: nobody to control
+    identity: Mapping[str, Any] = field(default_factory=dict)  # of worlds and scenario, and what computed it
+    shielded: dict[HarmCount, Shielded] | None = None  # [seeds, worlds] behind the shield that guards that count
+    goal: Goal | None = None  # None: nobody learns
+
+
+def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[Measured]:
+    """Let everything that was trained drive the common worlds, and search the joint optima (parts found are kept).
+
+    Level by level in the plan's order, algorithm by algorithm. What some policy does better than the search becomes
+    the best known of that world. Raises what loading teams and ``common_worlds`` raise, before any long work.
+    """
+    say = tell or (lambda progress: None)
+    teams: dict[tuple[str, str], list[Team]] = {}
+    trainings: dict[tuple[str, str], Training] = {}
+    for level, algorithm, training in plan.trainings():
+        trainings[level.name, algorithm] = training.training
+        team = RunDirectory(training.folder).load_team(level.scenario, training.folder.name)
+        teams.setdefault((level.name, algorithm), []).append(team)
+    samples = common_worlds(plan.levels, plan.episodes, plan.list_seed)
+    tables = search_all(plan, samples, jobs, say)
+    answers = {}
+    for level, sample in zip(plan.levels, samples, strict=True):
+        if level.scenario.learners:
+            own = [team for algorithm in plan.algorithms for team in teams[level.name, algorithm]]
+            part = sample.worlds.take(np.arange(plan.search_episodes))
+            answers[level.name] = LevelOptimum(level, part, tables[level.name], tuple(own))
+    found: list[Measured] = []
+    for level, sample in zip(plan.levels, samples, strict=True):
+        alike = level.scenario.replace(roles=dict.fromkeys(level.scenario.vehicle_names, "full_brake"))
+        braking = _drive(alike, sample, [Team({}, f"full braking in {level.name}")], say)
+        about = result_identity("ablate", level.scenario, sample)
+        if not level.scenario.learners:
+            scripts = _drive(level.scenario, sample, [Team({}, f"scripts of {level.name}")], say)
+            found.append(Measured(level, None, scripts, braking, None, about))
+            continue
+        known = best_known(answers[level.name], list(answers.values()))
+        best = {harm_count: harm[np.newaxis] for harm_count, harm in known.items()}
+        for algorithm in plan.algorithms:
+            own = teams[level.name, algorithm]
+            reached = _drive(level.scenario, sample, own, say)
+            behind: dict[HarmCount, Shielded] = {}
+            for harm_count in HARM_COUNTS if plan.shield else ():
+                task, parts = Task(level.scenario, level.scenario.learners, harm_count), []
+                for team in own:
+                    parts.append(Shielded.driven(team, sample.worlds, task))
+                    name = f"driving {team.name} behind the shield, {harm_count}"
+                    say(Progress(name, sample.worlds.n, sample.worlds.n))
+                behind[harm_count] = Shielded.stack(parts)
+            goal = Goal.of(trainings[level.name, algorithm], reached, braking)
+            found.append(Measured(level, algorithm, reached, braking, best, about, behind or None, goal))
+    return found
+
+
+def _drive(scenario: Scenario, sample: Sample, drivers: Sequence[Driver], tell: OnProgress) -> Harms:
+    """Harms of several drivers of one level on the same worlds."""
+    outcomes = []
+    for driver in drivers:
+        result = evaluate(sample, {driver.name: driver}, scenario=scenario).complete()
+        outcomes.append(result.outcome(driver.name))
+        tell(Progress(f"driving {driver.name}", sample.worlds.n, sample.worlds.n))
+    ledgers = [outcome.ledger for outcome in outcomes]
+    return Harms(
+        {harm_count: np.stack([each.world_harm(harm_count) for each in ledgers]) for harm_count in HARM_COUNTS},
+        {harm_count: np.stack([each.vehicle_harm(harm_count) for each in ledgers]) for harm_count in HARM_COUNTS},
+        np.stack([outcome.collided for outcome in outcomes]),
+        tuple(dict(outcome.policies) for outcome in outcomes),
+        tuple(ledgers),
+    )

@@ -1,0 +1,306 @@
+"""Episodes of one learner as a dataset of Minari, which replays to the recorded bits in the environment it recovers.
+
+An episode's ``seed`` and ``options`` put its world back: ``env.reset(seed=seed, options=options)``.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from numpy.typing import NDArray
+
+from ethbrake_marl.agents.protocol import Driver, Team
+from ethbrake_marl.env.harm import HARM_COUNTS
+from ethbrake_marl.env.making import action_box, feature_box
+from ethbrake_marl.env.observations import Observation, choose_observation
+from ethbrake_marl.env.rewards import Reward, reward_params
+from ethbrake_marl.errors import (
+    AlreadyExists,
+    InvalidInput,
+    PhysicsError,
+    check_one_learner,
+    check_whole_number,
+    naming_extras,
+    need,
+    unknown_name,
+)
+from ethbrake_marl.evaluation.identity import LIST_SEED, policies_of, result_versions, scenario_sha256
+from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.outcome import LeftOut
+from ethbrake_marl.extensions.datasets.parquet import KEY, OF_STEPS, parquet_dataset
+from ethbrake_marl.extensions.datasets.recording import Recording, Task, record_episodes
+from ethbrake_marl.files.store import check_target, check_writable, new_folder
+from ethbrake_marl.physics.left_out import leaving_out_failed
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.observed import observation_for
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.schema import Scenario
+
+DATA = "data"  # the folder of the data inside a dataset's
+
+_DATASET_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]*-v\d+")
+
+
+def check_folder(path: Path, *, force: bool = False) -> None:
+    """Refuse what cannot become a dataset's folder, before any work.
+
+    Raises ``AlreadyExists`` for one that is there, ``InvalidInput`` for what ``force`` does not replace: it replaces
+    datasets of Minari alone.
+    """
+    if _DATASET_NAME.fullmatch(path.name) is None:
+        raise InvalidInput(f"{path}: a dataset of Minari is a folder called NAME-vNUMBER, for instance brakes-v0")
+    if path.is_symlink() or path.exists():
+        if not force:
+            raise AlreadyExists(f"{path}: is there already; give another name or use force (--force)")
+        if path.is_symlink() or not (path / DATA / "metadata.json").is_file():
+            raise InvalidInput(f"{path}: is no dataset of Minari, and is not replaced; give another name")
+    if not path.parent.is_dir():
+        raise InvalidInput(f"{path}: there is no folder {path.parent}; make it first")
+    try:
+        check_writable(path.parent)
+    except OSError as error:
+        raise InvalidInput(f"{path}: cannot be written ({error.strerror})") from None
+
+
+@contextmanager
+def minari_folder(
+    path: Path, task: Task, told: Mapping[str, Any], *, force: bool
+) -> Iterator[Callable[[Recording], None]]:
+    """Give what adds recordings to the dataset, whose folder appears at ``path`` when the block ends well.
+
+    ``told`` is read at the end, and stands in its metadata under ``KEY``, as JSON. Raises ``MissingExtra``.
+    """
+    with naming_extras():
+        import h5py  # noqa: F401  # minari's own message would name another line
+        from minari.data_collector.episode_buffer import EpisodeBuffer
+        from minari.dataset.minari_storage import MinariStorage
+
+    with new_folder(path, replace=force) as partial:
+        storage = MinariStorage.new(
+            partial.resolve() / DATA,  # of a relative path Minari 0.5.4 looks for its own files in the wrong place
+            observation_space=feature_box(task.observation.features),
+            action_space=action_box(),
+            env_spec=env_spec(task),
+        )
+        storage.update_metadata({"dataset_id": path.name, "minari_version": version("minari")})
+
+        def add(recording: Recording) -> None:
+            first = storage.total_episodes
+            episodes = list(_episodes(recording))
+            storage.update_episodes(EpisodeBuffer(**episode) for episode in episodes)
+            harms = zip(*(recording.ledger.world_harm(count).tolist() for count in HARM_COUNTS), strict=True)
+            beside = [{"agent": recording.agent, "first_impact_harm": one, "total_harm": whole} for one, whole in harms]
+            storage.update_episode_metadata(beside, range(first, first + len(episodes)))
+
+        yield add
+        storage.update_metadata(
+            {
+                "algorithm_name": ", ".join(told["agents"]),
+                "description": f"{task.scenario.name}: {task.scenario.title or 'emergency braking'}",
+                "requirements": [f"ethbrake-marl>={version('ethbrake-marl')}"],
+                KEY: json.dumps(told),
+            }
+        )
+
+
+def env_spec(task: Task) -> EnvSpec:
+    """What ``gymnasium.make`` makes the same environment of, of plain data alone: it survives JSON.
+
+    Raises ``InvalidInput`` unless exactly one vehicle learns.
+    """
+    names = [task.scenario.vehicle_names[i] for i in task.scenario.learners]
+    check_one_learner(
+        task.scenario.name, names, "a dataset of Minari is one learner's; give the others a script, or write Parquet"
+    )
+    spec = copy.deepcopy(gymnasium.spec("EthBrake-v0"))
+    spec.kwargs = {"scenario": task.scenario.declared(), "reward": task.reward.model_dump(mode="json")}
+    if task.observation != observation_for(task.scenario):
+        spec.kwargs["observation"] = [feature.name for feature in task.observation.features]
+    return spec
+
+
+def _episodes(recording: Recording) -> Iterator[dict[str, Any]]:
+    """The fields of an ``EpisodeBuffer``, world by world."""
+    vehicle, seed = recording.learners[0], recording.task.seed
+    infos = _infos(recording, vehicle)
+    reward, terminated, truncated = (np.stack([getattr(step, name) for step in recording.steps]) for name in OF_STEPS)
+    for k, (world, end) in enumerate(zip(recording.index.tolist(), recording.decisions.tolist(), strict=True)):
+        yield {
+            "seed": seed,
+            "options": {"listed_world": {"seed": seed, "number": world}},
+            "observations": recording.observations[: end + 1, k, 0],
+            "actions": recording.actions[:end, k],
+            "rewards": reward[:end, k, vehicle],
+            "terminations": terminated[:end, k],
+            "truncations": truncated[:end, k],
+            "infos": {name: values[: end + 1, k] for name, values in infos.items()},
+        }
+
+
+def _infos(recording: Recording, vehicle: int) -> dict[str, NDArray[Any]]:
+    """The infos of the environment, [T + 1, n, ...]."""
+    told = {name: recording.told(name)[:, :, vehicle] for name in recording.reports[0].columns()}
+    cost = np.stack([each.cost for each in recording.reports])
+    news = [each.known_from_s[:, vehicle] for each in recording.reports if each.known_from_s is not None]
+    return {
+        **told,
+        "collided": told["collided"] == 1.0,
+        "chosen_action": told["chosen_action"].astype(np.float32)[:, :, np.newaxis],
+        "cost": cost,
+        "world_seed": np.full(cost.shape, recording.task.seed),
+        "world": np.stack([each.world for each in recording.reports]),
+        **{f"reward_{name}": term[:, :, 0] for name, term in recording.terms().items()},
+        **({"known_from_s": np.stack(news)} if news else {}),
+    }
+
+
+BATCH = 500  # worlds recorded together: bounds memory, changes no episode
+
+DatasetFormat = Literal["parquet", "minari"]
+
+_NEEDED_PACKAGES: dict[DatasetFormat, tuple[str, ...]] = {"parquet": ("pyarrow",), "minari": ("minari", "h5py")}
+
+
+@dataclass(frozen=True, slots=True)
+class DatasetSummary:
+    """What ``write_dataset`` wrote."""
+
+    path: Path
+    format: DatasetFormat
+    episodes: Mapping[str, int]  # by agent
+    decisions: int  # of all episodes
+    off_by: Mapping[str, float]  # by agent: by how much (m2/s2) rounding to actions changed a world's harm, at most
+    left_out: tuple[LeftOut, ...]  # worlds that could not be advanced
+
+
+def write_dataset(
+    path: str | Path,
+    agents: str | Sequence[str] | Mapping[str, Driver],
+    *,
+    scenario: str | Path | Scenario,
+    episodes: int,
+    seed: int = LIST_SEED,
+    format: DatasetFormat | None = None,
+    reward: Reward = "harm",
+    observation: Observation | None = None,
+    force: bool = False,
+    on_progress: Callable[[str, int], None] | None = None,
+) -> DatasetSummary:
+    """Record agents, each in the same worlds of a list, as a Parquet file or as a dataset of Minari.
+
+    The recorded actions replay to the recorded bits; docs/datasets.md says what is in it.
+
+    Args:
+        path: the file (``.parquet``), or the folder (``NAME-v0``) to write.
+        agents: specs as on the command line, or name -> agent, or team, that drives the scenario's learners; they are
+            left as they are.
+        scenario: whose worlds are driven in, also by name or path.
+        episodes: worlds of the list, from its first one on.
+        seed: of the list.
+        format: ``parquet`` or ``minari``; None: as the path's ending says.
+        reward: what a learner is rewarded with.
+        observation: what a learner observes; None: ``observation_for(scenario)``.
+        force: replace a dataset that is there.
+        on_progress: is called with an agent's name and its worlds done so far.
+
+    Raises ``InvalidInput``, ``AlreadyExists`` and ``MissingExtra`` before the work, ``PhysicsError`` where no world is
+    left.
+
+    """
+    check_whole_number("write_dataset: episodes", episodes, 1)
+    check_whole_number("write_dataset: seed", seed, 0)
+    scenario = load_scenario(scenario)
+    if isinstance(agents, Sequence):
+        agents = make_lineup(agents, scenario)
+    if not agents:
+        raise InvalidInput("write_dataset: no agents given; at least one is needed, for instance full_brake")
+    chosen = check_dataset(path, scenario, format, force=force)
+    spec = observation_for(scenario) if observation is None else choose_observation(observation)
+    task = Task(scenario, int(seed), reward_params(reward), spec)
+    told = tell(task, agents, episodes)
+    sink = (
+        parquet_dataset(Path(path), told) if chosen == "parquet" else minari_folder(Path(path), task, told, force=force)
+    )
+    recorded, off_by, left_out, decisions = dict.fromkeys(agents, 0), dict.fromkeys(agents, 0.0), [], 0
+    with sink as add:
+        for name, first in product(agents, range(0, int(episodes), BATCH)):
+            count = min(BATCH, int(episodes) - first)
+            sample = scenario.sample(count, task.seed, first=first)
+
+            def of(rows: Any, sample: Sample = sample, name: str = name) -> Recording:
+                return record_episodes(
+                    Sample(sample.worlds.take(rows), sample.index[rows], 0), agents[name], name, task
+                )
+
+            recording, _, failed = leaving_out_failed(of, np.arange(count))
+            left_out += [LeftOut(first + row, task.seed, name, why) for row, why in failed.items()]
+            if recording is not None:
+                add(recording)
+                recorded[name] += len(recording.index)
+                decisions += int(recording.decisions.sum())
+                off_by[name] = max(off_by[name], recording.off_by)
+            if on_progress is not None:
+                on_progress(name, first + count)
+        if not decisions:
+            raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in left_out})
+        told["left_out"] = [left._asdict() for left in left_out]
+        told["off_by"] = off_by
+    return DatasetSummary(Path(path), chosen, recorded, decisions, off_by, tuple(left_out))
+
+
+def check_dataset(
+    path: str | Path, scenario: Scenario, format: str | None = None, *, force: bool = False
+) -> DatasetFormat:
+    """The format of a dataset that can be written to ``path``; raises as ``write_dataset`` does before its work."""
+    target = Path(path)
+    is_file = target.suffix.lower() == ".parquet"
+    chosen: Any = format if format is not None else "parquet" if is_file else "minari"
+    if chosen not in get_args(DatasetFormat):
+        raise unknown_name("format", chosen, get_args(DatasetFormat))
+    if is_file != (chosen == "parquet"):
+        right = "a file ending in .parquet" if chosen == "parquet" else "a folder called NAME-vNUMBER"
+        raise InvalidInput(f"{target}: the format {chosen} is written to {right}")
+    for package in _NEEDED_PACKAGES[chosen]:
+        need(package)
+    if not scenario.learners:
+        raise InvalidInput(
+            f"scenario {scenario.name!r} has no learner to record: scenario.with_learners(['vehicle_2'])"
+        )
+    if chosen == "parquet":
+        check_target(target, force=force)
+    else:
+        env_spec(Task(scenario, LIST_SEED, reward_params("harm"), observation_for(scenario)))
+        check_folder(target, force=force)
+    return chosen  # type: ignore[no-any-return]  # one of them
+
+
+def tell(task: Task, agents: Mapping[str, Driver], episodes: int) -> dict[str, Any]:
+    """What is recorded, as plain data: the metadata of every dataset."""
+    scenario = task.scenario
+    teams = {name: Team.of(driver, scenario.learners).drivers for name, driver in agents.items()}
+    return {
+        "scenario": scenario.declared(),
+        "scenario_sha256": scenario_sha256(scenario),
+        "seed": task.seed,
+        "episodes": int(episodes),
+        "learners": [scenario.vehicle_names[i] for i in scenario.learners],
+        "agents": {
+            name: dict.fromkeys(scenario.vehicle_names[i] for i in drivers) | policies_of(drivers)
+            for name, drivers in teams.items()
+        },
+        "observation": [feature.name for feature in task.observation.features],
+        "reward": task.reward.model_dump(mode="json"),
+        "versions": result_versions(),
+    }

@@ -1,0 +1,1 @@
+"""Controllers that the field compares with: IDM, ACC, RSS, UN R157, AEB."""

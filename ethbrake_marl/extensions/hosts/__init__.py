@@ -1,0 +1,1 @@
+"""Driving worlds that another simulator moves; SUMO."""

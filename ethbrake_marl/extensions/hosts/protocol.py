@@ -1,0 +1,559 @@
+"""Driving worlds that somebody else moves: a simulator, or a test bench; and SUMO as one.
+
+A host only moves vehicles. Decisions and their grid, latencies, holding at rest, impacts and the ledger are ours:
+
+1. *Decide.* Who decides now is asked on the state that the host told, behind the shield where there is one.
+2. *Move.* The host gets one command, and moves for one step.
+3. *Meet.* Pairs that touch and close by then exchange velocity, unless the host has an impact law of its own and
+   tells what happened.
+
+A latency is rounded up to whole steps of the host, and everybody is told so: no decision falls between two steps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ethbrake_marl.agents.driving import Episodes, episode_engine
+from ethbrake_marl.agents.protocol import Driver, Team, check_agent
+from ethbrake_marl.env.actions import action_to_command
+from ethbrake_marl.env.engine import ROUNDING
+from ethbrake_marl.env.harm import Ledger, empty_ledger
+from ethbrake_marl.env.memory import ask_script, begin_script, is_state_free, renew_memory, take_memory, within_capacity
+from ethbrake_marl.env.stream import check_alert
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
+from ethbrake_marl.evaluation.outcome import Outcome
+from ethbrake_marl.evaluation.rollout import outcome_of
+from ethbrake_marl.physics.episode import Decisions
+from ethbrake_marl.physics.left_out import Impacts
+from ethbrake_marl.physics.motion import BOUND, has_acted
+from ethbrake_marl.physics.paper_map import held_speeds
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Vehicles, Worlds
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+
+STANDS_MPS = 1e-3  # a vehicle that a host with steps of its own moves more slowly stands
+
+STARTS_WITHIN = 0.01  # m, m/s: how far the first state may be from the worlds that the host was set up with
+
+READ_WITHIN = 0.2  # m, m/s: how far a change between two states may be misread
+
+# how a host's vehicles may follow commands: late by so much, and off by so much and by this share of the command
+LAG_S, OFF_MPS2, OFF_SHARE = 0.5, 0.5, 0.2
+
+SNAP = 1e-6  # of a step: moments so close are one
+
+
+class HostState(NamedTuple):
+    """What a host tells of its ``n`` lines of ``N`` vehicles, front to rear.
+
+    >>> import ethbrake_marl as eb
+    >>> eb.HostState(0.0, [[5.0, 6.0]], [[20.0, 18.0, 20.0]]).impacts is None
+    True
+
+    """
+
+    time_s: ArrayLike  # by its own clock, which may begin anywhere, to [n]
+    gaps_m: ArrayLike  # [n, N - 1] bumper to bumper; below 0 where bodies overlap
+    speeds_mps: ArrayLike  # [n, N]
+    impacts: Impacts | None = None  # of a host with an impact law of its own: those since its last state
+
+
+class HostCommand(NamedTuple):
+    """What a host is to do in one step.
+
+    >>> import ethbrake_marl as eb
+    >>> eb.HostCommand._fields
+    ('acceleration_mps2', 'speeds_mps', 'wanted_mps2', 'until_s')
+
+    """
+
+    acceleration_mps2: Floats  # [n, N] to hold: 0 before the latency, and no more than leads to rest or the speed limit
+    speeds_mps: Floats  # [n, N] with which the step begins: those it told, but where vehicles have met
+    wanted_mps2: Floats  # [n, N] what was decided, for a host that holds at rest and keeps latencies by itself
+    until_s: Floats  # [n] when the step ends, since the alert
+
+
+class Host(Protocol):
+    """Somebody else's ``n`` lines of vehicles, at the alert.
+
+    ``dt``: the length of its steps (s), all alike. With ``math.inf`` each world moves to its own ``command.until_s``,
+    the next decision there, and one whose time that is already stays as it is.
+
+    >>> import ethbrake_marl as eb
+    >>> class Bench:
+    ...     dt = 0.1
+    ...     def __init__(self, worlds):
+    ...         self.told = eb.HostState(0.0, worlds.gaps_m, worlds.speeds_mps)
+    ...     def state(self):
+    ...         return self.told
+    ...     def apply(self, command):
+    ...         after = command.speeds_mps + self.dt * command.acceleration_mps2
+    ...         way = self.dt * (command.speeds_mps + after) / 2
+    ...         gaps = self.told.gaps_m + way[:, :-1] - way[:, 1:]
+    ...         self.told = eb.HostState(self.told.time_s + self.dt, gaps, after)
+    >>> worlds = eb.load_scenario("paper-random").sample(5, seed=7).worlds
+    >>> eb.drive_host(Bench(worlds), eb.make_agent("full_brake"), "paper-random", worlds).outcome.at_rest.all()
+    np.True_
+
+    """
+
+    dt: float
+
+    def state(self) -> HostState:
+        """What its vehicles do now."""
+
+    def apply(self, command: HostCommand) -> None:
+        """Move on by one step."""
+
+
+class HostFailed(EthBrakeError):
+    """A host raised, or told what cannot be; ``ledger`` and ``worlds`` keep what had happened by then.
+
+    >>> import ethbrake_marl as eb
+    >>> issubclass(eb.HostFailed, eb.EthBrakeError)
+    True
+
+    """
+
+    def __init__(self, reason: str, ledger: Ledger, worlds: Worlds) -> None:
+        super().__init__(reason)
+        self.ledger, self.worlds = ledger, worlds
+
+
+class Hosted(NamedTuple):
+    """What an agent achieved in a host."""
+
+    outcome: Outcome
+    # [n] the host did what the shield did not foretell: nothing is promised there; None: no mode step or robust, which
+    # alone compare
+    distrusted: Bools | None
+
+    @classmethod
+    def join(cls, parts: list[Hosted]) -> Hosted:
+        """One from those of consecutive worlds."""
+        distrusted = [part.distrusted for part in parts if part.distrusted is not None]
+        outcome = Outcome.join([part.outcome for part in parts])
+        return cls(outcome, np.concatenate(distrusted) if distrusted else None)
+
+
+def drive_host(host: Host, agent: Driver, scenario: str | Path | Scenario, worlds: Worlds) -> Hosted:
+    """Let an agent, or a team, drive the scenario's learners in a host, from the alert to the end of every episode.
+
+    Args:
+        host: at the alert.
+        agent: drives each learner, as ``make_agent`` makes it, with or without a shield; it is left as it is.
+        scenario: its scripts drive the other vehicles, and every agent is told of them.
+        worlds: at the alert, as the host was set up with them: it is asked for gaps and speeds, not for the rest.
+
+    Gives the ``outcome``, and where a shield ``distrusted`` the host. Raises ``InvalidInput`` for what does not go with
+    a host, ``HostFailed`` for one that raises or tells what cannot be.
+
+    """
+    scenario = load_scenario(scenario)
+    if not isinstance(worlds, Worlds):
+        raise InvalidInput(f"host: worlds = {worlds!r}: must be worlds, as scenario.sample(n, seed).worlds")
+    check_alert(worlds, worlds.n, scenario.vehicles)
+    check_agent(agent, "host", alone=False)
+    team = Team.of(agent, scenario.learners)
+    if not team.drivers:
+        raise InvalidInput(f"host: scenario {scenario.name!r} has no learner to drive; scenario.with_learners([1])")
+    return _Run(host, worlds, team, scenario).to_the_end()
+
+
+class _Grid:
+    """Who decides together, at ``first_s`` [n] and every time step from then on; ``made`` [n] decisions so far."""
+
+    def __init__(self, first_s: Floats, vehicles: list[int], scenario: Scenario) -> None:
+        self.decisions, self.horizon_s = Decisions(first_s, scenario.time_step_s), scenario.horizon_s
+        self.vehicles, self.made = vehicles, np.zeros(len(first_s))
+        self.all = self.decisions.before(scenario.horizon_s)
+
+    @property
+    def next_s(self) -> Floats:
+        """Time of the next decision; of none any more, the horizon."""
+        return np.where(self.made < self.all, self.decisions.at(self.made), self.horizon_s)
+
+    def is_due(self, time_s: Floats) -> Bools:
+        """Where the next decision, or the end, has come."""
+        return self.next_s <= time_s + ROUNDING * self.decisions.time_step_s
+
+
+class _Run:
+    """The worlds of a host while they run."""
+
+    def __init__(self, host: Host, worlds: Worlds, team: Team, scenario: Scenario) -> None:
+        self.host, self.team, self.scenario = host, team, scenario
+        self.dt = _checked_dt(host, scenario)
+        self.exact = math.isinf(self.dt)
+        _check_known(worlds, scenario, tuple(team.drivers))
+        self.ledger, self.time_s, self.ticks = empty_ledger(worlds), np.zeros(worlds.n), 0
+        self.origin_s: Floats = np.zeros(worlds.n)
+        self.told_s: Floats = np.zeros(worlds.n)
+        self.alert = self.final = worlds
+        self.gaps_m, self.speeds_mps, self.wanted_mps2 = worlds.gaps_m, worlds.speeds_mps, worlds.command_mps2
+        self.gaps_m, self.speeds_mps = self._first_state()
+        if not self.exact:
+            worlds = replace(worlds, vehicles=_on_steps(worlds, self.dt))
+        self.alert = self.final = worlds.running(0.0, self.gaps_m, self.speeds_mps)
+        self.engine = engine = episode_engine(self.alert, team, scenario)
+        first = self.alert.first_decision_s
+        asked = [i for i, script in engine.scripts.items() if not is_state_free(script)]
+        drivers = [*engine.deciders]
+        self.grids = [_Grid(first(drivers), [i for i in asked if i in drivers], scenario)]
+        self.grids += [_Grid(first([i]), [i], scenario) for i in asked if i not in drivers]
+        known = {i: script for i, script in engine.scripts.items() if i not in drivers}
+        others = [i for i in asked if i not in drivers]
+        self.memories = engine.memories | {i: begin_script(known[i], self.alert, i, known) for i in others}
+        self.wanted_mps2 = engine.wanted_mps2.copy()
+        self.wanted_mps2[:, asked] = 0.0
+        self.motion = _Motion(self.alert, self.dt)
+        self.ended: Bools = np.zeros(worlds.n, np.bool_)
+        self.at_rest: Bools = np.zeros(worlds.n, np.bool_)
+
+    def to_the_end(self) -> Hosted:
+        """Drive every world to the end of its episode."""
+        if self.exact:
+            self._move()  # to the first decision
+        while not self.ended.all():
+            self._decide()
+            self._move()
+            self._end()
+        guarded = self.engine.guarded
+        driven = {i: memory for i, memory in self.memories.items() if i in self.team.drivers}
+        outcome = outcome_of(self.team, Episodes(self.ledger, self.final, self.at_rest, guarded, driven))
+        return Hosted(outcome, getattr(getattr(guarded, "shield", None), "distrusted", None))
+
+    # what was decided
+
+    def _decide(self) -> None:
+        """Ask those who decide now; all of them see the same."""
+        each = [~self.ended & (grid.made < grid.all) & grid.is_due(self.time_s) for grid in self.grids]
+        if not np.any(each):
+            return
+        worlds = self._seen()
+        for number, (grid, due) in enumerate(zip(self.grids, each, strict=True)):
+            idle = np.flatnonzero(~due)
+            if len(idle) == len(due):
+                continue
+            for i in grid.vehicles:
+                script, before = self.engine.scripts[i], self.memories[i]
+                command, after = ask_script(script, worlds, before, i)
+                self.wanted_mps2[due, i] = within_capacity(command, worlds, i, script, due)[due]
+                self.memories[i] = renew_memory(after, idle, take_memory(before, idle))
+            if number == 0 and self.engine.guard is not None:
+                self._ask_guard(worlds, due, idle)
+            grid.made = grid.made + due
+
+    def _ask_guard(self, worlds: Worlds, due: Bools, idle: Ints) -> None:
+        """Let the policies behind the shield propose, and want what it applies."""
+        engine = self.engine
+        assert engine.guard is not None
+        engine.place(worlds, self.ledger, ended=~due)
+        before: Any = engine.guarded
+        nothing = np.full((worlds.n, len(engine.learners)), np.nan)
+        ruling = engine.guard.decide(engine, before, nothing)
+        policies = renew_memory(ruling.memory.policies, idle, take_memory(before.policies, idle))
+        engine.guarded = ruling.memory._replace(policies=policies)
+        for c, i in enumerate(engine.learners):
+            self.wanted_mps2[due, i] = action_to_command(ruling.applied[:, c], worlds.vehicles, i)[due]
+
+    def _seen(self) -> Worlds:
+        """The worlds as agents see them."""
+        latency, speeds = self.alert.vehicles.latency_s, self.speeds_mps
+        in_force = np.where(has_acted(latency, self.time_s[:, np.newaxis]), self.wanted_mps2, 0.0)
+        if not self.exact:
+            speeds = np.where(np.abs(speeds) < STANDS_MPS, 0.0, speeds)
+        gaps = np.maximum(self.gaps_m, 0.0)
+        return self.alert.running(self.time_s, gaps, speeds, command_mps2=in_force, pair_hit=self.ledger.count > 0)
+
+    def _end(self) -> None:
+        """Note whose episodes end with this step: they hold the brakes."""
+        first = self.grids[0]
+        if not (stepped := ~self.ended & first.is_due(self.time_s) & (first.made > 0)).any():
+            return
+        worlds = self._seen()
+        rests = ((worlds.speeds_mps == 0.0) & (self.wanted_mps2 <= 0.0)).all(axis=1)
+        over = stepped & (rests | (self.time_s >= self.scenario.horizon_s - SNAP * self.scenario.time_step_s))
+        self.at_rest |= over & rests
+        self.ended |= over
+        rows, drivers = np.flatnonzero(over), list(self.team.drivers)
+        self.final = self.final.assign(rows, worlds.take(rows))
+        self.wanted_mps2[np.ix_(over, drivers)] = -worlds.vehicles.braking_capacity_mps2[np.ix_(over, drivers)]
+
+    # what the host does
+
+    def _move(self) -> None:
+        """Let the host make one step, and let vehicles meet that touch then."""
+        if self.exact:
+            until = np.minimum.reduce([grid.next_s for grid in self.grids])
+            until = np.where(self.ended, self.time_s, np.maximum(until, self.time_s))
+        else:
+            self.ticks += 1
+            until = np.full(len(self.ended), self.ticks * self.dt)
+        v, begin = self.alert.vehicles, self.speeds_mps
+        acceleration = np.where(v.latency_s <= self.time_s[:, np.newaxis], self.wanted_mps2, 0.0)
+        if not self.exact:
+            acceleration = (held_speeds(begin, acceleration, v.speed_limit_mps, self.dt) - begin) / self.dt
+        command = HostCommand(acceleration.copy(), begin.copy(), self.wanted_mps2.copy(), until.copy())
+        try:
+            self.host.apply(command)
+        except Exception as error:
+            self._fail(f"apply raised {describe_error(error)}", error)
+        time_s, gaps, speeds, impacts = self._read()
+        self._check_clock(time_s, until)
+        before_m, step_s = self.gaps_m, until - self.time_s
+        step = _Step(self.wanted_mps2, begin, until, time_s - self.told_s, gaps, speeds, impacts)
+        if refusal := self.motion.refusal(step):
+            self._fail(refusal[1], world=refusal[0])
+        self.told_s, self.time_s, self.gaps_m = time_s, until, gaps
+        self.speeds_mps = speeds.copy()
+        self.ledger = self.ledger.add(self._meet(before_m, begin, step_s) if impacts is None else impacts)
+
+    def _meet(self, before_m: Floats, begin: Floats, step_s: Floats) -> Impacts:
+        """Let pairs that touch and close exchange velocity by the paper's eq. (13), from the rear to the front.
+
+        With closing speed w and gap g <= 0 now, and the mean closing acceleration b of the step, a pair that was apart
+        before closed with ``sqrt(w^2 + 2 b g)`` when it met: that is what harms, and what is exchanged.
+        """
+        v, gaps, speeds, told = self.alert.vehicles, self.gaps_m, self.speeds_mps, self.speeds_mps.copy()
+        first, total, count = np.zeros(gaps.shape), np.zeros(gaps.shape), np.zeros(gaps.shape, np.int64)
+        pressing = np.diff(told - begin, axis=1) / np.maximum(step_s, SNAP)[:, np.newaxis]
+        for p in range(gaps.shape[1] - 1, -1, -1):
+            closing = speeds[:, p + 1] - speeds[:, p]
+            meets = (gaps[:, p] <= 0.0) & (closing > 0.0)
+            then = np.sqrt(np.maximum(closing * closing + 2.0 * pressing[:, p] * gaps[:, p], 0.0))
+            closing = np.where(meets, np.where(before_m[:, p] > 0.0, then, closing), 0.0)
+            front, rear = v.mass_t[:, p], v.mass_t[:, p + 1]
+            impulse = (1.0 + v.restitution) * closing / (front + rear)
+            speeds[:, p] += rear * impulse
+            speeds[:, p + 1] -= front * impulse
+            count[:, p] = closing > BOUND.TOUCH_SPEED_MPS
+            total[:, p] = np.where(count[:, p], closing * closing, 0.0)
+            first[:, p] = np.where(self.ledger.count[:, p], 0.0, total[:, p])
+        return Impacts(first, total, count, *Impacts.no_obstacle(len(gaps)))
+
+    def _read(self) -> tuple[Floats, Floats, Floats, Impacts | None]:
+        """Time since the alert, gaps, speeds and impacts as the host tells them, in our memory."""
+        (n, N), read = self.alert.speeds_mps.shape, list[Floats]()
+        try:
+            state = HostState(*self.host.state())
+            given = [np.array(np.ma.filled(each, np.nan), np.float64) for each in state[:3]]
+        except Exception as error:
+            self._fail(f"state raised {describe_error(error)}", error)
+        given[0] = given[0] if given[0].ndim else np.full(n, given[0])
+        for name, each, shape in zip(HostState._fields, given, ((n,), (n, N - 1), (n, N)), strict=False):
+            if each.shape != shape:
+                self._fail(f"{name} is of shape {each.shape}; {shape} is needed: worlds, then vehicles or pairs")
+            if not np.isfinite(each).all():
+                at = np.argwhere(~np.isfinite(each))[0].tolist()
+                self._fail(f"{name}{at} is {each[tuple(at)]}; every number must be finite")
+            read.append(each)
+        impacts = state.impacts
+        if impacts is not None:
+            if not isinstance(impacts, Impacts):
+                self._fail(f"impacts are {type(impacts).__name__}; what eb.advance gives is needed, or None")
+            for place, column in enumerate(fields(Impacts)[:6]):
+                values, shape = np.asarray(getattr(impacts, column.name)), (n, N - 1) if place < 3 else (n,)
+                whole = values.dtype.kind in ("iu" if column.name.endswith("count") else "fiu")
+                if not (whole and values.shape == shape and np.isfinite(values).all() and (values >= 0).all()):
+                    self._fail(f"impacts.{column.name} must be of shape {shape}, finite and not below 0; counts whole")
+        return read[0] - self.origin_s, read[1], read[2], impacts
+
+    def _first_state(self) -> tuple[Floats, Floats]:
+        """Gaps and speeds at the alert, and when that is by the host's clock."""
+        self.origin_s, gaps, speeds, _ = self._read()
+        for name, told, given in (("gaps_m", gaps, self.alert.gaps_m), ("speeds_mps", speeds, self.alert.speeds_mps)):
+            if not (close := np.abs(told - given) <= STARTS_WITHIN).all():
+                at = tuple(np.argwhere(~close)[0].tolist())
+                self._fail(
+                    f"{name}{list(at)} is {told[at]:g} and {given[at]:g} in the worlds that were given; set the host up"
+                    f" with these, to {STARTS_WITHIN:g}"
+                )
+        return np.maximum(gaps, 0.0), speeds
+
+    def _check_clock(self, time_s: Floats, until: Floats) -> None:
+        """Refuse a clock that is not where the step was to lead; by half a step it may be off."""
+        within = SNAP * self.scenario.time_step_s if self.exact else self.dt / 2.0
+        if not (good := np.abs(time_s - until) <= within).all():
+            k = int(np.argmin(good))
+            went = "skips" if time_s[k] > until[k] else "goes back" if time_s[k] < self.told_s[k] else "loses a step"
+            self._fail(
+                f"world {k} {went}: its clock went from {self.told_s[k]:g} s to {time_s[k]:g} s, and {until[k]:g} s is"
+                f" right to {within:g} s; each call of apply must make one step of dt"
+            )
+
+    def _fail(self, what: str, error: Exception | None = None, world: int | None = None) -> NoReturn:
+        at = float(self.time_s.max(initial=0.0) if world is None else self.time_s[world])
+        raise HostFailed(f"host {type(self.host).__name__} at {at:.2f} s: {what}", self.ledger, self._seen()) from error
+
+
+class _Step(NamedTuple):
+    """One step of a host: what it was to do, and what it says of its end."""
+
+    wanted_mps2: Floats  # [n, N]
+    begin_mps: Floats  # [n, N] the speeds it was to begin with
+    until_s: Floats  # [n] when it was to end
+    clock_s: Floats  # [n] how long it was by the host's clock
+    gaps_m: Floats  # [n, N - 1]
+    speeds_mps: Floats  # [n, N]
+    impacts: Impacts | None
+
+
+class _Motion:
+    """How the vehicles of a host can have moved since the alert. Three rules refuse what is impossible:
+
+    1. *Speed in a step.* It changes by no more than the commands so far allow.
+    2. *Gaps since the alert.* They follow from the speeds at the beginning and at the end of each step.
+    3. *Speed since the alert.* The commands lead to it, late by ``LAG_S`` at most, with accelerations that are off by
+       ``OFF_MPS2`` and ``OFF_SHARE`` of the command at most.
+
+    Bodies that pass through one another never push. In a host that reports impacts, vehicles that touch push one
+    another: rule 1 takes the commands of their whole line, and its energy where there was an impact; rules 2 and 3
+    begin again at what the host says.
+    """
+
+    def __init__(self, alert: Worlds, dt: float) -> None:
+        self.vehicles, self.jitter_s = alert.vehicles, 0.0 if math.isinf(dt) else dt
+        self.time_s, self.gaps_m, self.speeds_mps = alert.time_s, alert.gaps_m, alert.speeds_mps
+        self.least_mps2 = self.most_mps2 = np.zeros(alert.speeds_mps.shape)  # of the commands so far
+        self.least_m = self.most_m = alert.gaps_m  # where the speeds lead
+        self.led_mps = alert.speeds_mps  # where the commands lead
+        self.off_mps = np.full(alert.speeds_mps.shape, READ_WITHIN)  # how far from there, apart from the lag
+
+    def refusal(self, step: _Step) -> tuple[int, str] | None:
+        """The world and what is impossible in it; None: every world can be as the host says."""
+        acting_s = np.maximum(step.until_s[:, np.newaxis] - np.maximum(self._now, self.vehicles.latency_s), 0.0)
+        command = np.where(acting_s > 0.0, step.wanted_mps2, 0.0)
+        met = self._met(step)
+        low, high = self._reachable(step, met)
+        wrong = (
+            _refused(
+                step.speeds_mps, low, high,
+                lambda k, i, right: f"vehicle_{i + 1} of world {k} goes from {step.begin_mps[k, i]:g} to"
+                f" {step.speeds_mps[k, i]:g} m/s within {step.until_s[k] - self.time_s[k]:g} s; {right} m/s is possible"
+                f" under {command[k, i]:g} m/s2: begin a step with command.speeds_mps and let bodies pass through one"
+                " another, or report every impact in the state",
+            )
+            or self._wrong_gap(step, met, low, high)
+            or self._wrong_speed(step, met, command * acting_s)
+        )  # fmt: skip
+        self.time_s, self.gaps_m, self.speeds_mps = step.until_s, step.gaps_m, step.speeds_mps
+        return wrong
+
+    @property
+    def _now(self) -> Floats:
+        return self.time_s[:, np.newaxis]
+
+    def _met(self, step: _Step) -> Bools:
+        """Which vehicles may have pushed one another, [n, N]."""
+        met = np.zeros(step.speeds_mps.shape, np.bool_)
+        if step.impacts is not None:
+            touch = (step.impacts.count > 0) | (np.minimum(step.gaps_m, self.gaps_m) <= READ_WITHIN)
+            met[:, :-1] |= touch
+            met[:, 1:] |= touch
+        return met
+
+    def _reachable(self, step: _Step, met: Bools) -> tuple[Floats, Floats]:
+        """The least and the greatest speed at the end of the step, [n, N] m/s."""
+        # a host that keeps latencies by itself does not round them up
+        begun = step.until_s[:, np.newaxis] + self.jitter_s > self.vehicles.latency_s
+        command = np.where(begun, step.wanted_mps2, 0.0)
+        self.least_mps2, self.most_mps2 = np.minimum(self.least_mps2, command), np.maximum(self.most_mps2, command)
+        least = np.where(met, self.least_mps2.min(axis=1, keepdims=True), self.least_mps2)
+        most = np.where(met, self.most_mps2.max(axis=1, keepdims=True), self.most_mps2)
+        begin, seconds = step.begin_mps, np.maximum(step.until_s - self.time_s, step.clock_s)[:, np.newaxis]
+        low = begin + least * seconds - READ_WITHIN
+        high = np.maximum(begin, 0.0) + most * seconds + READ_WITHIN  # brakes bring one that rolls back to rest
+        if step.impacts is None:
+            return low, high
+        mass, fastest = self.vehicles.mass_t, np.maximum(np.abs(low), np.abs(high))
+        by_energy = np.sqrt((mass * fastest * fastest).sum(axis=1, keepdims=True) / mass)
+        struck = met & (step.impacts.count > 0).any(axis=1, keepdims=True)
+        return np.where(struck, -by_energy, low), np.where(struck, by_energy, high)
+
+    def _wrong_gap(self, step: _Step, met: Bools, low: Floats, high: Floats) -> tuple[int, str] | None:
+        seconds = (step.until_s - self.time_s)[:, np.newaxis]
+        low = np.where(met, low, np.minimum(step.begin_mps, step.speeds_mps))
+        high = np.where(met, high, np.maximum(step.begin_mps, step.speeds_mps))
+        closing = np.abs(np.diff(step.speeds_mps, axis=1))
+        jitter = self.jitter_s / 2.0 * np.abs(np.diff(step.speeds_mps - self.speeds_mps, axis=1))
+        least = self.least_m + seconds * (low[:, :-1] - high[:, 1:]) - jitter
+        most = self.most_m + seconds * (high[:, :-1] - low[:, 1:]) + jitter
+        off, pushed = READ_WITHIN + self.jitter_s * closing, met[:, :-1] | met[:, 1:]
+        self.least_m, self.most_m = np.where(pushed, step.gaps_m, least), np.where(pushed, step.gaps_m, most)
+        return _refused(
+            step.gaps_m, least - off, most + off,
+            lambda k, p, right: f"the gap between vehicle_{p + 1} and vehicle_{p + 2} of world {k} is"
+            f" {step.gaps_m[k, p]:g} m at {step.until_s[k]:g} s; their speeds lead to {right} m",
+        )  # fmt: skip
+
+    def _wrong_speed(self, step: _Step, met: Bools, change: Floats) -> tuple[int, str] | None:
+        """By a command that alone makes ``change`` [n, N] m/s of a vehicle's speed."""
+        began = self.led_mps + step.begin_mps - self.speeds_mps
+        led = held_speeds(began, change, self.vehicles.speed_limit_mps, 1.0)
+        seconds = (step.until_s - self.time_s)[:, np.newaxis]
+        self.off_mps = self.off_mps + OFF_MPS2 * seconds + OFF_SHARE * np.abs(led - began)
+        self.led_mps = np.where(met, step.speeds_mps, led)
+        off = self.off_mps + LAG_S * (self.most_mps2 - self.least_mps2)
+        led = np.where(step.speeds_mps >= 0.0, np.maximum(led, 0.0), led)  # some hosts know no speed below 0
+        return _refused(
+            step.speeds_mps, np.where(met, -np.inf, led - off), np.where(met, np.inf, led + off),
+            lambda k, i, right: f"vehicle_{i + 1} of world {k} drives at {step.speeds_mps[k, i]:g} m/s at"
+            f" {step.until_s[k]:g} s; its commands lead to {right} m/s: follow command.acceleration_mps2",
+        )  # fmt: skip
+
+
+def _refused(
+    values: Floats, low: Floats, high: Floats, describe: Callable[[int, int, str], str]
+) -> tuple[int, str] | None:
+    """The world of the first value outside its range, and what is wrong there."""
+    good = (low <= values) & (values <= high)
+    if good.all():
+        return None
+    k, i = np.argwhere(~good)[0].tolist()
+    return k, describe(k, i, f"{low[k, i]:g} to {high[k, i]:g}")
+
+
+def _checked_dt(host: Host, scenario: Scenario) -> float:
+    """The host's step; raises ``InvalidInput`` for what is no host, or one whose steps make no decision."""
+    missing = [what for what in ("dt", "state", "apply") if not hasattr(host, what)]
+    if missing:
+        raise InvalidInput(f"host {type(host).__name__}: has no {' and no '.join(missing)}; docs/hosts.md shows one")
+    dt, step = host.dt, scenario.time_step_s
+    if isinstance(dt, bool) or not isinstance(dt, int | float | np.number) or not dt > 0.0:
+        raise InvalidInput(f"host: dt = {dt!r}: must be a number of seconds above 0, or math.inf")
+    if not math.isinf(dt) and not (dt <= step * (1.0 + SNAP) and abs(step / dt - round(step / dt)) <= SNAP):
+        raise InvalidInput(
+            f"host: dt = {dt:g} s: decisions every {step:g} s must be whole steps; for instance"
+            f" {step / math.ceil(step / dt):g} s"
+        )
+    return float(dt)
+
+
+def _check_known(worlds: Worlds, scenario: Scenario, vehicles: tuple[int, ...]) -> None:
+    """Refuse worlds of which a host would have to know more than gaps and speeds."""
+    scenario.play_pieces(worlds, vehicles).refuse_build_up("host")
+    if worlds.messages.shape[1] or worlds.obstacle_ahead.any():
+        what = "periodic messages (v2x)" if worlds.messages.shape[1] else "an obstacle ahead (obstacle_gap_m)"
+        raise InvalidInput(f"host: scenario {scenario.name!r}: has {what}; hosts know lines of vehicles alone")
+
+
+def _on_steps(worlds: Worlds, dt: float) -> Vehicles:
+    """The vehicles, with latencies of whole steps."""
+
+    def up(seconds: Floats) -> Floats:
+        return np.ceil(seconds / dt - SNAP) * dt
+
+    v = worlds.vehicles
+    latency = up(v.latency_s)
+    if v.is_known_at_once:
+        return replace(v, latency_s=latency, own_latency_s=latency, known_from_s=Vehicles.known_at_once(latency))
+    return replace(v, latency_s=latency, own_latency_s=up(v.own_latency_s), known_from_s=up(v.known_from_s))

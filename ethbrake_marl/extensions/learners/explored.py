@@ -1,0 +1,110 @@
+"""Worlds in which random templates do better than every expert so far, and the templates to imitate there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.env.actions import command_to_action
+from ethbrake_marl.env.engine import Engine, Moment
+from ethbrake_marl.env.harm import HarmCount
+from ethbrake_marl.env.observations import Observations
+from ethbrake_marl.env.profiles import profile_problem
+from ethbrake_marl.errors import EthBrakeError
+from ethbrake_marl.extensions.learners.branches import Act, Offsets, play_on, play_to_the_end
+from ethbrake_marl.extensions.learners.recipes import ModesPlan
+from ethbrake_marl.extensions.search.templates import best_templates
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.policies.manifest import Float32s
+
+NO_DIFFERENCE = 1e-2  # of returns: two networks that differ by less do the same
+
+
+class Explored(NamedTuple):
+    """Worlds of the training, and the best that networks do in them."""
+
+    alert: Worlds
+    start: Moment  # at the first decision
+    gained: Floats  # [n] the highest return
+    harm: Floats  # [n] the least harm (m2/s2)
+
+
+class Shown(NamedTuple):
+    """What templates did at each decision, to be imitated."""
+
+    seen: Float32s  # [m, F]
+    action: Float32s  # [m]
+
+
+def explore(engine: Engine, plan: ModesPlan, acts: Sequence[Act], gamma: float) -> Explored:
+    """The first worlds of the training, each driven by every network from its start to its end."""
+    alert, start = engine.first_moments(plan.worlds)
+    gained, harm = np.full(plan.worlds, -np.inf), np.full(plan.worlds, np.inf)
+    for act in acts:
+        its_gain, its_harm = drive_from(engine, start, act, gamma)
+        gained, harm = np.fmax(gained, its_gain), np.fmin(harm, its_harm)
+    return Explored(alert, start, gained, harm)
+
+
+def drive_from(
+    engine: Engine, start: Moment, act: Act, gamma: float, count: HarmCount | None = None
+) -> tuple[Floats, Floats]:
+    """Return of the first learner [n], NaN for a row that could not be advanced, and harm of the world [n] (m2/s2).
+
+    The harm is of the reward's count unless another one is given.
+    """
+    rows = engine.branch(start)
+    nowhere = np.zeros(rows.n, np.int64)
+    gained, _ = play_to_the_end(rows, act, Offsets(nowhere, np.zeros(rows.n), nowhere), gamma)
+    return gained, rows.ledger.world_harm(engine.reward.harm_count if count is None else count)
+
+
+def show_templates(engine: Engine, plan: ModesPlan, found: Explored, gamma: float, seed: int) -> Shown:
+    """What the best template does in each world in which it gains more, by ``plan.gain``, than every network."""
+    (vehicle,) = engine.learners
+    problem = profile_problem(
+        found.alert,
+        [vehicle],
+        harm_count=engine.reward.harm_count,
+        horizon_s=engine.scenario.horizon_s,
+        time_step_s=engine.scenario.time_step_s,
+        others_mps2=found.start.wanted,
+    )
+    commands, steps = best_templates(problem, found.harm, number=plan.templates, seed=seed)
+    rows = np.flatnonzero(steps > 0)
+    worlds = found.alert.take(rows).vehicles
+    each = [command_to_action(commands[rows, t], worlds, vehicle) for t in range(commands.shape[1])]
+    actions = np.stack(each, axis=1)  # [rows, T]
+    seen_then: list[Observations] = []
+    where: list[Ints] = []
+
+    def decide(seen: Observations, some: Ints, number: int) -> Floats:
+        seen_then.append(seen[:, 0])
+        where.append(some)
+        wanted: Floats = actions[some, number][:, np.newaxis]
+        return wanted
+
+    gained = play_on(engine.branch(found.start.take(rows)), decide, gamma)[:, 0]
+    better: Bools = gained > found.gained[rows] + plan.gain
+    if not where:
+        return Shown(np.zeros((0, engine.observation.size), np.float32), np.zeros(0, np.float32))
+    wanted = np.concatenate([actions[some, number] for number, some in enumerate(where)]).astype(np.float32)
+    kept = better[np.concatenate(where)]
+    return Shown(np.concatenate(seen_then)[kept], wanted[kept])
+
+
+def own_worlds(engine: Engine, plan: ModesPlan, found: Explored, act: Act, gamma: float) -> Moment:
+    """The starts of the worlds in which ``act`` is at most ``plan.margin`` worse than the networks before it.
+
+    Those where it makes no difference are left out, and those where the networks before do no harm: they teach nothing.
+    """
+    gained, _ = drive_from(engine, found.start, act, gamma)
+    more = gained - found.gained
+    rows = np.flatnonzero((more > -plan.margin) & (np.abs(more) > NO_DIFFERENCE) & (found.harm > 0.0))
+    return found.start.take(rows)
+
+
+class NoOtherMode(EthBrakeError, ValueError):
+    """No template does better than the networks so far: there is no other mode to be learned."""

@@ -1,0 +1,62 @@
+"""The gating network of a mixture of experts: what it has learned, and the average that decides."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3.common.torch_layers import create_mlp
+from stable_baselines3.common.type_aliases import Schedule
+from torch import Tensor, nn
+
+from ethbrake_marl.extensions.learners.actors import adam
+from ethbrake_marl.extensions.learners.recipes import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.scout import Scout
+from ethbrake_marl.policies.manifest import Float32s
+from ethbrake_marl.training.networks import ACTIVATIONS
+
+
+class AveragedGate(nn.Module):
+    """A gate that learns (``learning``), and the running average of its weights (``average``), which decides.
+
+    It remembers the last decisions at which networks were compared: what was seen, and how much more than the best one
+    each of them costs.
+    """
+
+    seen: Tensor  # [M, F]
+    more: Tensor  # [M, K]
+    compared: Tensor  # [1] so far; the newest take the places of the oldest
+
+    def __init__(self, inputs: int, rate: Schedule, recipe: CounterfactualRecipe) -> None:
+        super().__init__()
+        plan = recipe.modes
+        assert plan is not None
+        layers = create_mlp(inputs, plan.networks, list(plan.gate), ACTIVATIONS[recipe.network.activation])
+        nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]  # until it learns, the first network acts
+        nn.init.zeros_(layers[-1].bias)  # type: ignore[arg-type]
+        self.average = nn.Sequential(*layers)
+        self.learning = copy.deepcopy(self.average)
+        self.scout = Scout(inputs) if recipe.focus > 0.0 else None
+        self.optimizer = adam(rate(1.0), self.learning, self.scout)
+        self.register_buffer("seen", torch.zeros(plan.gate_memory, inputs))
+        self.register_buffer("more", torch.zeros(plan.gate_memory, plan.networks))
+        self.register_buffer("compared", torch.zeros(1, dtype=torch.int64))
+
+    def remember(self, seen: Float32s, more: Float32s) -> None:
+        """Keep compared decisions."""
+        places = torch.arange(int(self.compared), int(self.compared) + len(seen)) % len(self.seen)
+        self.seen[places], self.more[places] = torch.from_numpy(seen), torch.from_numpy(more)
+        self.compared += len(seen)
+
+    def recall(self, count: int) -> tuple[Tensor, Tensor]:
+        """Some of the kept ones, [count, F] and [count, K]."""
+        some = torch.randint(min(int(self.compared), len(self.seen)), (count,))
+        return self.seen[some], self.more[some]
+
+    def choose(self, observation: Float32s) -> NDArray[np.int64]:
+        """Which network acts on each of the observations [rows, F], [rows]."""
+        with torch.no_grad():
+            chosen: NDArray[np.int64] = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
+        return chosen

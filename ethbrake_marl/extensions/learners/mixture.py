@@ -1,0 +1,173 @@
+"""The model that trains a mixture of experts: one expert alone, further ones, the gating network, then all together."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import torch
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.utils import update_learning_rate
+from torch.nn.functional import mse_loss, softplus
+
+from ethbrake_marl.env.engine import Moment
+from ethbrake_marl.env.sb3 import EthBrakeVecEnv
+from ethbrake_marl.extensions.learners.actors import (
+    AveragedActor,
+    Tried,
+    adam,
+    descend,
+    follow,
+    moving_rows,
+    other_count,
+)
+from ethbrake_marl.extensions.learners.branches import visit
+from ethbrake_marl.extensions.learners.explored import (
+    NoOtherMode,
+    Shown,
+    drive_from,
+    explore,
+    own_worlds,
+    show_templates,
+)
+from ethbrake_marl.extensions.learners.mixture_policy import ModesPolicy
+from ethbrake_marl.extensions.learners.recipes import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.scout import choose_rows
+from ethbrake_marl.extensions.learners.stages import Stage, stages_of
+from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
+from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.policies.manifest import Float32s
+
+
+class ModesModel(CounterfactualModel):
+    """Learns a network alone, further ones in the worlds of their own modes, the gate, and then all together."""
+
+    policy: ModesPolicy  # type: ignore[assignment]
+
+    def __init__(self, environment: EthBrakeVecEnv, recipe: CounterfactualRecipe) -> None:
+        assert recipe.modes is not None
+        self.plan = recipe.modes
+        self._stage: Stage | None = None
+        self._own: Moment | None = None  # starts of the worlds of the stage's network
+        self._rate_share = 1.0
+        super().__init__(environment, recipe)
+
+    def _update(self, told: BaseCallback, total: int) -> None:
+        each = self.n_envs * self.recipe.n_steps
+        number, policy = self.num_timesteps // each, self.policy
+        stage = next(s for s in stages_of(self.plan, -(-total // each)) if s.first <= number < s.end)
+        if stage != self._stage:
+            self._enter(stage, number)
+        member = policy.actors[stage.network]
+        if stage.does == "further":  # whole episodes in some of the stage's own worlds
+            assert self._own is not None
+            some = torch.randint(len(self._own.state), (self.n_envs,)).numpy()
+            found, moments = visit(self.engine.branch(self._own.take(some)), member.act)
+            seen = found.reshape(1, -1, found.shape[2])
+            self.num_timesteps += each
+        else:
+            seen, moments = self._visit(told, member.act if stage.does == "alone" else policy.act)
+        told.on_rollout_end()
+        self._update_current_progress_remaining(number - stage.first, stage.end - stage.first)
+        self._rate_share = self.plan.together_rate if stage.does == "together" else 1.0
+        if stage.does in ("alone", "further"):
+            self._train(member, self._try_out(seen, moments, member))
+            return
+        if stage.does == "together":  # each network on what was tried where the gate chooses it
+            tried = self._try_out(seen, moments, policy)
+            chosen = policy.gate.choose(tried.seen)
+            for k, actor in enumerate(policy.actors):
+                rows = np.flatnonzero(chosen == k)
+                if len(rows) > 1:
+                    self._train(actor, Tried(*(array[rows] for array in tried)))
+        self._train_gate(*self._compare(seen, moments))
+
+    def _update_learning_rate(self, optimizers: list[torch.optim.Optimizer] | torch.optim.Optimizer) -> None:
+        assert isinstance(optimizers, torch.optim.Optimizer)
+        rate = self._rate_share * self.lr_schedule(self._current_progress_remaining)
+        self.logger.record("train/learning_rate", rate)
+        update_learning_rate(optimizers, rate)
+
+    def _enter(self, stage: Stage, number: int) -> None:
+        """Prepare a stage. After a resume this finds the same again: it depends on finished networks alone."""
+        self._stage, self._own = stage, None
+        if stage.does != "further":
+            return
+        engine, gamma = self.engine, self.recipe.gamma
+        before = [actor.act for actor in self.policy.actors[: stage.network]]
+        found = explore(engine, self.plan, before, gamma)
+        seed = int(self.seed or 0)
+        shown = show_templates(engine, self.plan, found, gamma, seed)
+        pupil = copy.deepcopy(self.policy.actors[0])
+        self._imitate(pupil, shown, seed + stage.network)
+        self._own = own_worlds(engine, self.plan, found, pupil.act, gamma)
+        if len(shown.action) == 0 or len(self._own.state) == 0:
+            raise NoOtherMode(
+                f"modes: network {stage.network + 1}: in none of {self.plan.worlds:,} worlds did one of"
+                f" {self.plan.templates} templates do better by {self.plan.gain:g}; leave out modes, or have"
+                " fewer networks"
+            )
+        if number == stage.first:
+            self.policy.actors[stage.network].load_state_dict(pupil.state_dict())
+
+    def _imitate(self, pupil: AveragedActor, shown: Shown, seed: int) -> None:
+        """Teach a network what templates do."""
+        pupil.optimizer = adam(self.lr_schedule(1.0), pupil.learning)
+        seen, wanted = torch.from_numpy(shown.seen), torch.from_numpy(shown.action)
+        generator = torch.Generator().manual_seed(seed)
+        for _ in range(self.plan.imitation_epochs):
+            for batch in torch.split(torch.randperm(len(wanted), generator=generator), self.recipe.batch_size):
+                means, target = pupil.learning(seen[batch])[:, 0], wanted[batch]
+                reached = (target.abs() >= 1.0) & (means * target >= 1.0)  # beyond a bound it means the bound
+                loss = mse_loss(means, torch.where(reached, means.detach(), target))
+                descend(pupil.optimizer, loss)
+        follow(pupil.average, pupil.learning, 0.0)
+
+    def _compare(self, seen: Float32s, moments: Moment) -> tuple[Float32s, Floats, Float32s]:
+        """At some decisions: what is seen [B, F], what going on with each network costs [B, K], what each counts [B].
+
+        Where all networks would do the same now nothing depends on the choice: the gate is asked again at the next one.
+        """
+        engine, members = self.engine, [actor.act for actor in self.policy.actors]
+        observed = seen.reshape(-1, seen.shape[2])
+        actions = np.stack([act(observed) for act in members])
+        differ = (np.ptp(actions, axis=0) > 1e-2) & moving_rows(moments)
+        count, scout = self.plan.gate_states, self.policy.gate.scout
+        expect = None if scout is None else scout.expect
+        rows, importance = choose_rows(observed, np.flatnonzero(differ), count, self.recipe.focus, expect)
+        other = other_count(engine.reward.harm_count)
+        then = moments.take(rows)
+        costs = np.empty((len(rows), len(members)))
+        for number, act in enumerate(members):
+            gained, harm = drive_from(engine, then, act, self.recipe.gamma, other)
+            costs[:, number] = self.plan.tie_break * harm - gained
+        good = np.isfinite(costs).all(axis=1)
+        return observed[rows[good]], costs[good], importance[good]
+
+    def _train_gate(self, seen: Float32s, costs: Floats, importance: Float32s | None = None) -> None:
+        """Teach the gate which network costs least, each decision as much as the others would cost more."""
+        importance = np.ones(len(seen), np.float32) if importance is None else importance
+        gate = self.policy.gate
+        self._update_learning_rate(gate.optimizer)
+        more = (costs - costs.min(axis=1, keepdims=True)).astype(np.float32)
+        rows = np.flatnonzero(more.max(axis=1) > 1e-9)
+        gate.remember(seen[rows], more[rows] * importance[rows, np.newaxis])
+        if gate.scout is not None:
+            arrays = [torch.from_numpy(array) for array in (seen, more.max(axis=1), importance)]
+            for batch in torch.split(torch.randperm(len(seen)), self.recipe.batch_size):
+                descend(gate.optimizer, gate.scout.loss(*(array[batch] for array in arrays)))
+        if len(rows):
+            regret = np.take_along_axis(more[rows], gate.choose(seen[rows])[:, np.newaxis], axis=1)
+            self.logger.record("gate/regret", float((regret[:, 0] * importance[rows]).mean()))
+        if int(gate.compared) == 0:
+            return
+        losses = []
+        for _ in range(self.plan.gate_steps):
+            inputs, costlier = gate.recall(self.recipe.batch_size)
+            scores = gate.learning(inputs)
+            best = scores.gather(1, costlier.argmin(dim=1, keepdim=True))
+            loss = (costlier * softplus(scores - best)).sum(dim=1).mean()
+            descend(gate.optimizer, loss)
+            follow(gate.average.parameters(), gate.learning, self.recipe.averaging)
+            losses.append(loss.item())
+        self.logger.record("gate/loss", float(np.mean(losses)))

@@ -1,0 +1,52 @@
+"""A mixture of experts as one policy: several actors and a gating network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.spaces import Space, flatdim
+from numpy.typing import NDArray
+from stable_baselines3.common.type_aliases import Schedule
+from torch import Tensor, nn
+
+from ethbrake_marl.extensions.learners.actors import AveragedActor, Deterministic
+from ethbrake_marl.extensions.learners.gate import AveragedGate
+from ethbrake_marl.extensions.learners.recipes import CounterfactualRecipe
+from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.policies.manifest import Float32s
+
+
+class ModesPolicy(Deterministic):
+    """Several actors and a gate; under the names that ``NetworkSpec.tensors`` has for them."""
+
+    def __init__(
+        self, observation_space: Space[Any], action_space: Any, rate: Schedule, recipe: CounterfactualRecipe
+    ) -> None:
+        super().__init__(observation_space, action_space)
+        assert recipe.modes is not None
+        networks = range(recipe.modes.networks)
+        self.actors = [AveragedActor(observation_space, action_space, rate, recipe) for _ in networks]
+        self.members = nn.ModuleList(self.actors)
+        self.gate = AveragedGate(flatdim(observation_space), rate, recipe)
+
+    def _chosen(self, observation: Float32s, ask: Callable[[AveragedActor, Float32s], NDArray[Any]]) -> Floats:
+        """What the actors answer where the gate chooses them, [rows]."""
+        chosen, found = self.gate.choose(observation), np.empty(len(observation))
+        for number, actor in enumerate(self.actors):
+            rows = np.flatnonzero(chosen == number)
+            found[rows] = ask(actor, observation[rows])
+        return found
+
+    def means(self, observation: Float32s) -> Float32s:
+        return self._chosen(observation, AveragedActor.means).astype(np.float32)  # which they were
+
+    def expect(self, observation: Float32s) -> Floats:
+        return self._chosen(observation, AveragedActor.expect)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Actions [rows, 1] of the averages."""
+        chosen = self.gate.average(observation).argmax(dim=1, keepdim=True)
+        return torch.cat([actor(observation) for actor in self.actors], dim=1).gather(1, chosen)

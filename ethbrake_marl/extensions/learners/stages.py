@@ -1,0 +1,34 @@
+"""The stages of a training of several experts: which updates do what."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple
+
+from ethbrake_marl.extensions.learners.recipes import ModesPlan
+
+ROUNDING = 1e-6  # of sums of shares, in updates
+
+
+class Stage(NamedTuple):
+    """What a stretch of updates is for."""
+
+    does: Literal["alone", "further", "gate", "together"]
+    network: int  # that of ``further``
+    first: int  # update, from 0
+    end: int  # the first update after it
+
+
+def stages_of(plan: ModesPlan, updates: int) -> tuple[Stage, ...]:
+    """The stages of a training with so many updates, in order; some may be empty."""
+    shares, more = plan.shares, plan.networks - 1
+    parts: list[tuple[Literal["alone", "further", "gate", "together"], int, float]] = [("alone", 0, shares.alone)]
+    parts += [("further", k + 1, shares.further / more) for k in range(more)]
+    parts += [("gate", 0, shares.gate), ("together", 0, shares.together)]
+    found, done, first = [], 0.0, 0
+    for does, network, share in parts:
+        done += share
+        end = min(math.ceil(done * updates - ROUNDING), updates)
+        found.append(Stage(does, network, first, end))
+        first = end
+    return tuple(found)

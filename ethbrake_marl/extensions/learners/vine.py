@@ -1,0 +1,38 @@
+"""``vine``: gradients of the return from branches of the same moment, played on in two ways."""
+
+from __future__ import annotations
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from torch.optim import Optimizer
+
+from ethbrake_marl.env.sb3 import EthBrakeVecEnv
+from ethbrake_marl.extensions.learners.actors import widened
+from ethbrake_marl.extensions.learners.mixture import ModesModel
+from ethbrake_marl.extensions.learners.recipes import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
+from ethbrake_marl.policies.shipped import load_named_policy
+from ethbrake_marl.training.run_folder import Algorithm, Training
+
+
+class Counterfactual(Algorithm):
+    """Gradients of the return by playing on from the same moment in two ways; one actor for all learners."""
+
+    def build(self, training: Training, environment: EthBrakeVecEnv) -> CounterfactualModel:
+        """The model, from the policy of the training's ``start`` if it has one."""
+        recipe = training.recipe
+        assert isinstance(recipe, CounterfactualRecipe)
+        environment.engine.branch(environment.engine.moment())  # refuses what cannot be branched before it begins
+        model = (CounterfactualModel if recipe.modes is None else ModesModel)(environment, recipe)
+        if training.start is not None:
+            kind, _, path = training.start.partition("@")
+            policy = load_named_policy(path, kind, training.scenario, recipe.reward.harm_count)
+            first = model.policy.actors[0] if isinstance(model, ModesModel) else model.policy
+            first.take_over(widened(policy, training))
+        return model
+
+    def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
+        """The optimiser of the actor, or that of each network and of the gate."""
+        if not isinstance(model, ModesModel):
+            return {"policy": model.policy.optimizer}
+        members = {f"network_{k + 1}": actor.optimizer for k, actor in enumerate(model.policy.actors)}
+        return {**members, "gate": model.policy.gate.optimizer}

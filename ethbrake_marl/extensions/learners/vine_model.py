@@ -1,0 +1,164 @@
+"""The model of ``vine``: it visits decisions, tries some in two ways, and learns from all of them."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any, Self
+
+import numpy as np
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import MaybeCallback
+from torch import Tensor
+
+from ethbrake_marl.env.engine import Moment
+from ethbrake_marl.env.sb3 import EthBrakeVecEnv
+from ethbrake_marl.extensions.learners.actors import (
+    CUT,
+    REMEMBERED,
+    Adam,
+    AveragedActor,
+    Deterministic,
+    Tried,
+    descend,
+    follow,
+    limit_that_cuts,
+    moving_rows,
+    smallest_offset,
+    trusted_targets,
+)
+from ethbrake_marl.extensions.learners.branches import Act, Offsets, play_to_the_end
+from ethbrake_marl.extensions.learners.mixture_policy import ModesPolicy
+from ethbrake_marl.extensions.learners.recipes import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.scout import choose_rows
+from ethbrake_marl.physics.state import Floats, Ints
+from ethbrake_marl.policies.manifest import Float32s
+
+for _name in ("step", "add_param_group", "zero_grad", "state_dict", "load_state_dict"):
+    setattr(Adam, _name, torch.no_grad()(inspect.unwrap(getattr(torch.optim.Adam, _name))))
+
+
+class CounterfactualModel(BaseAlgorithm):
+    """Visits decisions by its deterministic actor, tries some of them in two ways, and learns from the difference."""
+
+    policy: AveragedActor
+
+    def __init__(self, environment: EthBrakeVecEnv, recipe: CounterfactualRecipe) -> None:
+        super().__init__(
+            AveragedActor,
+            environment,
+            stats_window_size=max(100, environment.num_envs),
+            device="cpu",
+            support_multi_env=True,
+            learning_rate=recipe.learning_rate.at,
+            seed=recipe.seed,
+        )
+        self.recipe, self.rows, self.engine = recipe, environment, environment.engine
+        self._setup_model()
+
+    def _setup_model(self) -> None:
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        kind: Any = AveragedActor if self.recipe.modes is None else ModesPolicy
+        self.policy = kind(self.observation_space, self.action_space, self.lr_schedule, self.recipe)
+        if self.recipe.gradient_limit == "auto":  # a checkpoint keeps it with the policy's weights
+            self.policy.register_buffer("measured", torch.zeros(REMEMBERED, 2, dtype=torch.float64))
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "counterfactual",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """Train for so many decisions of learners."""
+        total, told = self._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        told.on_training_start(locals(), globals())
+        while self.num_timesteps < total:
+            told.on_rollout_start()
+            self._update(told, total)
+        told.on_training_end()
+        return self
+
+    def _update(self, told: BaseCallback, total: int) -> None:
+        """One round of collecting and learning."""
+        actor = self.policy
+        seen, moments = self._visit(told, actor.act)
+        told.on_rollout_end()
+        self._update_current_progress_remaining(self.num_timesteps, total)
+        self._train(actor, self._try_out(seen, moments, actor))
+
+    def _visit(self, told: BaseCallback, act: Act) -> tuple[Float32s, Moment]:
+        """Drive on for ``n_steps``; what was seen [n_steps, rows, F], and the worlds' moments, step by step."""
+        seen, moments, numbers = [], [], []
+        for _ in range(self.recipe.n_steps):
+            observations: Any = self._last_obs
+            seen.append(observations)
+            numbers.append(self.engine.roster.numbers.copy())
+            moments.append(self.engine.moment())
+            new_obs, rewards, dones, infos = self.rows.step(act(observations)[:, np.newaxis])
+            self.num_timesteps += self.n_envs
+            self._update_info_buffer([infos[row] for row in np.flatnonzero(dones)], dones[dones])  # others tell nothing
+            self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]
+            told.update_locals(locals())
+            told.on_step()
+        self._numbers = np.concatenate(numbers)  # of those worlds in the training
+        return np.stack(seen), Moment.join(moments)
+
+    def _try_out(self, seen: Float32s, moments: Moment, actor: Deterministic) -> Tried:
+        """Try some of the visited decisions with more and with less, each to the end of its episode."""
+        recipe, learners = self.recipe, len(self.engine.learners)
+        moving = np.flatnonzero(moving_rows(moments).repeat(learners))
+        observed = seen.reshape(-1, seen.shape[2])
+        rows, importance = choose_rows(observed, moving, recipe.counterfactuals, recipe.focus, actor.expect)
+        least, most = recipe.offset.smallest, recipe.offset.largest
+        memory: Tensor | None = getattr(self.policy, "measured", None)  # where the limit is auto
+        if memory is not None:
+            least = smallest_offset(memory.numpy(), least, most)
+        sizes: Floats = least * (most / least) ** torch.rand(len(rows), dtype=torch.float64).numpy()
+        holds = np.array(recipe.holds, np.int64)[torch.randint(len(recipe.holds), (len(rows),)).numpy()]
+        worlds: Ints = np.tile(rows // learners, 2)
+        engine = self.engine.branch(moments.take(worlds))
+        offsets = Offsets(np.tile(rows % learners, 2), np.concatenate([sizes, -sizes]), np.tile(holds, 2))
+        gained, moved = (np.split(each, 2) for each in play_to_the_end(engine, actor.act, offsets, recipe.gamma))
+        measured = (gained[0] - gained[1]) / (moved[0] - moved[1])
+        good = np.isfinite(measured)
+        limit = recipe.gradient_limit
+        if memory is not None:
+            new = torch.from_numpy(np.stack([np.abs(measured[good]), sizes[good]], axis=1))
+            memory.copy_(torch.cat([memory, new])[-len(memory) :])
+            limit = limit_that_cuts(memory[:, 0].numpy(), CUT)
+            self.logger.record("train/gradient_limit", limit)
+            self.logger.record("train/smallest_offset", least)
+        assert limit != "auto"
+        gradient = np.clip(measured, -limit, limit)
+        whole = float(np.abs(measured[good]).sum())
+        self.logger.record("train/gradient_cut", 1.0 - float(np.abs(gradient[good]).sum()) / whole if whole else 0.0)
+        then = observed[rows[good]]
+        return Tried(then, actor.means(then), gradient[good].astype(np.float32), importance[good])
+
+    def _train(self, actor: AveragedActor, tried: Tried) -> None:
+        """Regress the actor on actions that are better, within the trust radius; log what that was."""
+        recipe = self.recipe
+        self._update_learning_rate(actor.optimizer)
+        target, weight = trusted_targets(tried, recipe.trust_radius, recipe.anchor)
+        arrays = (tried.seen, target, weight * tried.importance, np.abs(tried.gradient), tried.importance)
+        seen, wanted, weights, sizes, importance = (torch.from_numpy(array) for array in arrays)
+        losses = []
+        for _ in range(recipe.n_epochs):
+            for batch in torch.split(torch.randperm(len(wanted)), recipe.batch_size):
+                means = actor.learning(seen[batch])[:, 0]
+                loss = (weights[batch] * (means - wanted[batch]) ** 2).mean()
+                found = [loss]
+                if actor.scout is not None:
+                    found.append(actor.scout.loss(seen[batch], sizes[batch], importance[batch]))
+                descend(actor.optimizer, *found)
+                follow(actor.average, actor.learning, recipe.averaging)
+                losses.append(loss.item())
+        self._n_updates += recipe.n_epochs
+        self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
+        self.logger.record("train/gradient", float(np.abs(tried.gradient).mean()) if len(wanted) else 0.0)
+        self.logger.record("train/counterfactuals", len(wanted))

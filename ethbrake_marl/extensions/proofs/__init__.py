@@ -1,0 +1,1 @@
+"""What nobody can avoid: proven bounds on harm, whatever the controlled vehicle does."""

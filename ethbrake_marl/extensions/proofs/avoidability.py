@@ -1,0 +1,310 @@
+"""Compiled decision of one world: the largest trajectory behind the front vehicle, and whether the rear one meets it.
+
+Symbols: l the front vehicle (leader), f the controlled one (follower), r the rear one; gap [m], speed v [m/s],
+braking capacity a > 0, driving capacity u >= 0 [m/s2]. Times count from the moment at which the controlled vehicle
+may act; by then the leader brakes. docs/avoidability.md derives every formula. Only + - * / and sqrt.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.extensions.proofs.plans import empty_plan, fill_braking, fill_plan, time_to_limit, walk
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.motion import BOUND, solo_motion, stopping_distances
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+
+ROUNDING_M = 1e-12  # an overlap up to this is the rounding of a touch, not an impact
+
+SQUEEZE_M = 1e-9  # with less room than this between both neighbours, contact counts as unavoidable
+
+TOUCHING_M = 1e-5  # the same where the front vehicle cannot but be touched: a touch may cost that much of the way
+
+AVOIDABLE, EARLY, FRONT, REAR = 0, 1, 2, 3
+
+REASON, MARGIN, SPARE, DRIVE, TOUCH, FOLLOW, RESULT_WIDTH = range(7)  # columns of a decision
+
+
+@compiled
+def spare_gap(gap: float, v_l: float, a_l: float, v_f: float, a_f: float) -> float:
+    """Gap beyond what full braking from now needs to stay behind a leader that brakes from now; negative: they meet.
+
+    If the follower stops last, its stopping distance counts, else the moment of equal speeds. [m]
+    """
+    if v_f * a_l >= v_l * a_f:
+        return gap - max(0.0, v_f * v_f / (2.0 * a_f) - v_l * v_l / (2.0 * a_l))
+    if v_f > v_l:
+        return gap - (v_f - v_l) * (v_f - v_l) / (2.0 * (a_f - a_l))
+    return gap
+
+
+@compiled
+def drive_before_braking(
+    gap: float, v_l: float, a_l: float, v_f: float, a_f: float, u: float
+) -> tuple[float, float, bool]:
+    """Longest drive with constant ``u >= 0`` after which full braking still stays behind the braking leader.
+
+    Returns its duration, the time of the touch, and whether both move there (then ``a_f > a_l``, equal speeds; else the
+    follower comes to rest at the standing leader). Infinite where the follower never moves. Assumes ``spare_gap >= 0``.
+    """
+    w, closing, relief = v_f - v_l, u + a_l, a_f - a_l
+    if relief > 0.0 and v_l > 0.0:
+        both = u + a_f
+        root = math.sqrt(both * relief * (w * w + 2.0 * closing * gap))
+        if w > 0.0:
+            drive = max(2.0 * relief * gap - w * w, 0.0) / (w * both + root)
+        else:
+            drive = (root - w * both) / (closing * both)
+        touch = drive + (w + closing * drive) / relief
+        if touch * a_l <= v_l:
+            return drive, touch, True
+    ratio = 1.0 + u / a_f
+    room = max(v_l * v_l / (2.0 * a_l) + gap - v_f * v_f / (2.0 * a_f), 0.0)
+    pace = ratio * v_f + math.sqrt(ratio * ratio * v_f * v_f + 2.0 * u * ratio * room)
+    if v_f == 0.0 and u == 0.0:
+        return math.inf, math.inf, False
+    drive = 2.0 * room / pace if room > 0.0 else 0.0
+    return drive, drive + (v_f + u * drive) / a_f, False
+
+
+@compiled
+def largest_behind(
+    gap: float, v_l: float, a_l: float, v_f: float, a_f: float, u: float, limit: float
+) -> tuple[float, float, bool]:
+    """As ``drive_before_braking``, for a drive that ends at the speed limit."""
+    cap = time_to_limit(v_f, u, limit)
+    if cap > 0.0:
+        found = drive_before_braking(gap, v_l, a_l, v_f, a_f, u)
+        if found[0] <= cap:
+            return found
+        after_l, way_l, _ = solo_motion(v_l, -a_l, 0.0, math.inf, cap)
+        gap = gap + (way_l - 0.5 * (v_f + limit) * cap)
+        v_l, v_f = after_l, limit
+    drive, touch, moving = drive_before_braking(gap, v_l, a_l, v_f, a_f, 0.0)
+    return cap + drive, cap + touch, moving
+
+
+@compiled
+def lowest_while_coasting(gap: float, v_f: float, v_r: float, a_r: float, onset_r: float, until: float) -> float:
+    """Smallest gap behind a vehicle that coasts until then. The gap is convex: at equal speeds or at an end. [m]"""
+    w = v_r - v_f
+    if w <= 0.0:
+        return gap
+    if onset_r + w / a_r < until:
+        return gap - w * onset_r - w * w / (2.0 * a_r)
+    return gap + v_f * until - solo_motion(v_r, -a_r, onset_r, math.inf, until)[1]
+
+
+@compiled
+def met(gap: float, closing: float) -> bool:
+    """Whether a pair with this gap and closing speed has met, or meets at this very moment, with an impact."""
+    return gap < -ROUNDING_M or (gap <= 0.0 and closing > BOUND.TOUCH_SPEED_MPS)
+
+
+@compiled
+def leader_at_onset(
+    gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, start: float
+) -> tuple[float, float]:
+    """Gap to the leader and its speed when the follower, coasting until then, may act; the leader brakes by then.
+
+    The gap is concave until then: if it is not negative at the end, it never was.
+    """
+    after, way, _ = solo_motion(v_l, -a_l, onset_l, math.inf, start)
+    return gap + (way - v_f * start), after
+
+
+@compiled
+def decide_front(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: int, out: Floats) -> bool:
+    """The front pair of vehicle ``i``: False if it surely meets. REASON, MARGIN and SPARE in ``out``; no drive yet."""
+    a_l, v_f, a_f = braking[i - 1], speed[i], braking[i]
+    ahead, v_l = leader_at_onset(gap[i - 1], speed[i - 1], a_l, onset[i - 1], v_f, onset[i])
+    out[REASON], out[MARGIN] = EARLY, ahead
+    if met(ahead, v_f - v_l):
+        return False
+    spare = spare_gap(max(ahead, 0.0), v_l, a_l, v_f, a_f)
+    out[REASON], out[MARGIN], out[SPARE], out[DRIVE] = FRONT, spare, max(spare, 0.0), 0.0
+    if spare < -ROUNDING_M:
+        return False
+    out[REASON] = AVOIDABLE
+    return True
+
+
+@compiled
+def plan_behind(
+    gap: Floats, speed: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, keep: float,
+    plan: Floats, out: Floats,
+) -> None:  # fmt: skip
+    """The largest trajectory that keeps ``keep`` metres to the leader, if there is one, into ``plan`` and ``out``."""
+    a_f, u = braking[i], driving[i]
+    if i > 0:
+        a_l = braking[i - 1]
+        ahead, v_l = leader_at_onset(gap[i - 1], speed[i - 1], a_l, onset[i - 1], speed[i], onset[i])
+        ahead = max(ahead - keep, 0.0)
+        out[DRIVE], out[TOUCH], moving = largest_behind(ahead, v_l, a_l, speed[i], a_f, u, limit[i])
+        out[FOLLOW] = -a_l if moving else -a_f
+    cap = min(time_to_limit(speed[i], u, limit[i]), out[DRIVE])
+    fill_plan(plan, cap, u, out[DRIVE], 0.0, out[TOUCH], -a_f, out[FOLLOW])
+
+
+@compiled
+def meets_rear_early(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: int, out: Floats) -> bool:
+    """Whether the rear pair of vehicle ``i`` meets before the vehicle may act; then the reason is in ``out``."""
+    v_f, v_r, a_r, start = speed[i], speed[i + 1], braking[i + 1], onset[i]
+    lowest = lowest_while_coasting(gap[i], v_f, v_r, a_r, onset[i + 1], start)
+    after, way, _ = solo_motion(v_r, -a_r, onset[i + 1], math.inf, start)
+    if met(lowest, 0.0) or met(gap[i] + (v_f * start - way), after - v_f):
+        out[REASON], out[MARGIN] = EARLY, lowest
+        return True
+    return False
+
+
+@compiled
+def decide_world(
+    gap: Floats, speed: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, plan: Floats,
+    rear: Floats, out: Floats,
+) -> None:  # fmt: skip
+    """Decide one world into ``out`` [RESULT_WIDTH]; plan and rear are scratch. Times count from the onset of ``i``."""
+    out[REASON], out[MARGIN], out[SPARE] = AVOIDABLE, math.inf, math.inf
+    out[DRIVE], out[TOUCH], out[FOLLOW] = math.inf, math.inf, -braking[i]
+    has_rear = i < gap.shape[0]
+    if i > 0 and not decide_front(gap, speed, onset, braking, i, out) and out[REASON] == EARLY:
+        return
+    if has_rear and meets_rear_early(gap, speed, onset, braking, i, out):
+        return
+    if has_rear and out[REASON] == AVOIDABLE:
+        # whether the rear vehicle stays behind the largest trajectory of vehicle i
+        v_f, a_r, start = speed[i], braking[i + 1], onset[i]
+        v_r, way, _ = solo_motion(speed[i + 1], -a_r, onset[i + 1], math.inf, start)
+        behind = max(gap[i] + (v_f * start - way), 0.0)
+        onset_r = max(onset[i + 1] - start, 0.0)
+        fill_braking(rear, onset_r, a_r)
+        plan_behind(gap, speed, onset, braking, driving, limit, i, 0.0, plan, out)
+        margin = walk(behind, v_f, plan, v_r, rear, onset_r + v_r / a_r)[0]
+        out[MARGIN] = margin
+        if margin < -ROUNDING_M:
+            out[REASON] = REAR
+        elif i > 0:
+            if behind > SQUEEZE_M and margin < (SQUEEZE_M if out[SPARE] >= SQUEEZE_M else TOUCHING_M):
+                out[REASON] = REAR
+            keep = 0.5 * min(SQUEEZE_M, out[SPARE], max(margin, 0.0))
+            plan_behind(gap, speed, onset, braking, driving, limit, i, keep, plan, out)
+
+
+@compiled
+def decide_worlds(
+    gaps: Floats, speeds: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, out: Floats
+) -> None:
+    """Decide every world into ``out`` [n, RESULT_WIDTH]."""
+    plan, rear = empty_plan(), empty_plan()
+    for k in range(gaps.shape[0]):
+        decide_world(gaps[k], speeds[k], onset[k], braking[k], driving[k], limit[k], i, plan, rear, out[k])
+
+
+REASONS = ("", "early", "front", "rear")  # the name of each code; "" where contact is avoidable
+
+
+@dataclass(frozen=True, slots=True)
+class Avoidability:
+    """The verdict on each world [n].
+
+    ``reason``: 0 avoidable; 1 early, a pair meets before the controlled vehicle may act; 2 front, even full braking
+    meets the front vehicle; 3 rear, the rear vehicle meets the largest trajectory that spares the front one.
+
+    ``margin_m``: the smallest gap between that trajectory and the rear vehicle (of two vehicles with the rear one
+    controlled: what full braking leaves of the gap). Where contact is unavoidable it is negative and says by how much:
+    for *front* the gap that full braking lacks, for *early* the overlap before the vehicle may act.
+
+    ``switch_s``, ``command_mps2``: the witness, a profile of the controlled vehicle: each command from its absolute
+    time to the next (infinite: never). Played in the physics it has no impact. NaN where contact is unavoidable.
+    """
+
+    reason: Ints
+    margin_m: Floats
+    switch_s: Floats  # [n, 3]
+    command_mps2: Floats  # [n, 3]
+
+    @property
+    def avoidable(self) -> Bools:
+        """Whether some profile avoids all contact, hence every impact, [n]."""
+        return np.asarray(self.reason == 0, np.bool_)
+
+    @property
+    def reason_name(self) -> NDArray[np.str_]:
+        """The reason in words, [n]: one of ``REASONS``."""
+        return np.array(REASONS)[self.reason]
+
+
+def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str] | None = None) -> Avoidability:
+    """Decide in every world whether ``vehicle`` (index from 0) could have avoided all contact from now on.
+
+    Elsewhere every profile leads to contact, but not always to an impact: see ``LowerBound.impact_proven``.
+    Three vehicles with the middle one controlled, or two with either. The others brake with their whole capacity from
+    their latencies on. ``scripts`` (index -> name, as ``Scenario.roles``) is only checked to say the same. An overlap
+    of the deciding trajectories of up to 1e-12 m counts as a touch, hence as avoided.
+
+    Raises ``InvalidInput`` for another line, another script than full_brake, a front vehicle that may brake only after
+    the controlled one acts, a vehicle that moves backward, or an obstacle (``obstacle_gap_m``) that vehicle_1 could
+    reach before any contact.
+    """
+    worlds.refuse_build_up("avoidability")
+    check_covered(worlds, vehicle, scripts)
+    v = worlds.vehicles
+    onset = np.maximum(v.latency_s - worlds.time_s[:, None], 0.0)
+    out = np.empty((worlds.n, RESULT_WIDTH))
+    decide_worlds(
+        worlds.gaps_m, worlds.speeds_mps, onset, v.braking_capacity_mps2, v.driving_capacity_mps2, v.speed_limit_mps,
+        vehicle, out,
+    )  # fmt: skip
+    reason = out[:, REASON].astype(np.int64)
+    start = worlds.time_s + onset[:, vehicle]
+    switch = np.column_stack([worlds.time_s, start + out[:, DRIVE], start + out[:, TOUCH]])
+    braking = -v.braking_capacity_mps2[:, vehicle]
+    command = np.column_stack([v.driving_capacity_mps2[:, vehicle], braking, out[:, FOLLOW]])
+    switch[reason > 0] = np.nan
+    command[reason > 0] = np.nan
+    return Avoidability(reason, out[:, MARGIN].copy(), switch, command)
+
+
+def check_covered(worlds: Worlds, vehicle: int, scripts: Mapping[int, str] | None) -> None:
+    """Raise ``InvalidInput`` for what ``avoidability`` does not cover, but for brakes that build up."""
+    # An obstacle that Vehicle 1 cannot reach by braking fully changes nothing: only a push could bring it there, and
+    # that is an impact already.
+    check_whole_number("avoidability: vehicle", vehicle, 0, worlds.N - 1)
+    own = np.maximum(worlds.vehicles.latency_s[:, 0] - worlds.time_s, 0.0)
+    v = worlds.vehicles
+    way = stopping_distances(worlds.speeds_mps[:, 0], own, v.braking_capacity_mps2[:, 0], v.brake_rate_mps3[:, 0])
+    _refuse(
+        ~(way < worlds.obstacle_gap_m),
+        worlds.obstacle_gap_m,
+        "obstacle_gap_m",
+        None,
+        "beyond full braking of vehicle_1",
+    )
+    if vehicle == 0 and np.isfinite(worlds.obstacle_gap_m).any():
+        raise InvalidInput("avoidability: vehicle_1 controlled, with an obstacle ahead (obstacle_gap_m): not decided")
+    if (worlds.N, vehicle) not in ((3, 1), (2, 0), (2, 1)):
+        raise InvalidInput(
+            f"avoidability: vehicle_{vehicle + 1} of {worlds.N} vehicles; it is decided for vehicle_2 of 3 and for"
+            " either vehicle of 2"
+        )
+    for index, script in (scripts or {}).items():
+        if index != vehicle and script != "full_brake":
+            raise InvalidInput(f"avoidability: vehicle_{index + 1} follows {script!r}; must be 'full_brake'")
+    if vehicle == 1:
+        latency = np.maximum(worlds.vehicles.latency_s, worlds.time_s[:, None])
+        _refuse(latency[:, 0] > latency[:, 1], worlds.vehicles.latency_s[:, 0], "latency_s", 0, "not above vehicle_2's")
+    for i in range(worlds.N):
+        _refuse(~(worlds.speeds_mps[:, i] >= 0.0), worlds.speeds_mps[:, i], "speeds_mps", i, ">= 0")
+
+
+def _refuse(bad: Bools, values: Floats, name: str, i: int | None, right: str) -> None:
+    if bad.any():
+        k = int(np.argmax(bad))
+        place = f"{k}" if i is None else f"{k}, {i}"
+        raise InvalidInput(f"avoidability: {name}[{place}] = {values[k]:g}: must be {right}")

@@ -1,0 +1,208 @@
+"""Compiled: the least harm over all first meetings with one neighbour, by branch and bound.
+
+A meeting is a time and a closing speed. What it costs is its own closing speed squared and what must follow
+(``aftermath``). Cells of time and closing speed are halved until their bounds come close to the best meeting seen.
+docs/avoidability.md has the proof.
+"""
+
+from __future__ import annotations
+
+import math
+
+from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, LINE, RAMPED_FRONT, follower, leader
+from ethbrake_marl.extensions.proofs.meetings import gentlest
+from ethbrake_marl.extensions.proofs.obstacle import CELL, after, after_at_obstacle
+from ethbrake_marl.extensions.proofs.ramped_meetings import gentlest_ramped_between
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Floats
+
+CELLS = 600  # room on the heap: after that many divisions a minimum stays as loose as it is
+
+# columns of a heap, of a cell of meetings: bound; times (s); closing speeds (m/s); of meetings behind also how much
+# further the rear vehicle has come (m)
+HARM, EARLY, LATE, SOFT, HARD, NEAR, FAR, HEAP_WIDTH = range(8)
+
+_SPLITS = 64  # parts at most into which decisions divide the times
+
+_PART_S = 0.05  # of the times where brakes build up
+
+_TRIED = 8  # meetings tried before the search, to have something to compare with
+
+
+@compiled(apart=True)
+def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
+    """Least closing speed of the meetings between two times.
+
+    It falls with the time, but for a leader that brakes harder than the controlled vehicle: it may then rise by the
+    difference.
+    """
+    if kind >= RAMPED_FRONT:
+        return gentlest_ramped_between(kind, at, early, late)
+    least = gentlest(kind, at, late)[0]
+    if kind == FRONT_FIRST and at[LINE.A_L] > at[LINE.A_F] and early * at[LINE.A_L] < at[LINE.V_L]:
+        least -= (at[LINE.A_L] - at[LINE.A_F]) * (late - early)
+    return max(least, 0.0)
+
+
+@compiled
+def decision_around(at: Floats, early: float, late: float) -> tuple[float, float]:
+    """Start and end of the step that holds these times; both ``late`` without decisions or over more than one."""
+    step = at[LINE.TIME_STEP]
+    if step <= 0.0:
+        return late, late
+    begin = math.floor(0.5 * (early + late) / step) * step
+    if early < begin - 1e-9 or late > begin + step + 1e-9:
+        return late, late
+    return begin, begin + step
+
+
+@compiled(apart=True)
+def lacking(kind: int, at: Floats, early: float, late: float, softest: float, hard: float, begin: float) -> float:
+    """How much the command in force at the meetings of a cell lacks, at least, of the extreme one that follows best.
+
+    To meet gently the vehicle brakes (drives) before a meeting, and to soften what follows it drives (brakes) after it;
+    the command is one and the same in the whole step. Meetings of at most ``hard``, where ``softest`` is the least.
+    """
+    whole = at[LINE.U_F] + at[LINE.A_F]
+    turn = gentlest(kind, at, early)[1]
+    if early <= begin:
+        return 0.0
+    if kind == FRONT_FIRST:
+        if leader(at, early)[0] + hard >= at[LINE.LIMIT_F]:
+            return 0.0
+    elif follower(at, late)[0] <= hard:
+        return 0.0
+    softer = max(hard - softest, 0.0) / (early - begin)
+    if turn >= begin:
+        share = (turn - begin) / (early - begin)
+        return float(max(whole - 2.0 * softer - whole * share * share, 0.0))
+    steep = (late - begin) / (begin - turn)
+    return float(max(whole - softer * (1.0 + steep) / (1.0 + 0.5 * steep), 0.0))
+
+
+@compiled(apart=True)
+def harm_of(
+    kind: int, at: Floats, early: float, late: float, soft: float, hard: float, floor: float, plan: Floats,
+    other: Floats,
+) -> float:  # fmt: skip
+    """Lower bound of the harm of the meetings of a cell."""
+    begin, end = decision_around(at, early, late)
+    lack = 0.0
+    if end > late:
+        lack = lacking(kind, at, early, late, gentlest_between(kind, at, early, late), hard, begin)
+    follows = after(kind, at, early, late, hard, max(end, late), lack, plan, other)
+    follows = max(follows, floor)
+    if kind == FRONT_FIRST:
+        follows = after_at_obstacle(at, early, late, soft, hard, follows, plan, other)
+    return soft * soft + follows
+
+
+@compiled
+def room_for(heap: Floats, count: int, harm: float) -> int:
+    """Make room on the heap, whose first cell is the one of least harm, for a cell of this one; its place."""
+    at = count
+    while at > 0 and heap[(at - 1) // 2, HARM] > harm:
+        for c in range(heap.shape[1]):  # numba compiles the copy of a row with the text of an error, for 3 CPU-s
+            heap[at, c] = heap[(at - 1) // 2, c]
+        at = (at - 1) // 2
+    heap[at, HARM] = harm
+    return at
+
+
+@compiled(apart=True)
+def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: float, hard: float) -> int:
+    """Put a cell on the heap; the new number of cells."""
+    at = room_for(heap, count, harm)
+    heap[at, EARLY], heap[at, LATE], heap[at, SOFT], heap[at, HARD] = early, late, soft, hard
+    return count + 1
+
+
+@compiled(apart=True)
+def drop_first(heap: Floats, count: int) -> int:
+    """Take the first cell off the heap; the new number of cells."""
+    count -= 1
+    at, below = 0, 1
+    while below < count:
+        if below + 1 < count and heap[below + 1, HARM] < heap[below, HARM]:
+            below += 1
+        if heap[below, HARM] >= heap[count, HARM]:
+            break
+        for c in range(heap.shape[1]):
+            heap[at, c] = heap[below, c]
+        at, below = below, 2 * below + 1
+    for c in range(heap.shape[1]):
+        heap[at, c] = heap[count, c]
+    return count
+
+
+@compiled(apart=True)
+def divide(
+    kind: int, at: Floats, floor: float, count: int, plan: Floats, other: Floats, heap: Floats
+) -> tuple[int, float]:
+    """Replace the first cell of the heap by its halves; their number, and the harm of a meeting within."""
+    harm, early, late, soft, hard = (heap[0, HARM], heap[0, EARLY], heap[0, LATE], heap[0, SOFT], heap[0, HARD])
+    count = drop_first(heap, count)
+    middle = 0.5 * (early + late)
+    if (late - early) * (at[LINE.U_F] + at[LINE.A_F] + at[LINE.A_L]) > hard - soft and early < middle < late:
+        closing = max(soft, gentlest(kind, at, middle)[0])
+        met = harm_of(kind, at, middle, middle, closing, closing, floor, plan, other)
+        later = max(soft, gentlest_between(kind, at, middle, late)) if kind >= RAMPED_FRONT else soft
+        if later < hard:
+            least = harm_of(kind, at, middle, late, later, hard, floor, plan, other)
+            count = put(heap, count, max(least, harm), middle, late, later, hard)
+        soft, late = max(soft, gentlest_between(kind, at, early, middle)), middle
+    else:
+        middle = 0.5 * (soft + hard)
+        met = harm_of(kind, at, late, late, middle, middle, floor, plan, other)
+        least = harm_of(kind, at, early, late, middle, hard, floor, plan, other)
+        count = put(heap, count, max(least, harm), early, late, middle, hard)
+        hard = middle
+    if soft < hard:
+        least = harm_of(kind, at, early, late, soft, hard, floor, plan, other)
+        count = put(heap, count, max(least, harm), early, late, soft, hard)
+    return count, met
+
+
+@compiled(apart=True)
+def least_harm(
+    kind: int, at: Floats, first: float, last: float, floor: float, best: float, enough: float, plan: Floats,
+    other: Floats, heap: Floats,
+) -> float:  # fmt: skip
+    """Lower bound of the harm of all meetings between two times; ``best`` if none does less than that.
+
+    ``enough`` is proven without it: where some meeting does no more, 0 is returned at once.
+    """
+    for k in range(_TRIED):
+        time = first + (last - first) * k / (_TRIED - 1)
+        closing = gentlest(kind, at, time)[0]
+        best = min(best, harm_of(kind, at, time, time, closing, closing, floor, plan, other))
+    # the meetings between both times, at most ``hard``, on the heap: one cell for each step
+    hard = math.sqrt(best)
+    count, begin = 0, first
+    while begin < last:
+        until = next_split(kind, at, begin, last) if count < _SPLITS else last
+        soft = gentlest_between(kind, at, begin, until)
+        if soft < hard:
+            harm = harm_of(kind, at, begin, until, soft, hard, floor, plan, other)
+            count = put(heap, count, harm, begin, until, soft, hard)
+        begin = until
+    for _ in range(heap.shape[0] - _SPLITS - 2):
+        if best <= enough or count == 0 or heap[0, HARM] >= best - CELL * (1.0 + best):
+            break
+        count, met = divide(kind, at, floor, count, plan, other, heap)
+        best = min(best, met)
+    if best <= enough:
+        return 0.0
+    return min(best, heap[0, HARM]) if count > 0 else best
+
+
+@compiled
+def next_split(kind: int, at: Floats, time: float, last: float) -> float:
+    """The next time at which a decision falls or the leader comes to rest, at most ``last``."""
+    until = last if kind < RAMPED_FRONT else min(last, time + _PART_S)
+    if at[LINE.TIME_STEP] > 0.0:
+        until = min(until, (math.floor(time / at[LINE.TIME_STEP] + 1e-6) + 1.0) * at[LINE.TIME_STEP])
+    stand = at[LINE.V_L] / at[LINE.A_L]
+    if kind == FRONT_FIRST and time < stand:
+        until = min(until, stand)
+    return until

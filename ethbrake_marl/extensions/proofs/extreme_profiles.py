@@ -1,0 +1,115 @@
+"""Profiles of full drive and full braking from which a search starts: drive, brake to the leader, drive; or the
+mirror.
+
+The proof of the lower bound says what the least harm looks like: the vehicle drives as hard as it can for a while,
+then brakes as hard as it can until it meets the leader; or it brakes, then drives until the rear one meets it. After
+that it goes the other way (docs/avoidability.md). A random search seldom finds such a narrow optimum.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ethbrake_marl.env.profiles import MOST_PHASES, ProfileProblem, Profiles, SearchWorld, copy_rows, make_search_world
+from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, REAR_FIRST
+from ethbrake_marl.extensions.proofs.meetings import meet_front, meet_rear
+from ethbrake_marl.extensions.proofs.plans import empty_plan
+from ethbrake_marl.extensions.search.profiles import allowed, copy_profile, largest
+from ethbrake_marl.physics.episode import CLOCK, follow_whole
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Bools, Floats, Ints
+
+KEPT = 12  # profiles of each world
+
+_LATEST_S = 2.0  # of the first change of command, at first
+
+_TIMES = 24  # of it that are tried in each round
+
+_ROUNDS = 3  # each closer around the best one
+
+_PHASES = 5  # before the first change, its step, up to the second one, its step, after it
+
+
+def extreme_profiles(problem: ProfileProblem, states: Floats, has_front: Bools, has_rear: Bools) -> Profiles:
+    """The ``KEPT`` best such profiles of each world [n * KEPT], world by world, of the one controlled vehicle.
+
+    ``states`` [n, WIDTH] is each world at the first decision (as of the bound). It tells only when the two would
+    meet, so a neighbour that does not brake fully makes the profiles less good, not wrong. A neighbour that is not
+    there [n] is not met.
+    """
+    n, last = problem.n, problem.last_step
+    ends = np.repeat(last, KEPT * MOST_PHASES).reshape(n, KEPT, MOST_PHASES)
+    commands = np.zeros((n, KEPT, MOST_PHASES, 1))
+    _fill_extremes(problem, states, has_front, has_rear, ends, commands)
+    return Profiles(ends.reshape(-1, MOST_PHASES), commands.reshape(-1, MOST_PHASES, 1))
+
+
+@compiled
+def _fill_extremes(
+    problem: ProfileProblem, states: Floats, has_front: Bools, has_rear: Bools, ends: Ints, commands: Floats
+) -> None:
+    """Fill ``ends`` [n, KEPT, K] and ``commands`` [n, KEPT, K, 1]."""
+    no_random = np.zeros(states.shape[0], np.uint64)
+    for k in range(states.shape[0]):
+        world = make_search_world(problem, k, no_random)
+        values = np.full(KEPT, math.inf)
+        for kind, there in ((FRONT_FIRST, has_front[k]), (REAR_FIRST, has_rear[k])):
+            low, high = 0.0, _LATEST_S
+            for _ in range(_ROUNDS if there else 0):
+                best = try_changes(world, kind, states[k], problem.start[k], low, high, ends[k], commands[k], values)
+                around = 1.5 * (high - low) / (_TIMES - 1)
+                low, high = max(best - around, 0.0), best + around
+
+
+@compiled(apart=True)
+def try_changes(
+    world: SearchWorld, kind: int, at: Floats, start: Floats, low: float, high: float, ends: Ints, commands: Floats,
+    values: Floats,
+) -> float:  # fmt: skip
+    """Try first changes of command from ``low`` to ``high`` (s) and keep the best profiles; the best change."""
+    plan, other = empty_plan(), empty_plan()
+    states = np.zeros((_PHASES + 1, start.shape[0]))
+    copy_rows(start.reshape(1, -1), states, 1)
+    tried_ends, tried = np.zeros(_PHASES, np.int64), np.zeros((_PHASES, 1))
+    least, best = math.inf, low
+    for k in range(_TIMES):
+        change = low + (high - low) * k / (_TIMES - 1)
+        meeting = meet_front(at, change, plan, other) if kind == FRONT_FIRST else meet_rear(at, change, plan, other)
+        for early, share in ((0, 0.0), (0, 0.5), (0, 1.0), (1, 0.5)):
+            fill_extreme(world, kind, change, meeting, early, share, tried_ends, tried)
+            value, reached = follow_whole(world.episode, tried_ends, tried, states, math.inf)
+            if reached < 0:
+                continue
+            if value < least:
+                least, best = value, change
+            worst = largest(values)
+            if value < values[worst]:
+                values[worst] = value
+                copy_profile(tried_ends, tried, ends[worst], commands[worst])
+                for phase in range(_PHASES, commands.shape[1]):
+                    commands[worst, phase, 0] = tried[_PHASES - 1, 0]
+    return best
+
+
+@compiled
+def fill_extreme(
+    world: SearchWorld, kind: int, change: float, meeting: float, early: int, share: float, ends: Ints, commands: Floats
+) -> None:
+    """One profile: from ``change`` to ``meeting`` (s) the other command; ``share`` of the first one in the step of it.
+
+    In the step of the change the command leads to the speed that the change would. ``early``: so many steps earlier.
+    """
+    low, high, step = world.bounds[0, 0], world.bounds[0, 1], world.episode.clock[CLOCK.TIME_STEP]
+    last = int(world.episode.clock[CLOCK.LAST_STEP])
+    first, second = (high, low) if kind == FRONT_FIRST else (low, high)
+    turn = min(int(change / step), last)
+    back = max(int(min(meeting / step, last)) - early, turn + 1)
+    commands[0, 0], commands[2, 0], commands[4, 0] = first, second, first
+    commands[1, 0] = second + (change / step - turn) * (first - second)
+    commands[3, 0] = second + share * (first - second)
+    ends[0], ends[1], ends[2], ends[3], ends[4] = turn, turn + 1, back, back + 1, last
+    for k in range(_PHASES):
+        ends[k] = min(ends[k], last)
+        commands[k, 0] = allowed(commands[k, 0], low, high)

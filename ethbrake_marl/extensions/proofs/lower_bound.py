@@ -1,0 +1,348 @@
+"""``lower_bound``: a proven lower bound on the harm of every world, whatever the controlled vehicle does."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.env.harm import HarmCount
+from ethbrake_marl.extensions.proofs.avoidability import avoidability, check_covered, largest_behind, spare_gap
+from ethbrake_marl.extensions.proofs.branch_and_bound import CELLS, NEAR, least_harm
+from ethbrake_marl.extensions.proofs.followers import obstacle_harm
+from ethbrake_marl.extensions.proofs.line import (
+    BOUNDS,
+    COMBINED_BOUND,
+    FRONT_BOUND,
+    FRONT_FIRST,
+    HALVINGS,
+    LARGE,
+    LINE,
+    REAR_BOUND,
+    REAR_FIRST,
+    TOUCH_HARM,
+    TOUCHING_M,
+)
+from ethbrake_marl.extensions.proofs.meetings import (
+    braking_to_rear,
+    gentlest_front,
+    meet_front,
+    meet_rear,
+    stays_ahead,
+    stays_behind,
+)
+from ethbrake_marl.extensions.proofs.obstacle import after, after_at_obstacle, beyond_rear
+from ethbrake_marl.extensions.proofs.plans import empty_plan, fill_braking, fill_drive_then_brake, walk
+from ethbrake_marl.extensions.proofs.ramped_bound import bound_ramped, ramped_states
+from ethbrake_marl.extensions.proofs.ramped_meetings import (
+    LEAST_PART,
+    LowerBound,
+    at_onset_of,
+    check_asked,
+    onset_states,
+    rounding,
+)
+from ethbrake_marl.physics.jit import by_parts, compiled
+from ethbrake_marl.physics.motion import solo_motion
+from ethbrake_marl.physics.state import Bools, Floats, Worlds
+
+_GRAZE_S = 1e-3  # more than rounding can move a graze
+
+_PARTS = 8  # into which the times of soft meetings are divided
+
+
+@compiled
+def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
+    """Least squared closing speed at the rear pair's first contact, that under full drive; and its latest time."""
+    fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], math.inf, at[LINE.A_F])
+    fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
+    _, time, squared = walk(
+        at[LINE.GAP_R], at[LINE.V_F], plan, at[LINE.V_R], other, at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
+    )
+    return squared, time
+
+
+@compiled(apart=True)
+def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
+    """Whether the other neighbour has not come before the gentlest meeting at ``time``."""
+    if kind == FRONT_FIRST:
+        return stays_ahead(at, gentlest_front(at, time)[1], time, plan, other)
+    return stays_behind(at, braking_to_rear(at, time, 0.0), time, plan, other)
+
+
+@compiled(apart=True)
+def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, other: Floats) -> float:
+    """The latest time, at most ``last``, of a meeting with one neighbour before which the other one has not come.
+
+    At ``first`` there is room. The later the meeting, the shorter the drive (the braking) before it, and the less room
+    behind (ahead).
+    """
+    if is_first(kind, at, last, plan, other):
+        return last
+    for _ in range(HALVINGS):
+        middle = 0.5 * (first + last)
+        if is_first(kind, at, middle, plan, other):
+            first = middle
+        else:
+            last = middle
+    return last
+
+
+@compiled(apart=True)
+def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple[float, float, bool]:
+    """When the leader, met at ``first`` at the earliest, is met at the latest; when it is met first at the latest.
+
+    And whether it may be met first however late and softly.
+    """
+    touches = spare_gap(at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F]) >= 0.0
+    last = meet_front(at, 0.0, plan, other)
+    if touches:
+        last = largest_behind(
+            at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F], at[LINE.U_F], at[LINE.LIMIT_F]
+        )[1]
+    end = last_first(FRONT_FIRST, at, first, last, plan, other)
+    return last, end, touches and end == last
+
+
+@compiled(apart=True)
+def front_first(
+    at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
+) -> float:
+    """Least harm, if below ``best``, where the leader is met first or all three meet at once.
+
+    At once: the outer two close with W, of which the front pair has at least the least at that time. Only if the leader
+    can be met as late as that.
+    """
+    first = meet_front(at, math.inf, plan, other)
+    if (
+        first == math.inf and at[LINE.GAP_L] <= TOUCHING_M
+    ):  # it stands at the leader, and stays: both are struck at once
+        return min(best, rear_bound(at, plan, other)[0])
+    if first == math.inf or not stays_ahead(at, first, first, plan, other):
+        return best
+    last, end, leans = last_meeting(at, first, plan, other)
+    best = least_harm(FRONT_FIRST, at, first, end, floor, best, enough, plan, other, heap)
+    if leans:
+        best = soft_harm(FRONT_FIRST, at, last, last, floor, best, plan, other)
+        stand = at[LINE.V_L] / at[LINE.A_L]
+        if last < stand:
+            best = soft_harm(FRONT_FIRST, at, stand, stand, floor, best, plan, other)
+    fill_braking(plan, 0.0, at[LINE.A_L])
+    fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
+    _, time, squared = walk(at[LINE.GAP_L] + at[LINE.GAP_R], at[LINE.V_L], plan, at[LINE.V_R], other, math.inf)
+    if time == math.inf or (time > end + _GRAZE_S and not leans):
+        return best
+    least = gentlest_front(at, min(time, last))[0] if time > first else 0.0
+    front = max(least, 0.5 * math.sqrt(squared))
+    rear = max(math.sqrt(squared) - front, 0.0)
+    beyond = 0.0
+    if at[LINE.WALL] > 0.0:
+        beyond = beyond_rear(at, time, time, rear, obstacle_harm(at, time, least), plan, other)
+    return min(best, front * front + rear * rear + beyond)
+
+
+@compiled(apart=True)
+def soft_harm(
+    kind: int, at: Floats, early: float, late: float, floor: float, best: float, plan: Floats, other: Floats
+) -> float:
+    """Least harm, if below ``best``, of the meetings with one neighbour from ``early`` to ``late``, however soft."""
+    soft = 0.0
+    while soft * soft < best:
+        hard = soft + 0.02 * (1.0 + soft)
+        follows = max(after(kind, at, early, late, hard, late, 0.0, plan, other), floor)
+        if kind == FRONT_FIRST:
+            follows = after_at_obstacle(at, early, late, soft, hard, follows, plan, other)
+        best = min(best, soft * soft + follows)
+        soft = hard
+    return best
+
+
+@compiled(apart=True)
+def rear_first(
+    at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
+) -> float:
+    """Least harm, if below ``best``, where the rear vehicle is met first."""
+    high = max(at[LINE.V_F] / at[LINE.A_F], at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R])
+    first = meet_rear(at, high, plan, other)
+    if first == math.inf or not stays_behind(at, first, first, plan, other):
+        return best
+    last = meet_rear(at, 0.0, plan, other)
+    if last < math.inf:
+        end = last_first(REAR_FIRST, at, first, last, plan, other)
+        return least_harm(REAR_FIRST, at, first, end, floor, best, enough, plan, other, heap)
+    low, top = 0.0, high
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + top)
+        if meet_rear(at, middle, plan, other) < math.inf:
+            top = middle
+        else:
+            low = middle
+    last = meet_rear(at, top, plan, other)
+    end = last_first(REAR_FIRST, at, first, last, plan, other)
+    best = least_harm(REAR_FIRST, at, first, end, floor, best, enough, plan, other, heap)
+    if end < last:
+        return best
+    late = max(last_soft(at, high, plan, other), last) + _GRAZE_S
+    part = (late - last) / _PARTS
+    for k in range(_PARTS):
+        best = soft_harm(REAR_FIRST, at, last + k * part, last + (k + 1) * part, floor, best, plan, other)
+    return best
+
+
+@compiled(apart=True)
+def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
+    """A time after which no first meeting with the rear vehicle comes, however soft; all stand at ``rest``.
+
+    It has then passed neither the leader nor the controlled vehicle; where it brakes harder than this one, by b, it was
+    faster by ``b t`` a time t before the meeting, from its onset on.
+    """
+    fill_braking(plan, 0.0, at[LINE.A_L])
+    fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
+    last = min(
+        max(rest, at[LINE.V_L] / at[LINE.A_L]),
+        walk(at[LINE.GAP_L] + at[LINE.GAP_R], at[LINE.V_L], plan, at[LINE.V_R], other, math.inf)[1],
+    )
+    if at[LINE.A_F] >= at[LINE.A_R]:
+        return float(last)
+    harder, onset, closing = at[LINE.A_R] - at[LINE.A_F], at[LINE.ONSET_R], at[LINE.V_R] - at[LINE.V_F]
+    gap = max(at[LINE.GAP_R] + (0.5 * at[LINE.U_F] * onset - closing) * onset, 0.0)
+    ahead = max(closing + at[LINE.A_F] * onset, 0.0)
+    return float(min(last, onset + min(ahead / harder, math.sqrt(2.0 * gap / harder))))
+
+
+@compiled(apart=True)
+def last_rest(at: Floats) -> tuple[float, float]:
+    """By when what follows from braking is over, whoever is met; and when the rear vehicle stands by full braking."""
+    stand = at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
+    way = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, stand)[1]
+    room = at[LINE.GAP_L] + at[LINE.V_L] * at[LINE.V_L] / (2.0 * at[LINE.A_L]) + at[LINE.GAP_R] - way
+    rest = at[LINE.ONSET_R] + at[LINE.V_R] / min(at[LINE.A_R], at[LINE.A_F])
+    return max(rest, stand + math.sqrt(2.0 * max(room, 0.0) / at[LINE.A_F])), stand
+
+
+@compiled(apart=True)
+def combined_bound(
+    at: Floats, until: float, front: float, rear: float, plan: Floats, other: Floats, heap: Floats
+) -> float:
+    """Least harm of a world in which contact is unavoidable, whoever is met first; 0 if that may be after ``until``.
+
+    ``front`` and ``rear`` are the pairs' own bounds.
+    """
+    if not last_rest(at)[0] < until:
+        return 0.0
+    step, least = at[LINE.TIME_STEP], 0.0
+    for time_step in (0.0, step):  # what holds for any command holds for one that changes at decisions only
+        at[LINE.TIME_STEP] = time_step
+        best = front_first(at, rear, LARGE, front + rear, plan, other, heap)
+        best = rear_first(at, front, best, front + rear, plan, other, heap)
+        least = max(least, best - TOUCH_HARM if best < LARGE else 0.0)
+        if step <= 0.0:
+            break
+    return least
+
+
+@compiled
+def bound_worlds(
+    states: Floats, until: Floats, has_front: Bools, has_rear: Bools, unavoidable: Bools, out: Floats
+) -> None:
+    """Bounds of worlds ``states`` [n, WIDTH] into ``out`` [n, BOUNDS].
+
+    Each pair's where it exists, both together where contact is unavoidable.
+    """
+    plan, other, heap = empty_plan(), empty_plan(), np.empty((CELLS, NEAR))
+    for k in range(states.shape[0]):
+        front, rear = 0.0, 0.0
+        if has_front[k]:
+            # least squared closing speed at the front pair's first contact, whoever pushes; and its latest time
+            at = states[k]
+            fill_braking(plan, 0.0, at[LINE.A_L])
+            fill_braking(other, 0.0, at[LINE.A_F])
+            _, time, squared = walk(
+                at[LINE.GAP_L], at[LINE.V_L], plan, at[LINE.V_F], other, at[LINE.V_F] / at[LINE.A_F]
+            )
+            if at[LINE.A_F] < at[LINE.A_L] and at[LINE.V_F] < at[LINE.V_L]:
+                squared = min(squared, 2.0 * (at[LINE.A_L] - at[LINE.A_F]) * at[LINE.GAP_L])
+            front = squared if time < until[k] and squared > TOUCH_HARM else 0.0
+            if front > 0.0 and at[LINE.WALL] > 0.0:
+                front += obstacle_harm(at, time, math.sqrt(squared))
+        if has_rear[k]:
+            squared, time = rear_bound(states[k], plan, other)
+            rear = squared if time < until[k] and squared > TOUCH_HARM else 0.0
+        out[k, FRONT_BOUND], out[k, REAR_BOUND], out[k, COMBINED_BOUND] = front, rear, 0.0
+        if unavoidable[k]:
+            out[k, COMBINED_BOUND] = combined_bound(states[k], until[k], front, rear, plan, other, heap)
+
+
+def lower_bound(
+    worlds: Worlds,
+    vehicle: int = 1,
+    *,
+    harm_count: HarmCount = "first",
+    horizon_s: float = 8.0,
+    scripts: Mapping[int, str] | None = None,
+    time_step_s: float | None = None,
+) -> LowerBound:
+    """Proven lower bound on the harm from now to ``horizon_s`` (absolute), over all commands of ``vehicle``.
+
+    ``harm = early + max(front_pair + rear_pair, combined)``, each part rounded outward (``rounding``). The combined
+    bound is 0 where contact can be avoided. What may come only after the horizon counts as 0, and so does the next
+    impact of a pair that was hit before where ``harm_count`` is "first".
+
+    With ``time_step_s`` it is proven only for commands that change at decisions, the first one when the vehicle may
+    act, one every ``time_step_s`` after it: what every agent drives. That is sharper, and takes ten times as long.
+
+    Where brakes build up it holds for any command at any time, is looser, and says nothing of contact: ``contact`` is
+    None if that is so in any of the worlds.
+
+    Covers the same lines as ``avoidability``, and raises ``InvalidInput`` for others, for an unknown ``harm_count``, a
+    time step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before the vehicle may act.
+    """
+    check_asked("lower_bound", harm_count, horizon_s, time_step_s)
+    slow = worlds.vehicles.build_up
+    if worlds.vehicles.in_pieces.any():
+        worlds.refuse_build_up("lower_bound")
+    if slow.any() and not slow.all():
+        asked = partial(
+            lower_bound, vehicle=vehicle, harm_count=harm_count, horizon_s=horizon_s, scripts=scripts,
+            time_step_s=time_step_s,
+        )  # fmt: skip
+        order = np.argsort(np.concatenate([np.flatnonzero(slow), np.flatnonzero(~slow)]))
+        halves = asked(worlds.take(slow)), asked(worlds.take(~slow))
+        each = ((part.harm, part.early, part.front_pair, part.rear_pair, part.combined) for part in halves)
+        harm, early, front, rear, combined = (np.concatenate(columns)[order] for columns in zip(*each, strict=True))
+        return LowerBound(harm, early, front, rear, combined, None)
+    if slow.any():
+        check_covered(worlds, vehicle, scripts)
+        verdict, reason = None, np.full(worlds.n, 2)  # it may be: the bound itself finds out
+    else:
+        verdict = avoidability(worlds, vehicle, scripts=scripts)
+        reason = verdict.reason
+    at_onset, start, early, counts = at_onset_of("lower_bound", worlds, np.array([vehicle]), harm_count, horizon_s)
+    none = np.zeros(worlds.n, dtype=np.bool_)
+    has_front = counts[:, vehicle - 1] if vehicle > 0 else none
+    has_rear = counts[:, vehicle] if vehicle < worlds.N - 1 else none
+    struck = at_onset.obstacle_hit & (harm_count == "first")  # whoever is pushed there is not charged for it again
+    unavoidable = has_front & has_rear & (reason >= 2) & ~struck
+    out = np.empty((worlds.n, BOUNDS))
+    given: tuple[Any, ...] = (has_front, has_rear, unavoidable, out)
+    kernel: Callable[..., None] = bound_worlds
+    if slow.any():
+        # a neighbour that still drives, told otherwise before, is not yet left alone
+        left_alone = np.delete(at_onset.command_mps2, vehicle, axis=1).max(axis=1) <= 0.0
+        given = (has_front, has_rear & left_alone, unavoidable & left_alone, out)
+        given, kernel = (ramped_states(at_onset, vehicle, horizon_s - start), *given), bound_ramped
+    else:
+        states = onset_states(at_onset, vehicle, time_step_s)
+        ahead = states[:, LINE.OBSTACLE]
+        states[:, LINE.WALL] = np.where(np.isfinite(ahead) & ~struck, ahead, 0.0)
+        states[:, LINE.UNTIL] = horizon_s - start
+        given = (states, horizon_s - start, *given)
+    threads = min(os.cpu_count() or 1, worlds.n // LEAST_PART + 1)
+    by_parts(lambda part: kernel(*(array[part] for array in given)), worlds.n, threads)
+    parts = (early, *(out[:, column] for column in (FRONT_BOUND, REAR_BOUND, COMBINED_BOUND)))
+    early, front, rear, combined = (np.maximum(part - rounding(worlds, vehicle), 0.0) for part in parts)
+    return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined, verdict)

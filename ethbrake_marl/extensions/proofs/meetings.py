@@ -1,0 +1,131 @@
+"""Compiled: the gentlest first meeting of the controlled vehicle with a neighbour at a given time.
+
+Times count from the moment at which the controlled vehicle may act; the front vehicle (leader, l) brakes by then, f
+is the controlled one, the rear vehicle (r) coasts to its onset and then brakes. All speeds and gaps are >= 0.
+docs/avoidability.md has the proofs.
+"""
+
+from __future__ import annotations
+
+import math
+
+from ethbrake_marl.extensions.proofs.line import AHEAD_M, FRONT_FIRST, HALVINGS, LINE, RAMPED_FRONT, follower, leader
+from ethbrake_marl.extensions.proofs.plans import (
+    fill_brake_then_drive,
+    fill_braking,
+    fill_drive_then_brake,
+    time_to_limit,
+    walk,
+)
+from ethbrake_marl.extensions.proofs.ramped_meetings import gentlest_ramped
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Floats
+
+_GUARD = 2.0**-46  # of the positions: a way that rounding shortens must not make a meeting look harder
+
+
+@compiled(apart=True)
+def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
+    """Least closing speed of a meeting with the leader at ``time``, and how long it must be driven before braking.
+
+    The slowest way to be there then: drive, then brake.
+    """
+    v_l, way = leader(at, time)
+    place, v, u, a = at[LINE.GAP_L] + way, at[LINE.V_F], at[LINE.U_F], at[LINE.A_F]
+    cap = time_to_limit(v, u, at[LINE.LIMIT_F])
+    drive = u if cap > 0.0 else 0.0
+    driven = (v + 0.5 * drive * time) * time
+    beyond = 0.5 * drive * max(time - cap, 0.0) * max(time - cap, 0.0)
+    guard = _GUARD * (driven + place)
+    brake = math.sqrt(2.0 * max(driven - beyond - place + guard, 0.0) / a)
+    top = v + drive * cap
+    if time - brake < cap:
+        brake = math.sqrt(2.0 * max(driven - place + guard, 0.0) / (drive + a))
+        top = v + drive * (time - brake)
+    if brake > time:
+        brake, top = time, v
+    return max(top - a * brake - v_l, 0.0), time - brake
+
+
+@compiled
+def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, float]:
+    """Way and speed at ``time`` of one that brakes for ``brake`` (at most to rest), then drives."""
+    v, u, a = at[LINE.V_F], at[LINE.U_F], at[LINE.A_F]
+    braking = min(brake, v / a)
+    slow = max(v - a * brake, 0.0)
+    cap = time_to_limit(slow, u, at[LINE.LIMIT_F])
+    drive = u if cap > 0.0 else 0.0
+    left = time - brake
+    beyond = max(left - cap, 0.0)
+    way = (v - 0.5 * a * braking) * braking + (slow + 0.5 * drive * left) * left - 0.5 * drive * beyond * beyond
+    return way, slow + drive * (left - beyond)
+
+
+@compiled(apart=True)
+def braking_to_rear(at: Floats, time: float, further: float) -> float:
+    """How long it must be braked to be met by the rear vehicle at ``time``, if it is driven from then on.
+
+    Or by one that has come ``further`` than the rear vehicle by full braking (m).
+    """
+    place = follower(at, time)[1] - at[LINE.GAP_R] + further
+    low, high = 0.0, time
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        if braked_then_driven(at, middle, time)[0] >= place:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@compiled(apart=True)
+def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
+    """Least closing speed of a meeting with the rear vehicle at ``time``, and how long it must be braked before.
+
+    The fastest way to be there then: brake, then drive. The braking is infinite where that is at its speed limit.
+    """
+    brake = braking_to_rear(at, time, 0.0)
+    speed = braked_then_driven(at, brake, time)[1]
+    return max(follower(at, time)[0] - speed, 0.0), brake if speed < at[LINE.LIMIT_F] else math.inf
+
+
+@compiled(apart=True)
+def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
+    """``gentlest_front`` or ``gentlest_rear``, or ``gentlest_ramped``."""
+    if kind >= RAMPED_FRONT:
+        return gentlest_ramped(kind, at, time), 0.0
+    return gentlest_front(at, time) if kind == FRONT_FIRST else gentlest_rear(at, time)
+
+
+@compiled(apart=True)
+def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
+    """When one that drives for ``drive``, then brakes, meets the leader."""
+    fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
+    fill_braking(other, 0.0, at[LINE.A_L])
+    return walk(at[LINE.GAP_L], at[LINE.V_L], other, at[LINE.V_F], plan, math.inf)[1]
+
+
+@compiled(apart=True)
+def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
+    """When the rear vehicle meets one that brakes for ``brake``, then drives."""
+    fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])
+    fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
+    return walk(
+        at[LINE.GAP_R], at[LINE.V_F], plan, at[LINE.V_R], other, at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
+    )[1]
+
+
+@compiled(apart=True)
+def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Floats) -> bool:
+    """Whether one that drives for ``drive``, then brakes, is not met from behind until then."""
+    fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
+    fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
+    return walk(at[LINE.GAP_R], at[LINE.V_F], plan, at[LINE.V_R], other, until)[0] >= -AHEAD_M
+
+
+@compiled(apart=True)
+def stays_behind(at: Floats, brake: float, until: float, plan: Floats, other: Floats) -> bool:
+    """Whether one that brakes for ``brake``, then drives, does not meet the leader until then."""
+    fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])
+    fill_braking(other, 0.0, at[LINE.A_L])
+    return walk(at[LINE.GAP_L], at[LINE.V_L], other, at[LINE.V_F], plan, until)[0] >= -AHEAD_M

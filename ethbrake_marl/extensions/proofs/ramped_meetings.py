@@ -1,0 +1,342 @@
+"""Compiled: meetings where brakes build up, and what follows them. docs/proofs/lower-bound-cases.md has the proofs.
+
+``sign`` is 1 for meetings with the leader and -1 for those with the rear vehicle, whose mirror image they are: forces
+times ``sign`` then rise first (drive, or brake) and fall later.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from numbers import Real
+
+import numpy as np
+
+from ethbrake_marl.env.harm import HarmCount, check_harm_count, empty_ledger
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.proofs.avoidability import Avoidability
+from ethbrake_marl.extensions.proofs.line import AHEAD_M, FORCE_HALVINGS, HALVINGS, LINE, RAMPED_FRONT, ROUGHLY
+from ethbrake_marl.extensions.proofs.ramps import (
+    FORCES,
+    empty_legs,
+    fill_build_up,
+    fill_switch,
+    force_of,
+    meeting,
+    travel,
+)
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+
+
+@compiled
+def fill_leader(at: Floats, plan: Floats) -> None:
+    """The front vehicle, left alone."""
+    fill_build_up(plan, 0.0, at[LINE.FORCE_L], -at[LINE.A_L], at[LINE.FALL_L])
+
+
+@compiled
+def fill_follower(at: Floats, plan: Floats) -> None:
+    """The rear vehicle, left alone."""
+    fill_build_up(plan, at[LINE.ONSET_R], at[LINE.FORCE_R], -at[LINE.A_R], at[LINE.FALL_R])
+
+
+@compiled
+def range_of(sign: float, at: Floats) -> tuple[float, float, float, float]:
+    """Largest force and how fast it is reached, least force and how fast it is reached, times ``sign``."""
+    if sign > 0.0:
+        return at[LINE.U_F], at[LINE.RISE_F], at[LINE.A_F], at[LINE.FALL_F]
+    return at[LINE.A_F], at[LINE.FALL_F], at[LINE.U_F], at[LINE.RISE_F]
+
+
+@compiled
+def fill_controlled(at: Floats, sign: float, switch: float, time: float, final: float, plan: Floats) -> None:
+    """``fill_switch`` of the controlled vehicle."""
+    high, rise, low, fall = range_of(sign, at)
+    fill_switch(plan, sign, sign * at[LINE.FORCE_F], high, rise, low, fall, switch, time, final)
+
+
+@compiled(apart=True)
+def switch_for(
+    at: Floats, sign: float, time: float, place: float, final: float, halvings: int, plan: Floats
+) -> tuple[float, float, float]:
+    """Switches just before and after which it is at ``place`` at ``time``, and the speed after the earlier one.
+
+    ``place`` is times ``sign``, and the way to it has that force at least (at most) at ``time``.
+    """
+    low, high = (-1.0 if range_of(sign, at)[1] == math.inf else 0.0), time
+    for _ in range(halvings):
+        middle = 0.5 * (low + high)
+        fill_controlled(at, sign, middle, time, final, plan)
+        if sign * travel(plan, at[LINE.V_F], at[LINE.LIMIT_F], time)[1] < place:
+            low = middle
+        else:
+            high = middle
+    fill_controlled(at, sign, low, time, final, plan)
+    return low, high, travel(plan, at[LINE.V_F], at[LINE.LIMIT_F], time)[0]
+
+
+@compiled
+def met_at(kind: int, at: Floats, time: float, plan: Floats) -> tuple[float, float, float]:
+    """Sign, speed and place (times the sign) of the vehicle that is met, left alone until ``time``."""
+    if kind == RAMPED_FRONT:
+        fill_leader(at, plan)
+        v, way = travel(plan, at[LINE.V_L], math.inf, time)
+        return 1.0, v, at[LINE.GAP_L] + way
+    fill_follower(at, plan)
+    v, way = travel(plan, at[LINE.V_R], math.inf, time)
+    return -1.0, v, at[LINE.GAP_R] - way
+
+
+@compiled(apart=True)
+def gentlest_ramped(kind: int, at: Floats, time: float) -> float:
+    """Least closing speed of a meeting at ``time``."""
+    plan = empty_legs()
+    sign, v, place = met_at(kind, at, time, plan)
+    return max(sign * (switch_for(at, sign, time, place, -math.inf, HALVINGS, plan)[2] - v), 0.0)
+
+
+@compiled
+def slack_of(
+    kind: int, at: Floats, early: float, late: float, v: float, hard: float, plan: Floats
+) -> tuple[float, float]:
+    """How far from its place, and by which speed, a vehicle that meets in a cell may be at ``early``, at most."""
+    span = late - early
+    if kind == RAMPED_FRONT:
+        return (hard + at[LINE.A_F] * span) * span, at[LINE.A_F] * span
+    slower = v - met_at(kind, at, late, plan)[1]
+    return (hard + at[LINE.U_F] * span + slower) * span, at[LINE.U_F] * span + slower
+
+
+@compiled(apart=True)
+def gentlest_ramped_between(kind: int, at: Floats, early: float, late: float) -> float:
+    """Least closing speed of the meetings between two times."""
+    plan = empty_legs()
+    hard = gentlest_ramped(kind, at, early)
+    sign, v, place = met_at(kind, at, early, plan)
+    far, faster = slack_of(kind, at, early, late, v, hard, plan)
+    closing = sign * (switch_for(at, sign, early, place - far, -math.inf, HALVINGS, plan)[2] - v)
+    if kind == RAMPED_FRONT:
+        fill_leader(at, plan)
+        if travel(plan, at[LINE.V_L], math.inf, late)[0] > 0.0:
+            faster = max(at[LINE.A_F] + force_of(plan, early), 0.0) * (late - early)
+    return max(min(closing - faster, hard), 0.0)
+
+
+@compiled(apart=True)
+def force_of_meeting(kind: int, at: Floats, early: float, late: float, hard: float) -> float:
+    """Largest force, times the sign, with which a meeting of a cell can be as soft as ``hard``."""
+    plan = empty_legs()
+    sign, v, place = met_at(kind, at, early, plan)
+    far, faster = slack_of(kind, at, early, late, v, hard, plan)
+    high, rise, low, _ = range_of(sign, at)
+    if rise == math.inf:
+        return high
+    least, most = -low, high
+    for k in range(FORCE_HALVINGS):
+        tried = most if k == 0 else 0.5 * (least + most)
+        final = tried - rise * (late - early)
+        if sign * (switch_for(at, sign, early, place - far, final, ROUGHLY, plan)[2] - v) <= hard + faster:
+            least = tried
+        else:
+            most = tried
+    return most
+
+
+@compiled(apart=True)
+def after_ramped(
+    kind: int, at: Floats, early: float, late: float, hard: float, plan: Floats, other: Floats
+) -> float:  # fmt: skip
+    """Least squared closing speed at the other neighbour after a meeting of a cell: of the controlled one alone."""
+    sign = 1.0 if kind == RAMPED_FRONT else -1.0
+    share = at[LINE.FRONT_SHARE] if kind == RAMPED_FRONT else at[LINE.REAR_SHARE]
+    kept = 1.0 - share * (1.0 + at[LINE.RESTITUTION])
+    if kind == RAMPED_FRONT and (kept < 0.0 or at[LINE.OBSTACLE] < math.inf):
+        return 0.0  # it may be thrown back
+    kept, span = max(kept, 0.0), late - early
+    high, rise, _, _ = range_of(sign, at)
+    force = high
+    if rise < math.inf:
+        force = min(force_of_meeting(kind, at, early, late, hard) + rise * span, high)
+    fill_leader(at, plan)
+    v_l, way_l = travel(plan, at[LINE.V_L], math.inf, early)
+    fill_follower(at, other)
+    v_r, way_r = travel(other, at[LINE.V_R], math.inf, early)
+    gap = max(at[LINE.GAP_L] + at[LINE.GAP_R] + way_l - way_r, 0.0)
+    if kind == RAMPED_FRONT:
+        # until ``late`` it does not fall behind the leader
+        least = force_of(plan, early) if travel(plan, at[LINE.V_L], math.inf, late)[0] > 0.0 else 0.0
+        fill_build_up(plan, late, force, high, rise)
+        plan[FORCES, 0] = max(force, least)
+        found = meeting(
+            gap, kept * hard * span, v_l + kept * hard, plan, math.inf, v_r, other, math.inf, early, at[LINE.UNTIL]
+        )
+    else:
+        v = v_r - kept * hard
+        if v <= 0.0:
+            return 0.0
+        most = force_of(other, late)
+        since, begins = late, -force
+        fastest = (1.0 + at[LINE.RESTITUTION]) * v_r + at[LINE.U_F] * at[LINE.U_F] / rise
+        if begins > 0.0 and fastest >= at[LINE.LIMIT_F]:  # beyond its speed limit a vehicle that drives coasts
+            since, begins = late + begins / rise, 0.0
+        fill_build_up(other, since, begins, -high, rise)
+        other[FORCES, 0] = min(begins, most)
+        found = meeting(gap, kept * hard * span, v_l, plan, math.inf, v, other, math.inf, early, at[LINE.UNTIL])
+    return found[2] * found[2]
+
+
+@compiled(apart=True)
+def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
+    """Whether the other neighbour has not come before every meeting at ``time`` and later."""
+    sign, _, place = met_at(kind, at, time, plan)
+    switch = switch_for(at, sign, time, place, -math.inf, HALVINGS, plan)[1]
+    fill_controlled(at, sign, switch, time, -math.inf, plan)
+    if kind == RAMPED_FRONT:
+        fill_follower(at, other)
+        gap = at[LINE.GAP_R] + AHEAD_M
+        return meeting(
+            gap, 0.0, at[LINE.V_F], plan, at[LINE.LIMIT_F], at[LINE.V_R], other, math.inf, 0.0, time
+        )[0] == math.inf  # fmt: skip
+    fill_leader(at, other)
+    gap = at[LINE.GAP_L] + AHEAD_M
+    return (
+        meeting(gap, 0.0, at[LINE.V_L], other, math.inf, at[LINE.V_F], plan, at[LINE.LIMIT_F], 0.0, time)[0] == math.inf
+    )
+
+
+@compiled(apart=True)
+def meet_ramped(kind: int, at: Floats, sign: float, plan: Floats, other: Floats) -> tuple[float, float, float]:
+    """``meeting`` with this neighbour of one that drives (``sign`` 1) or brakes (-1) as hard as it can."""
+    fill_controlled(at, sign, math.inf, math.inf, -math.inf, plan)
+    if kind == RAMPED_FRONT:
+        fill_leader(at, other)
+        return meeting(
+            at[LINE.GAP_L], 0.0, at[LINE.V_L], other, math.inf, at[LINE.V_F], plan, at[LINE.LIMIT_F], 0.0, math.inf
+        )
+    fill_follower(at, other)
+    return meeting(
+        at[LINE.GAP_R], 0.0, at[LINE.V_F], plan, at[LINE.LIMIT_F], at[LINE.V_R], other, math.inf, 0.0, math.inf
+    )
+
+
+EPS = 2.0**-52  # the spacing of doubles at 1
+
+# Bounds are lowered by so many eps of the squared speeds that a world can hold: a segment or a round of impacts moves a
+# squared closing speed by at most 8 eps of these, and an episode has up to 500 of them.
+BOUND_EPS = 2.0**12
+
+LEAST_TIME_STEP_S = 1e-3  # between decisions: work grows as they come closer
+
+LEAST_PART = 100  # worlds of a thread: fewer are done before another one has begun
+
+
+@dataclass(frozen=True, slots=True)
+class LowerBound:
+    """What is proven about each world [n], in m2/s2."""
+
+    harm: Floats  # no profile does less harm than this
+    early: Floats  # done before the controlled vehicle may act
+    front_pair: Floats  # of the front pair alone, from then on
+    rear_pair: Floats  # of the rear pair alone
+    combined: Floats  # of both together; 0 where nothing is proven
+    # the verdict on contact that the bound of both together rests on; None where brakes of some world build up
+    contact: Avoidability | None
+
+    @property
+    def impact_proven(self) -> Bools:
+        """Whether every profile has an impact, [n]; elsewhere none is proven, which need not mean that one can."""
+        return np.asarray(self.harm > 0.0, np.bool_)
+
+
+def at_onset_of(
+    where: str, worlds: Worlds, vehicles: Ints, harm_count: HarmCount, horizon_s: float
+) -> tuple[Worlds, Floats, Floats, Bools]:
+    """The worlds when the first of these vehicles may act, when that is (s), and the harm that was done before, [n].
+
+    And the pairs whose next impact counts, and which move forward, [n, P].
+    """
+    start = np.maximum(worlds.vehicles.latency_s[:, vehicles].min(axis=1), worlds.time_s)
+    if not (np.all(start <= horizon_s) and horizon_s < np.inf):
+        raise InvalidInput(f"{where}: horizon_s {horizon_s!r}: must be finite and at least {start.max():g} s")
+    now, impacts = advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=start)
+    early = empty_ledger(worlds).add(impacts).world_harm(harm_count)
+    forward = now.speeds_mps >= 0.0
+    counts = (~now.pair_hit if harm_count == "first" else True) & forward[:, 1:] & forward[:, :-1]
+    return now, start, early, counts
+
+
+def check_asked(where: str, harm_count: str, horizon_s: object, time_step_s: object) -> None:
+    """Raise ``InvalidInput`` for an unknown count, a horizon that is no number, or a time step that cannot be."""
+    check_harm_count(harm_count)
+    if not _is_number(horizon_s):
+        raise InvalidInput(f"{where}: horizon_s {horizon_s!r}: must be a number of seconds")
+    if time_step_s is not None and not (_is_number(time_step_s) and LEAST_TIME_STEP_S <= time_step_s < np.inf):  # type: ignore[operator]  # a number
+        raise InvalidInput(
+            f"{where}: time_step_s {time_step_s!r}: must be a number of seconds from {LEAST_TIME_STEP_S:g} on, or None"
+        )
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -> Floats:
+    """How far arithmetic can move a bound and a realised harm apart, at most; [n] m2/s2.
+
+    A squared closing speed is ``D = w^2 + 2 b g``. With ``V`` the largest speed in the line, ``G`` its gaps (and
+    ``way_m`` [n] beyond them), ``A`` the largest closing acceleration and ``a`` the weakest brakes, every ``w^2`` is at
+    most ``V^2`` and no gap grows beyond ``G + V^2 / 2a`` (and ``V a / r`` where brakes build up at a rate r), so all
+    terms of D stay below ``S = V^2 (1 + A / a) + 2 A G``.
+    A segment of motion rounds each speed twice and each gap five times, a round of impacts each speed by
+    ``CLUSTER_EPS``: either moves D by at most 8 eps S. These add up and are not multiplied, for the proofs compare a
+    run with itself, not with another one. ``BOUND_EPS`` grants 500 of them; the steps of an episode of 8 s are 80, and
+    the bound's own arithmetic, a few hundred roundings, is among them too. Of several vehicles (a team) the largest
+    speed is a speed limit where any of them may drive, the largest closing acceleration that of the strongest drive.
+    """
+    v, chosen = worlds.vehicles, np.atleast_1d(vehicle)
+    driving = v.driving_capacity_mps2[:, chosen]
+    limits = np.where(driving > 0.0, v.speed_limit_mps[:, chosen], 0.0)
+    fastest = np.maximum(worlds.speeds_mps.max(axis=1), limits.max(axis=1))
+    closing = v.braking_capacity_mps2.max(axis=1) + driving.max(axis=1)
+    weakest = v.braking_capacity_mps2.min(axis=1)
+    longest = worlds.gaps_m.sum(axis=1) + way_m + fastest * (v.braking_capacity_mps2 / v.brake_rate_mps3).max(axis=1)
+    scale = fastest * fastest * (1.0 + closing / weakest) + 2.0 * closing * longest
+    return np.asarray(BOUND_EPS * EPS * scale, np.float64)
+
+
+def onset_states(worlds: Worlds, i: int, time_step_s: float | Floats | None) -> Floats:
+    """The worlds, in which vehicle ``i`` may act, as the compiled bounds take them [n, WIDTH] (``limits.lower_bound``).
+
+    Columns of a neighbour that is not there stay 0, as does the time step where there is none.
+    """
+    v = worlds.vehicles
+    at = np.zeros((worlds.n, LINE.WIDTH))
+    columns = {
+        LINE.V_F: worlds.speeds_mps[:, i],
+        LINE.A_F: v.braking_capacity_mps2[:, i],
+        LINE.U_F: v.driving_capacity_mps2[:, i],
+        LINE.LIMIT_F: v.speed_limit_mps[:, i],
+        LINE.RESTITUTION: v.restitution,
+        LINE.OBSTACLE: worlds.obstacle_gap_m if i == 1 else np.inf,
+        LINE.TIME_STEP: 0.0 if time_step_s is None else time_step_s,
+    }
+    if i > 0:
+        columns |= {
+            LINE.GAP_L: worlds.gaps_m[:, i - 1],
+            LINE.V_L: worlds.speeds_mps[:, i - 1],
+            LINE.A_L: v.braking_capacity_mps2[:, i - 1],
+            LINE.FRONT_SHARE: v.mass_t[:, i - 1] / (v.mass_t[:, i - 1] + v.mass_t[:, i]),
+        }
+    if i < worlds.N - 1:
+        columns |= {
+            LINE.GAP_R: worlds.gaps_m[:, i],
+            LINE.V_R: worlds.speeds_mps[:, i + 1],
+            LINE.A_R: v.braking_capacity_mps2[:, i + 1],
+            LINE.ONSET_R: np.maximum(v.latency_s[:, i + 1] - worlds.time_s, 0.0),
+            LINE.REAR_SHARE: v.mass_t[:, i + 1] / (v.mass_t[:, i + 1] + v.mass_t[:, i]),
+        }
+    for column, values in columns.items():
+        at[:, column] = values
+    return at

@@ -1,0 +1,185 @@
+"""Two vehicles whose forces change at finite rates: where they first meet, and how gently at least. Compiled.
+
+A plan is an array [3, LEGS]: row ENDS holds the end of each leg (s from now, the last one infinite), row FORCES the
+acceleration in force at its start (m/s2), row JERKS how fast that changes (m/s3). A vehicle at rest holds until its
+force is above 0, one at its speed limit until it is below. No time step: a gap is one cubic after the other.
+docs/proofs/lower-bound-cases.md has the proof, under "Brakes that build up".
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ethbrake_marl.extensions.proofs.plans import ENDS
+from ethbrake_marl.physics.build_up import contact_within, first_return, gap_after
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Floats
+
+FORCES, JERKS = 1, 2
+
+LEGS = 5
+
+_MEETING_HALVINGS = 30
+
+
+@compiled
+def empty_legs() -> Floats:
+    """Memory of a plan."""
+    return np.empty((3, LEGS))
+
+
+@compiled
+def put_leg(plan: Floats, k: int, end: float, force: float, jerk: float) -> None:
+    """Leg ``k``, the last one so far: all later ones never begin."""
+    plan[ENDS, k], plan[FORCES, k], plan[JERKS, k] = end, force, jerk
+
+
+@compiled
+def fill_build_up(plan: Floats, since: float, force: float, wanted: float, rate: float) -> None:
+    """``force`` until ``since``, from then on towards ``wanted`` at this rate, which may be infinite."""
+    rise = abs(wanted - force) / rate
+    put_leg(plan, 0, since, force, 0.0)
+    put_leg(plan, 1, since + rise, force, (wanted - force) / rise if rise > 0.0 else 0.0)
+    put_leg(plan, 2, math.inf, wanted, 0.0)
+
+
+@compiled
+def fill_switch(
+    plan: Floats, sign: float, force: float, high: float, rise: float, low: float, fall: float, switch: float,
+    time: float, final: float,
+) -> None:  # fmt: skip
+    """From ``force`` up to ``high`` until ``switch``, then down to ``-low``, but so as to be at ``final`` at ``time``.
+
+    Rates are ``rise`` and ``fall``. All forces are given, and come out, times ``sign``. A ``switch`` from -1 to 0, for
+    an infinite ``rise``, is one at once from a part of the way up.
+    """
+    full = (high - force) / rise
+    top = high if switch >= full else force + rise * switch
+    if switch < 0.0:
+        top, switch = force + (high - force) * (1.0 + switch), 0.0
+    put_leg(plan, 0, min(full, switch), sign * force, sign * rise if full > 0.0 else 0.0)
+    put_leg(plan, 1, switch, sign * top, 0.0)
+    down, tail = switch + (top + low) / fall, math.inf
+    if final > -low and rise < math.inf:
+        tail = time - (final + low) / rise
+        if tail < down:
+            tail = switch + max(top - final + rise * (time - switch), 0.0) / (rise + fall)
+    put_leg(plan, 2, min(down, tail), sign * top, -sign * fall if down > switch else 0.0)
+    put_leg(plan, 3, tail, -sign * low, 0.0)
+    put_leg(plan, 4, math.inf, sign * (final - rise * (time - tail)) if tail < math.inf else 0.0, 0.0)
+    if tail < math.inf:
+        plan[JERKS, 4] = sign * rise
+
+
+@compiled
+def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, float, float, float]:
+    """Acceleration and jerk at ``now`` and speed ``v``, until when, and the speed that is reached then, else NaN."""
+    k = 0
+    while now >= plan[ENDS, k]:
+        k += 1
+    jerk, end = plan[JERKS, k], plan[ENDS, k]
+    u = plan[FORCES, k] + jerk * (now - (plan[ENDS, k - 1] if k > 0 else 0.0))
+    if (v <= 0.0 and (u < 0.0 or (u == 0.0 and jerk <= 0.0))) or (
+        v >= limit and (u > 0.0 or (u == 0.0 and jerk > 0.0))
+    ):
+        free = now - u / jerk if u * jerk < 0.0 else math.inf
+        if free > now:
+            return 0.0, 0.0, min(end, free), v
+        u = 0.0  # it is free just now, but for rounding
+    reached = math.nan
+    stands = now + first_return(v, u, jerk)
+    if v <= 0.0 and stands <= now:
+        return 0.0, 0.0, end, v
+    if stands <= end:
+        end, reached = stands, 0.0
+    if v < limit < math.inf:
+        capped = now + first_return(v - limit, u, jerk)
+        if capped < end:
+            end, reached = capped, limit
+    return u, jerk, end, reached
+
+
+@compiled
+def speed_after(v: float, u: float, jerk: float, step: float, reached: float) -> float:
+    """Speed at the end of a leg, or of the part of it that is ``step`` long (``reached`` is NaN then)."""
+    return max(v + (u + 0.5 * jerk * step) * step, 0.0) if math.isnan(reached) else reached
+
+
+@compiled(apart=True)
+def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, float]:
+    """Speed and way at ``until`` of one that starts at 0 with ``v``."""
+    now, way = 0.0, 0.0
+    while now < until:
+        u, jerk, end, reached = leg_at(plan, now, v, limit)
+        if end > until:
+            end, reached = until, math.nan
+        step = end - now
+        way -= gap_after(0.0, v, u, jerk, step)
+        v, now = speed_after(v, u, jerk, step, reached), end
+    return v, way
+
+
+@compiled
+def force_of(plan: Floats, now: float) -> float:
+    """Force of a plan, at rest as well."""
+    return leg_at(plan, now, 1.0, math.inf)[0]
+
+
+@compiled(apart=True)
+def least_on_cubic(constant: float, pressing: float, jerk: float, since: float, until: float) -> float:
+    """Least value of ``constant / t + pressing t / 2 + jerk t^2 / 3`` from ``since`` to ``until``; -inf at 0, if so."""
+    if since <= 0.0 and constant <= 0.0:
+        return -math.inf
+    least = constant / until + (0.5 * pressing + jerk * until / 3.0) * until
+    turn = -0.5 * pressing / jerk if jerk != 0.0 else since
+    turn = min(max(turn, since), until)
+    for low, high in ((since, turn), (turn, until)):  # on each the sign of the slope changes once at most
+        if low > 0.0:
+            least = min(least, constant / low + (0.5 * pressing + jerk * low / 3.0) * low)
+        if (0.5 * pressing + 2.0 / 3.0 * jerk * high) * high * high <= constant or low >= high:
+            continue
+        for _ in range(_MEETING_HALVINGS):
+            middle = 0.5 * (low + high)
+            if (0.5 * pressing + 2.0 / 3.0 * jerk * middle) * middle * middle < constant:
+                low = middle
+            else:
+                high = middle
+        least = min(least, constant / high + (0.5 * pressing + jerk * high / 3.0) * high)
+    return least
+
+
+@compiled(apart=True)
+def meeting(
+    gap: float, slack: float, v_front: float, front: Floats, front_limit: float, v_rear: float, rear: Floats,
+    rear_limit: float, since: float, until: float,
+) -> tuple[float, float, float]:  # fmt: skip
+    """When two first meet after ``since``, with which closing speed w, and the least forced one; inf, 0, 0: never.
+
+    That is the least of ``w + (gap - slack) / t`` until then, t counted from ``since``: of a run that is never behind
+    these extremes, ``slack`` nearer than they at ``since``, and ever faster by more.
+    """
+    now, least = since, math.inf
+    while now < until:
+        u_f, jerk_f, end_f, reached_f = leg_at(front, now, v_front, front_limit)
+        u_r, jerk_r, end_r, reached_r = leg_at(rear, now, v_rear, rear_limit)
+        end = min(end_f, end_r, until)
+        w, b, jerk, step = v_rear - v_front, u_r - u_f, jerk_r - jerk_f, end - now
+        after, speed = contact_within(max(gap, 0.0), w, b, jerk, step)
+        met, t = after <= step, now - since
+        if met:
+            end = now + after
+        if end - since > t and end < math.inf:
+            c = b - jerk * t
+            constant = gap - slack + (w - (0.5 * c + jerk * t / 3.0) * t) * t
+            least = min(least, least_on_cubic(constant, c, jerk, t, end - since))
+        if met:
+            return end, speed, max(min(least, speed), 0.0)
+        if end == math.inf:
+            break
+        gap = gap_after(gap, w, b, jerk, step)
+        v_front = speed_after(v_front, u_f, jerk_f, step, reached_f if end == end_f else math.nan)
+        v_rear = speed_after(v_rear, u_r, jerk_r, step, reached_r if end == end_r else math.nan)
+        now = end
+    return math.inf, 0.0, 0.0

@@ -1,0 +1,138 @@
+"""An episode as a film, in real time: the environment's own pictures as a GIF or MP4, or a moving drawing as SVG."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from ethbrake_marl.agents.driving import episode_engine
+from ethbrake_marl.agents.protocol import Driver, Team
+from ethbrake_marl.env.motion import Trace
+from ethbrake_marl.env.rendering import Frame, Scene
+from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, need
+from ethbrake_marl.extensions.report.moving_drawing import animate_films
+from ethbrake_marl.physics.state import Worlds
+from ethbrake_marl.scenario.schema import Scenario
+
+Films = Mapping[str, Sequence[Scene]]  # of one world, by title
+
+FILM_FPS = 25
+
+MOST_FILMS = 12  # one below the other
+
+MOST_PICTURES = 2_500  # of all films together: 1.8 GB in memory
+
+_COLOURS = 64
+
+
+def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float = FILM_FPS) -> list[Scene]:
+    """What one world shows from the alert to the end of its episode, ``fps`` moments per second, then its end.
+
+    Args:
+        world: at the alert, n = 1.
+        agent: drives the learner, or, as a team, its vehicles; it is left as it is.
+        scenario: of the world; its scripts drive the other vehicles.
+        fps: moments per second of the world.
+
+    Raises ``InvalidInput`` for more than one world, ``PhysicsError`` for one that could not be advanced.
+
+    """
+    if world.n != 1:
+        raise InvalidInput(f"film_scenes: {count_of(world.n, 'world')} given; exactly 1 is needed: worlds.take([0])")
+    engine = episode_engine(world, Team.of(agent, scenario.learners), scenario)
+    trace = Trace(engine, whole=True, alert=world)
+    while not engine.ended.all():
+        engine.step({})
+    if engine.roster.failed:
+        raise PhysicsError(engine.roster.failed)
+    end = float(engine.worlds.time_s[0])
+    times = np.append(np.arange(int(np.ceil(end * fps - 1e-9))) / fps, end)
+    shown: list[Scene] = []
+    for motion in trace.motions(engine):
+        start, until = float(motion.start.time_s[0]), float(motion.until_s[0])
+        mine = times[(times >= start if motion.fresh[0] else times > start) & (times <= until)]
+        shown += motion.scenes(engine, 0, mine) if len(mine) else []
+    return shown
+
+
+def film(world: Worlds, agents: Mapping[str, Driver], ending: str, *, scenario: Scenario) -> bytes:
+    """``film_bytes`` of what agents, each under its title, do in one world; refuses before any work what it can."""
+    check_film(ending, len(agents))
+    films = {title: film_scenes(world, agent, scenario=scenario) for title, agent in agents.items()}
+    return film_bytes(films, ending)
+
+
+def film_bytes(films: Films, ending: str, *, fps: int = FILM_FPS) -> bytes:
+    """Films of one world, titled and one below the other, in real time: an endless GIF or SVG, or an MP4.
+
+    A film that ends before the others shows its end. Raises ``InvalidInput`` without films, for more than
+    ``MOST_FILMS`` or ``MOST_PICTURES``, for an ``ending`` that is
+    none of ``.gif``, ``.mp4`` and ``.svg``, for an ``fps`` whose frames do not last whole hundredths of a second, as a
+    GIF needs, and for an MP4 where the library that writes it is missing.
+    """
+    check_film(ending, len(films))
+    if not films or not all(films.values()):
+        raise InvalidInput("film_bytes: no films given")
+    if not fps > 0 or 100 % fps:
+        raise InvalidInput(f"film_bytes: fps = {fps}: must divide 100, for instance 10, 20, 25 or 50")
+    pictures = len(films) * max(map(len, films.values()))
+    if pictures > MOST_PICTURES:
+        raise InvalidInput(
+            f"film of {len(films)} agents for {pictures // len(films) / fps:g} s: needs {pictures:,} pictures,"
+            f" and at most {MOST_PICTURES:,} are kept; give fewer agents, or a scenario with a shorter horizon_s"
+        )
+    return _WRITERS[ending](films, fps)
+
+
+def check_film(ending: str, films: int = 1) -> None:
+    """Refuse, before any work, what ``film_bytes`` cannot write: that ending, or so many films."""
+    if ending not in _WRITERS:
+        raise InvalidInput(f"a film that ends in {ending!r}: films are written as {', '.join(_WRITERS)}")
+    if ending == ".mp4":
+        need("imageio_ffmpeg")
+    if films > MOST_FILMS:
+        raise InvalidInput(f"film: {films} agents, one below the other; at most {MOST_FILMS} are shown")
+
+
+def _stacked(films: Films) -> Iterator[Frame]:
+    """The frames of all films, one below the other."""
+    for k in range(max(map(len, films.values()))):
+        each = (shown[min(k, len(shown) - 1)]._replace(title=title) for title, shown in films.items())
+        yield np.concatenate([scene.frame() for scene in each])
+
+
+def _write_gif(films: Films, fps: int) -> bytes:
+    from PIL import Image
+
+    pictures = [
+        Image.fromarray(frame).quantize(_COLOURS, method=Image.Quantize.FASTOCTREE) for frame in _stacked(films)
+    ]
+    buffer = io.BytesIO()
+    pictures[0].save(buffer, "GIF", save_all=True, append_images=pictures[1:], duration=1000 // fps, loop=0)
+    return buffer.getvalue()
+
+
+def _write_mp4(films: Films, fps: int) -> bytes:
+    from imageio_ffmpeg import write_frames
+
+    frames = list(_stacked(films))
+    height, width, _ = frames[0].shape
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "film.mp4"
+        writer = write_frames(str(path), (width, height), fps=fps, quality=8)
+        writer.send(None)
+        for frame in frames:
+            writer.send(frame)
+        writer.close()
+        return path.read_bytes()
+
+
+_WRITERS: dict[str, Callable[[Films, int], bytes]] = {
+    ".gif": _write_gif,
+    ".mp4": _write_mp4,
+    ".svg": lambda films, fps: animate_films(films, fps=fps).encode(),
+}

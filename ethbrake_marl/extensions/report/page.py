@@ -1,0 +1,314 @@
+"""Every HTML page: one file that loads nothing, opens from disk, and shows whatever it is told as text.
+
+A page is a title, a sentence or two, and sections. What a section holds are strings, which become paragraphs, and
+parts: tables, figures, the player of episodes. Strings are never markup: they are escaped, and control and direction
+characters are written as in Python.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from ethbrake_marl.env.rendering import BODY_M
+from ethbrake_marl.errors import InvalidInput, plain_text
+from ethbrake_marl.evaluation.conditions import Conditions
+from ethbrake_marl.extensions.report.player import DATA, PLAYER_SCRIPTS, Played
+from ethbrake_marl.files.sheet import Sheet
+
+if TYPE_CHECKING:
+    from ethbrake_marl.figures import Figure
+
+_STAY = "\u00a0"  # a blank at which no line is broken
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A piece of a page, and what it needs there: names of style sheets and scripts of this folder."""
+
+    html: Markup
+    styles: tuple[str, ...] = ()
+    scripts: tuple[str, ...] = ()
+
+    @classmethod
+    def paragraph(cls, text: str, kind: str = "") -> Part:
+        """Text as a paragraph: ``quiet`` (conditions), ``note`` (what must not be overlooked), ``alarm``, or plain."""
+        return cls(Markup('<p class="{}">{}</p>\n').format(kind, shown(text)))
+
+    @classmethod
+    def heading(cls, text: str) -> Part:
+        """A heading inside a section."""
+        return cls(Markup("<h3>{}</h3>\n").format(shown(text)))
+
+    @classmethod
+    def facts(cls, found: Mapping[str, object]) -> Part:
+        """Names and values, one below the other."""
+        lines = [Markup("<dt>{}</dt><dd>{}</dd>").format(shown(name), _text(value)) for name, value in found.items()]
+        return cls(Markup("<dl>\n{}\n</dl>\n").format(Markup("\n").join(lines)))
+
+    @classmethod
+    def remarks(cls, texts: Sequence[str]) -> Part:
+        """A list of what must not be overlooked, one line each; nothing without any."""
+        lines = [Markup("<li>{}</li>").format(shown(text)) for text in texts]
+        return cls(Markup('<ul class="remarks">\n{}\n</ul>\n').format(Markup("\n").join(lines)) if lines else Markup())
+
+    @classmethod
+    def box(cls, title: str, meanings: Mapping[str, str]) -> Part:
+        """Words and what they mean, in a box."""
+        return cls(Markup('<aside class="box"><strong>{}</strong>{}</aside>\n').format(title, cls.facts(meanings).html))
+
+    @classmethod
+    def beside(cls, parts: Sequence[Part]) -> Part:
+        """Parts of equal width side by side; on a narrow screen, one below the other."""
+        return cls._around('<div class="beside">{}</div>\n', parts)
+
+    @classmethod
+    def opened(cls, title: str, parts: Sequence[Part]) -> Part:
+        """Parts that show when their title is chosen."""
+        return cls._around("<details><summary>{}</summary>\n{}</details>\n", parts, shown(title))
+
+    @classmethod
+    def _around(cls, markup: str, parts: Sequence[Part], *texts: str) -> Part:
+        inside = Markup("").join(part.html for part in parts)
+        styles, scripts = (tuple(n for part in parts for n in getattr(part, what)) for what in ("styles", "scripts"))
+        return cls(Markup(markup).format(*texts, inside), styles, scripts)
+
+    @classmethod
+    def data(cls, name: str, content: object, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = ()) -> Part:
+        """Plain data for a script of the page: JSON in which nothing can end the element or begin another."""
+        text = json.dumps(content, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+        for sign in "<>&":
+            text = text.replace(sign, f"\\u{ord(sign):04x}")
+        html = Markup('<script type="application/json" id="{}">{}</script>\n').format(name, Markup(text))
+        return cls(html, styles, scripts)
+
+    @classmethod
+    def template(cls, file: str, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = (), **values: object) -> Part:
+        """A template of this folder with these values; all of them are text but what is Markup already."""
+        return cls(Markup(_environment().get_template(file).render(**values)), styles, scripts)
+
+    @classmethod
+    def table(cls, sheet: Sheet) -> Part:
+        """A table that scrolls by itself where it is wider than the page; a cell may be a ``Shown`` of Markup."""
+        return cls(Markup(sheet.html() + "\n"))
+
+    @classmethod
+    def drawing(
+        cls,
+        figure: Figure | bytes,
+        title: str,
+        description: str,
+        *,
+        alone: bool = False,
+        known: str = "",
+        where: object = "",
+    ) -> Part:
+        """A figure, or the SVG of one of ours, with its title and, in words, what it shows.
+
+        The caption is taken out of the SVG and stands below it as text of the page, which a phone can show.
+
+        Args:
+            figure: in the colours of the page, light or dark.
+            title: above it.
+            description: in words, what it shows.
+            alone: in colours that must not change, such as those of a map; it then stands on white.
+            known: what its caption need not say, because the page does.
+            where: the file that the SVG was read from, for the error where that holds what no figure of ours does.
+
+        """
+        from ethbrake_marl.extensions.report.svg import (
+            inline_svg,  # matplotlib takes a second to load, and some pages draw nothing
+        )
+
+        try:
+            svg, caption = inline_svg(figure, f"{title}. {description}", recolour=not alone)
+        except InvalidInput as error:
+            raise InvalidInput(f"{where}: {error}") from None
+        for told in (known.strip(), description):
+            caption = caption.replace(told, "").strip() if told else caption
+        below = Markup('<p class="quiet">{}</p>').format(shown(caption)) if caption else Markup()
+        return cls(
+            Markup(
+                "<figure><figcaption><strong>{}</strong> <span>{}</span></figcaption>"
+                '<div class="drawing{}" tabindex="0" role="group" aria-label="{}">{}</div>{}</figure>\n'
+            ).format(shown(title), shown(description), " map" * alone, shown(title), Markup(svg), below)
+        )
+
+    @classmethod
+    def player(
+        cls,
+        worlds: Sequence[Played],
+        driven: Sequence[int] | Mapping[str, Sequence[int]],
+        *,
+        focus: str = "",
+        shown_first: Sequence[int] = (),
+        folded: bool = False,
+    ) -> Part:
+        """The player of these worlds, all driven by the same agents.
+
+        Args:
+            worlds: at least one.
+            driven: indices (0 = front) of the vehicles that the agents drive; by agent where they drive others.
+            focus: the agent that is shown from the beginning, between the first and the last.
+            shown_first: numbers of the agents that are shown from the beginning, where those are others.
+            folded: traces show when their title is chosen.
+
+        """
+        agents, one = list(worlds[0].motions), next(iter(worlds[0].motions.values())).world
+        by_agent = driven if isinstance(driven, Mapping) else dict.fromkeys(agents, driven)
+        middle = [agents.index(focus)] if focus in agents else []
+        order = dict.fromkeys([*middle, 0, *reversed(range(len(agents)))])
+        told: list[dict[str, Any]] = []
+        for world in worlds:
+            alert = next(iter(world.motions.values())).world
+            title = shown(world.title or f"World {world.number}")
+            episodes = [Played.episode(motion, by_agent[agent]) for agent, motion in world.motions.items()]
+            told.append({
+                "conditions": f"{title}: {Conditions.of(alert).quantities}.",
+                "episodes": episodes,
+                "number": world.number,
+                "title": title,
+                "kind": shown(world.kind),
+                "why": shown(world.why),
+            })  # fmt: skip
+        content = {
+            "vehicles": one.N,
+            "agents": [shown(agent) for agent in agents],
+            # the first, the focus, and as many of the last as there is room for
+            "shown": list(shown_first) or sorted(list(order)[:3]),
+            "worlds": told,
+        }
+        shielded = any(episode["stepped"] for world in told for episode in world["episodes"])
+        return cls.template(
+            "player.html.j2",
+            ("player.css",),
+            PLAYER_SCRIPTS,
+            vehicles=one.N,
+            shielded=shielded,
+            folded=folded,
+            name=DATA,
+            episodes=cls.data(DATA, content).html,
+            body=BODY_M,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A section of a page: strings, which become paragraphs, and parts."""
+
+    title: str
+    body: Sequence[str | Part]
+
+    @property
+    def parts(self) -> list[Part]:
+        """The body, every string as a paragraph."""
+        return [Part.paragraph(each) if isinstance(each, str) else each for each in self.body]
+
+
+@dataclass(frozen=True)
+class Page:
+    """A whole page.
+
+    Args:
+        title: of the page.
+        sections: in this order, each with an entry in the table of contents.
+        lead: what the page is about, in a sentence or two below its title.
+        opening: parts between these and the table of contents.
+
+    >>> from ethbrake_marl.pages.page import Page, Part, Section
+    >>> section = Section("Results", ["Text with <b> stays text.", Part.paragraph("small print")])
+    >>> "Text with &lt;b&gt; stays text." in Page("A page", [section]).html
+    True
+
+    """
+
+    title: str
+    sections: Sequence[Section]
+    lead: str = ""
+    opening: Sequence[Part] = ()
+
+    @cached_property
+    def _parts(self) -> list[Part]:
+        return [*self.opening, *(part for section in self.sections for part in section.parts)]
+
+    @cached_property
+    def _code(self) -> tuple[str, str]:
+        """Its own styles and script: each file once, one after the other."""
+        styles = dict.fromkeys(["page.css", *(name for part in self._parts for name in part.styles)])
+        scripts = dict.fromkeys(name for part in self._parts for name in part.scripts)
+        return "\n".join(map(read_file, styles)), "\n".join(map(read_file, scripts))
+
+    @property
+    def policy(self) -> str:
+        """Its content security policy: its own styles and script, pictures inside it, and nothing else."""
+        styles, script = (
+            f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" if text else "'none'"
+            for text in self._code
+        )
+        return (
+            f"default-src 'none'; style-src {styles}; script-src {script}; img-src data:;"
+            " base-uri 'none'; form-action 'none'"
+        )
+
+    @staticmethod
+    def anchors(titles: Sequence[str]) -> list[str]:
+        """The name of each section of a page with these titles, for links: of letters and digits, no two alike."""
+        found: list[str] = []
+        for k, title in enumerate(titles):
+            name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:40]
+            found.append(f"{name}-{k + 1}" if name in found or not name else name)
+        return found
+
+    @cached_property
+    def html(self) -> str:
+        """The page as text."""
+        styles, script = self._code
+        names = self.anchors([section.title for section in self.sections])
+        whole = Part.template(
+            "page.html.j2",
+            title=self.title,
+            lead=self.lead,
+            opening=self.opening,
+            sections=list(zip(names, self.sections, strict=True)),
+            policy=self.policy,
+            style=Markup(styles),
+            script=Markup(script),
+        )
+        return str(whole.html)
+
+
+def shown(value: object) -> str:
+    """A value as the text that a page shows: no control or direction character, whoever wrote it."""
+    return plain_text(str(value), keep=_STAY)
+
+
+@cache
+def read_file(name: str) -> str:
+    """A file of this folder, as text."""
+    return files(__package__).joinpath(name).read_text("utf-8")
+
+
+@cache
+def _environment() -> Environment:
+    return Environment(
+        loader=PackageLoader("ethbrake_marl.pages", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=_text,
+    )
+
+
+def _text(value: object) -> str:
+    return value if isinstance(value, Markup) else shown(value)

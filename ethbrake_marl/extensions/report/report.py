@@ -1,0 +1,371 @@
+"""Sections of a report: the worst worlds, what was avoidable, and what the shield was good for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from ethbrake_marl.agents.protocol import Driver
+from ethbrake_marl.env.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.errors import count_of
+from ethbrake_marl.evaluation.conditions import Conditions
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.shield_modes import ShieldModes, compare_modes
+from ethbrake_marl.evaluation.statistics import mean, rate
+from ethbrake_marl.evaluation.summary import SummaryRow, SummaryTable
+from ethbrake_marl.extensions.report.harm_figures import harm_by_agent, harm_in_parts, regret_distribution
+from ethbrake_marl.extensions.report.page import Page, Part, Section
+from ethbrake_marl.extensions.report.player import Played
+from ethbrake_marl.extensions.report.shown_worlds import (
+    BASELINE,
+    NAMES,
+    ROUNDING,
+    TRAINED_POLICY,
+    WORDS,
+    choose_shown,
+    worst_rows,
+)
+from ethbrake_marl.extensions.search.shipped import Unproven
+from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown
+from ethbrake_marl.files.store import write_output
+from ethbrake_marl.scenario.task import Task
+
+SHIELD_WORLDS = 200  # in which what a shield replaced is simulated again
+
+
+def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) -> Section:
+    """The ten worlds in which an agent did worst; those that the page plays have a button."""
+    regrets, outcome = evaluation.regrets, evaluation.outcome(focus)
+    avoidable = None if regrets is None else regrets.limits.proof.avoidable
+    columns: dict[str, NDArray[Any] | None] = {
+        "First-impact harm": outcome.first_impact_harm,
+        "Total harm": outcome.total_harm,
+        "Best known, first": None if regrets is None else regrets.first_impact_harm,
+        "Best known, total": None if regrets is None else regrets.total_harm,
+        "Contact": None if avoidable is None else np.where(avoidable, "avoidable", "unavoidable"),
+        "Impacts": outcome.impacts,
+    }
+    told = {name: column.tolist() for name, column in columns.items() if column is not None}
+    rows = []
+    for k in worst_rows(evaluation, focus).tolist():
+        number = int(evaluation.index[k])
+        button = Markup('{} <button type="button" data-watch="{}">Watch</button>').format(number, number)
+        rows.append([Shown(button) if number in watched else number, *(column[k] for column in told.values())])
+    why = ", as nothing is proven of these worlds" if regrets is None else " above the best known"
+    body: list[str | Part] = [f"{focus} did no harm above the best known in any of these worlds."]
+    if rows:
+        table = Part.table(Sheet(f"Worlds of {focus}", list(map(Column, ("World", *told))), rows))
+        body = [f"Of {focus}, by total harm{why}. Harm in m²/s².", table]
+    return Section("Worst ten worlds", body)
+
+
+def avoidable_section(evaluation: Evaluation) -> Section:
+    """Collisions and harm where contact could be avoided, and where nobody could; and the regret of each agent."""
+    regrets = evaluation.regrets
+    body: list[str | Part] = []
+    avoidable = None if regrets is None else regrets.limits.proof.avoidable
+    if isinstance(evaluation.limits, Unproven):
+        told = "Nothing is proven of these worlds, so what was avoidable is not told apart."
+        body.append(f"{told} Reason: {evaluation.limits.because}.")
+    elif regrets is None or avoidable is None:
+        body.append("Where contact can be avoided is not decided for these vehicles, so that is not told apart.")
+    else:
+        share = rate(int(avoidable.sum()), len(avoidable)).in_words(digits=1, scale=100.0, unit=" %")
+        body.append(
+            f"Contact can be avoided in {share} of these worlds (proven, world by world); in the others no command can."
+        )
+        for where, among in (("Contact avoidable", avoidable), ("Contact unavoidable", ~avoidable)):
+            if among.any():
+                part = evaluation.take(among)
+                caption = f"{where}: {count_of(part.worlds.n, 'world')}"
+                rows = [
+                    (
+                        agent,
+                        rate(int(each.collided.sum()), part.worlds.n),
+                        *(mean(each.world_harm(count)) for count in HARM_COUNTS),
+                        *(mean(regrets.regret(evaluation.outcomes[agent], count)[among]) for count in HARM_COUNTS),
+                    )
+                    for agent, each in part.outcomes.items()
+                ]
+                body.append(Part.table(Sheet(caption, _SPLIT, rows)))
+        about = "Mean harm per world as the least that is known, and what each agent did above it."
+        body.append(Part.drawing(harm_in_parts(evaluation), "What the harm is made of", about))
+    title, words = "Harm world by world", "For each harm x, the share of the worlds in which an agent did more."
+    if regrets is not None:
+        title = "Regret world by world"
+        words = "For each regret x, the share of the worlds in which an agent did more than x above the best known."
+    body.append(Part.drawing(regret_distribution(evaluation), title, words))
+    return Section("What was avoidable", body)
+
+
+_SPLIT: tuple[Column | str, ...] = (
+    "Agent", Column("Collided", digits=1, scale=100.0, unit=" %"),
+    *map(Column, ("First-impact harm", "Total harm", "Regret, first-impact", "Regret, total")),
+)  # fmt: skip
+
+
+def shield_section(rows: ShieldModes, conditions: str) -> Section:
+    """The modes of the shield on the same worlds, and what each intervention of step mode was good for."""
+    if not rows:
+        return Section("Shield", ())
+    told = (
+        "Each agent alone and behind every mode of the shield. Each decision that step mode replaced was simulated"
+        " again without it: needed (harm would have been higher), harmless (the same), costly (lower)."
+    )
+    body: list[str | Part] = [told, *map(Part.table, rows.sheets()), Part.paragraph(conditions, "quiet")]
+    if left_out := rows[0].left_out:
+        told_of = count_of(len(left_out), "world")
+        body.append(Part.paragraph(f"Left out: {told_of}, which the physics could not advance.", "note"))
+    return Section("Shield", body)
+
+
+_SHORT = {"collision_rate", "first_impact_harm", "total_harm"}  # beside the agent, in the table that all begins with
+
+_CAPTION = "Means with 95 % intervals, m²/s²"
+
+_OTHERS = {"Knows", "sampled_harm", "vehicle_1_shoved_m", "vehicle_1_shoved_far_rate", "predicted_harm"}
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Everything on the page. ``settings`` and ``versions`` are printed as they are given, name and value."""
+
+    title: str
+    rows: Sequence[SummaryRow]
+    evaluation: Evaluation  # that the rows sum up
+    played: Sequence[Played] = ()  # episodes to watch
+    shield: Section | None = None  # what is behind a shield
+    focus: str = ""  # the agent whose worst worlds are shown
+    figures: Sequence[Part] = ()
+    tests: Sequence[tuple[str, str, Sequence[SummaryRow]]] = ()  # the same agents elsewhere: title, what differs, rows
+    harm_count: HarmCount = "first"  # that agents minimised
+    remarks: Sequence[str] = ()  # what must not be overlooked, below the first sentence
+    summary: str = ""  # what was compared, in a sentence or two
+    settings: Mapping[str, object] = field(default_factory=dict)  # command, seeds, training set-up
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    def driven(self, agents: Mapping[str, Driver], *, on_agent: Callable[[str], None] | None = None) -> Report:
+        """The same with episodes, which every agent drives once more, and with what any shields among them are worth.
+
+        Shields are measured in the first worlds, alone and in every mode.
+
+        Args:
+            agents: that were evaluated, by name; they are left as they are.
+            on_agent: is told each agent that is done.
+
+        """
+        evaluation, focus, harm_count = self.evaluation, self.about, self.harm_count
+        chosen = choose_shown(evaluation, focus)
+        worlds, played = evaluation.worlds.take(np.array(list(chosen), np.int64)), list(chosen.values())
+        scenario = evaluation.scenario
+        if evaluation.vehicles != scenario.learners:
+            scenario = scenario.with_learners(evaluation.vehicles)
+        for name, agent in agents.items():
+            Played.drive(played, worlds, name, agent, scenario)
+            if on_agent is not None:
+                on_agent(name)
+        some = evaluation.worlds.take(np.arange(min(evaluation.worlds.n, SHIELD_WORLDS)))
+        modes = compare_modes(agents, some, Task(evaluation.scenario, evaluation.vehicles, harm_count), behind=True)
+        line = Conditions({**evaluation.conditions, "count": some.n}).line
+        count = "First-impact" if harm_count == "first" else "Total"
+        shield = shield_section(modes, f"{count} harm, which the shield bounds, in m²/s². {line}.")
+        return replace(self, played=played, shield=shield, focus=focus)
+
+    @property
+    def about(self) -> str:
+        """The agent that the page is about: its focus, or the last that drives by a trained policy, or the last."""
+        learned = [row.agent for row in self.rows if row.policy_sha256]
+        return self.focus or (learned or [row.agent for row in self.rows] or [""])[-1]
+
+    @property
+    def html(self) -> str:
+        """The page; it loads nothing from anywhere."""
+        sections: list[Section | None] = [self._results(), self._episodes()]
+        if self.focus:
+            sections.append(worst_section(self.evaluation, self.focus, [one.number for one in self.played]))
+        sections += [avoidable_section(self.evaluation), self.shield, Section("Figures", self.figures)]
+        all_rows = SummaryTable(self.rows)
+        sheet, nowhere = all_rows.sheet(), set(_empty(all_rows))
+        for title, about, told_rows in self.tests:
+            rows = SummaryTable(told_rows)
+            notes = [Part.paragraph(text, "note") for text in _remarks(rows)]
+            told = [_short_table(rows), *notes, *_measured(rows), Part.paragraph(rows.identity_line(), "quiet")]
+            sections.append(Section(title, [about, *told]))
+            nowhere.intersection_update(_empty(rows))
+        unseen = tuple(name for name in sheet.headings[2:] if name in nowhere)
+        seen = tuple(name for name in sheet.headings[2:] if name not in nowhere)
+        meanings = {
+            name: meaning
+            for name, meaning in all_rows.meanings().items()
+            if any(each.startswith(name) for each in seen) or not any(each.startswith(name) for each in unseen)
+        }
+        versions = [Part.facts(self.versions)] if self.versions else []
+        versions += [Part.paragraph(all_rows.identity_line(), "quiet")] if all_rows else []
+        sections += [
+            Section("How to read the tables", [Part.facts(meanings)]),
+            Section("Settings and seeds", [Part.facts(self.settings)] if self.settings else ()),
+            Section("Versions", versions),
+        ]
+        shown = [section for section in sections if section is not None and section.body]
+        return Page(self.title, shown, self.first_sentence, opening=self._opening(all_rows)).html
+
+    def write(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the page; raises ``AlreadyExists`` unless ``force``, ``InvalidInput`` without a folder."""
+        write_output(path, self.html.encode("utf-8"), force=force)
+
+    @property
+    def first_sentence(self) -> str:
+        """How much harm the agent does against full braking, beside the best known, and where it fails.
+
+        It fails in the other tests where it does no less harm than full braking; if in none, in single worlds.
+        """
+        rows, harm = {row.agent: row for row in self.rows}, NAMES[self.harm_count]
+        if self.about not in rows:
+            return ""
+        row, before = rows[self.about], rows.get(BASELINE)
+        name = {BASELINE: "Full braking", TRAINED_POLICY: f"The {TRAINED_POLICY}"}.get(self.about, self.about)
+        value, best = row[harm], row[f"best_known_{harm}"]
+        known = "" if best is None else f"; best known {_words(best)}"
+        impacts = "first impacts" if self.harm_count == "first" else "all impacts"
+        if before is None or row is before:
+            return f"{name} does {_words(value)} m²/s² of harm per emergency ({impacts}{known})."
+        change, decrease = _change(row, harm), row[f"harm_decrease_{self.harm_count}"]
+        much = "" if decrease is None else f"{abs(100.0 * decrease.value):.0f} % "  # None: full braking does none
+        told = "about as much harm as" if change == "as much" else f"{much}{change} harm than"
+        numbers = f"{impacts}: {_words(value)} m²/s² per emergency instead of {_words(before[harm])}{known}"
+        fails = self._fails(harm)
+        joined = ", but " if fails and change == "less" else ", and "
+        return f"{name} does {told} full braking ({numbers}){joined}{fails or 'in none of these worlds more'}."
+
+    def _fails(self, harm: str) -> str:
+        """Where the agent does no less harm than full braking; empty: nowhere."""
+        found = []
+        for title, _, others in self.tests:
+            rows = {row.agent: row for row in others}
+            if self.about in rows and BASELINE in rows and (change := _change(rows[self.about], harm)) != "less":
+                numbers = f"{_words(rows[self.about][harm])} instead of {_words(rows[BASELINE][harm])}"
+                found.append(f"{change} in the {title.lower()} ({numbers})")
+        if found:
+            return " and ".join(found)
+        outcomes = (self.evaluation.outcome(agent) for agent in (self.about, BASELINE))
+        after, before = (outcome.world_harm(self.harm_count) for outcome in outcomes)
+        share = float((after > before + ROUNDING).mean())
+        most = float((after - before).max())
+        return f"more in {100.0 * share:.1f} % of these worlds, by {most:.2f} at most" if share else ""
+
+    def _opening(self, rows: SummaryTable) -> list[Part]:
+        """What must not be overlooked, one figure and one table."""
+        if not rows:
+            return []
+        which = "First-impact" if self.harm_count == "first" else "Total"
+        elsewhere = {title: told for title, _, told in self.tests}
+        marks = "; marks: the other tests" if elsewhere else ""
+        figure = harm_by_agent(rows, self.harm_count, elsewhere)
+        about = f"Mean and 95 % interval{marks}."
+        drawing = Part.drawing(figure, f"{which} harm of each agent", about)
+        return [Part.remarks([*self.remarks, *_remarks(rows)]), Part.beside([drawing, _short_table(rows)])]
+
+    def _results(self) -> Section:
+        rows, limits = SummaryTable(self.rows), self.evaluation.limits
+        because = f" Nothing is proven of these worlds: {limits.because}." if isinstance(limits, Unproven) else ""
+        told: list[str | Part] = [self.summary] if self.summary else []
+        return Section("Results", [*told, Part.box("Three words", WORDS), *_measured(rows, because)])
+
+    def _episodes(self) -> Section:
+        """The episodes to watch; which agents drove otherwise when they drove once more, and where episodes end."""
+        evaluation, played = self.evaluation, self.played
+        if not played:
+            return Section("Episodes", ())
+        rows = {int(number): row for row, number in enumerate(evaluation.index)}
+        unrepeated: dict[str, int] = {}
+        for world in played:
+            for agent, motion in world.motions.items():
+                outcome, row = evaluation.outcome(agent), rows[world.number]
+                counted = (float(outcome.first_impact_harm[row]), float(outcome.total_harm[row]))
+                unrepeated[agent] = unrepeated.get(agent, 0) + (motion.harm != counted)
+        notes = [
+            f"{agent} did not repeat itself in {count_of(count, 'world')} of these: what is played there is another"
+            " episode than the one that the tables count."
+            for agent, count in unrepeated.items()
+            if count
+        ]
+        moving = sum(not all(motion.at_rest for motion in world.motions.values()) for world in played)
+        until = (
+            f"from the alert to rest, or to the horizon of {evaluation.scenario.horizon_s:g} s: in"
+            f" {count_of(moving, 'world')} the line of some agent was not at rest then, and the player says whose"
+        )
+        until = until if moving else "from the alert to rest"
+        shown, every = len(played), evaluation.worlds.n
+        told = f"{shown} of the {every:,} worlds" if shown < every else f"All {shown} worlds"
+        player = Part.player(played, evaluation.vehicles, focus=self.focus)
+        body: list[str | Part] = [f"{told}, {until}.", *(Part.paragraph(text, "note") for text in notes), player]
+        return Section("Episodes", body)
+
+
+def _words(estimate: Estimate | None) -> str:
+    """A mean without its interval."""
+    return Column("").show(estimate).value
+
+
+def _change(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
+    """How the harm compares with that of full braking in the same worlds; "as much" if the interval holds 0."""
+    difference = row[f"{harm}_difference"]
+    low, high = (0.0, 0.0) if difference is None else difference.ends
+    return "less" if high < 0.0 else "more" if low > 0.0 else "as much"
+
+
+def _short_table(rows: SummaryTable) -> Part:
+    """Each agent, how often it collides, and both harms."""
+    return _table(SummaryTable(replace(row, beside_paper=False) for row in rows).sheet(), _CAPTION, _SHORT)
+
+
+def _remarks(rows: SummaryTable) -> list[str]:
+    """What must not be overlooked about these rows."""
+    return [
+        text for kind, text in SummaryTable(replace(row, beside_paper=False) for row in rows).notes() if kind == "note"
+    ]
+
+
+def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
+    """The conditions of these rows, and folded every measure with the paper's rows.
+
+    ``because``: why columns may be empty.
+    """
+    ours = SummaryTable(replace(row, beside_paper=False) for row in rows)
+    whole, notes, empty = rows.sheet(), ours.notes(), _empty(rows)
+    folded = [
+        _table(whole, "Every harm and what it is compared with", set(whole.names) - _OTHERS),
+        _table(ours.sheet(), "In the same worlds", _OTHERS),
+    ]
+    left_out = f"Columns without a value in any row are left out: {'; '.join(empty)}.{because}"
+    told = [*([("quiet", left_out)] if empty else []), *(note for note in rows.notes() if note not in notes)]
+    folded += [Part.paragraph(text, kind) for kind, text in told]
+    quiet = [
+        *(f"{row.parameters.line}. Harm in m²/s²." for row in rows[:1]),
+        *(t for kind, t in notes if kind == "quiet"),
+    ]
+    title = "Every measure" + (", and the paper's rows" if len(whole.rows) > len(rows) else "")
+    return [*(Part.paragraph(text, "quiet") for text in quiet), Part.opened(title, folded)]
+
+
+def _empty(rows: SummaryTable) -> list[str]:
+    """Columns of the table of these rows in which no line has a value."""
+    sheet = rows.sheet()
+    filled = sheet.filled()
+    return [name for k, name in enumerate(sheet.headings) if k not in filled]
+
+
+def _table(sheet: Sheet, caption: str, names: set[str]) -> Part:
+    """Columns of a table by name, beside those of the agent; what is empty is left out."""
+    filled = set(sheet.filled())
+    some = sheet.only(k for k, name in enumerate(sheet.names) if k == 0 or (name in names and k in filled))
+    rows = [
+        f"The paper's {row.removeprefix('paper, ')}, as printed" if isinstance(row, str) else row for row in some.rows
+    ]
+    return Part.table(replace(some, title=caption, rows=rows))

@@ -1,0 +1,178 @@
+"""The style of all figures: colours, axes, caption, and how a figure is written to a file."""
+
+from __future__ import annotations
+
+import io
+import textwrap
+from collections.abc import Mapping, Sequence
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, Literal
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.backend_bases import RendererBase
+from matplotlib.figure import Figure
+from matplotlib.font_manager import findfont, get_font
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from ethbrake_marl.env.rendering import COLOURS
+from ethbrake_marl.errors import InvalidInput, plain_text
+from ethbrake_marl.files.store import write_output
+from ethbrake_marl.physics.state import Floats
+
+# Markers and dashes repeat the distinction of the colours.
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+
+DASHES: tuple[str | tuple[int, tuple[int, ...]], ...] = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1)), "-", "--")
+
+GREY = "#555555"
+
+ALARM = "#b00020"
+
+DPI = 150
+
+CAPTION = "caption"  # the name of a caption's group in an SVG
+
+CAPTION_PT = 7.5
+
+_CHARACTERS_PER_INCH = 17.0  # of a caption
+
+_NO_DATES: dict[str, dict[str, None]] = {  # what would differ from one writing to the next, and from one version too
+    ".png": {"Software": None},
+    ".svg": {"Date": None, "Creator": None},
+    ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+}
+
+
+class ShownFigure(Figure):
+    """A figure that a notebook shows, whether or not pyplot is loaded there."""
+
+    def draw(self, renderer: RendererBase) -> None:
+        """Draw it; the first of the two times that a writing draws it, where nothing is kept, it is only laid out."""
+        engine = self.get_layout_engine()
+        if self.axes and isinstance(engine, ConstrainedLayoutEngine) and self.canvas.is_saving():
+            engine.execute(self)
+        else:
+            super().draw(renderer)
+
+    def _repr_png_(self) -> bytes:
+        return picture_bytes(self, "shown.png")
+
+
+def series_style(number: int) -> dict[str, Any]:
+    """Colour, marker and dashes of the series with this number (from 0); they repeat after seven."""
+    k = number % len(COLOURS)
+    return {"color": COLOURS[k], "marker": MARKERS[k], "linestyle": DASHES[k], "linewidth": 1.6, "markersize": 4.5}
+
+
+def label_text(text: str, most: int = 40) -> str:
+    """Text as a figure may have it, whoever wrote it: no formula, no sign that the font lacks, not too long."""
+    signs = font_signs()
+    told = "".join(c if ord(c) in signs else c.encode("unicode_escape").decode() for c in plain_text(text))
+    return (told if len(told) <= most else f"{told[: most - 16]}…{told[-15:]}").replace("$", r"\$")
+
+
+@cache
+def font_signs() -> frozenset[int]:
+    """Code points that the font of figures has."""
+    return frozenset(get_font(findfont("DejaVu Sans")).get_charmap())
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """An empty figure that lays itself out; it belongs to no window."""
+    return ShownFigure(figsize=(width_in, height_in), layout="constrained")
+
+
+def style_axes(axes: Axes, labelsize: float = 9) -> None:
+    """Thin grid behind the data, no frame where nothing is read off."""
+    axes.grid(visible=True, color="#dddddd", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=labelsize, color=GREY)
+
+
+def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, list[Axes]]:
+    """A figure and its axes, row by row, in the style of all; ``how`` as matplotlib's ``subplots``."""
+    figure = new_figure(*size_in)
+    panels = list(figure.subplots(rows, columns, squeeze=False, **how).ravel())
+    for axes in panels:
+        style_axes(axes)
+    return figure, panels
+
+
+def name_axes(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
+    """What a panel shows, above it, and what its axes mean."""
+    in_style = ((title, partial(axes.set_title, loc="left"), 10), (x, axes.set_xlabel, 9), (y, axes.set_ylabel, 9))
+    for text, write, size in in_style:
+        if text:
+            write(text, fontsize=size)
+
+
+def finish(
+    figure: Figure,
+    caption: str,
+    legend: Axes | None = None,
+    *,
+    columns: int = 6,
+    fontsize: float = 9,
+    loc: Literal["outside upper left", "outside upper right"] = "outside upper left",
+) -> Figure:
+    """The figure with its caption, and one legend for all panels above them: that of the axes given."""
+    if legend is not None:
+        named = legend.get_legend_handles_labels()
+        figure.legend(*named, loc=loc, ncols=columns, frameon=False, fontsize=fontsize)
+    add_caption(figure, caption)
+    return figure
+
+
+def band(axes: Axes, x: Sequence[float] | Floats, low: Any, high: Any, style: Mapping[str, Any]) -> None:
+    """What a line's intervals reach, in the line's colour."""
+    axes.fill_between(x, low, high, color=str(style["color"]), alpha=0.18, linewidth=0.0)
+
+
+def add_caption(figure: Figure, text: str) -> None:
+    """The conditions of a figure, small, below it."""
+    width = int(figure.get_figwidth() * _CHARACTERS_PER_INCH)
+    label = figure.supxlabel(textwrap.fill(text, width), x=0.01, ha="left", fontsize=CAPTION_PT, color=GREY)
+    label.set_gid(CAPTION)
+
+
+def picture_ending(path: str | Path) -> str:
+    """The ending that says how a picture is written; raises ``InvalidInput`` for any but .png, .svg and .pdf."""
+    ending = Path(path).suffix.lower()
+    if ending not in _NO_DATES:
+        raise InvalidInput(f"{path}: pictures are written as PNG, SVG or PDF; end the name in .png, .svg or .pdf")
+    return ending
+
+
+def picture_bytes(figure: Figure, path: str | Path) -> bytes:
+    """The figure as the ending of ``path`` says: ``.png``, ``.svg`` or ``.pdf``; the same figure gives the same bytes.
+
+    Raises ``InvalidInput`` for another ending.
+    """
+    ending = picture_ending(path)
+    buffer = io.BytesIO()
+    # Fonts travel with the file: as outlines in SVG, as TrueType in PDF.
+    with matplotlib.rc_context(
+        {"savefig.facecolor": "white", "svg.hashsalt": "ethbrake", "svg.fonttype": "path", "pdf.fonttype": 42}
+    ):
+        figure.savefig(buffer, format=ending[1:], dpi=DPI, metadata=_NO_DATES[ending])
+    return buffer.getvalue()
+
+
+def write_picture(path: str | Path, figure: Figure, *, force: bool = False) -> None:
+    """Write a figure as the ending of ``path`` says, whole or not at all.
+
+    Raises ``InvalidInput`` for an ending other than ``.png``, ``.svg`` and ``.pdf`` or a file that cannot be written,
+    ``AlreadyExists`` unless ``force``.
+    """
+    write_output(path, picture_bytes(figure, path), force=force)
+
+
+TITLES = {"first": "First-impact harm (m²/s²)", "total": "Total harm (m²/s²)"}
+
+
+def plain(value: float, _: int) -> str:
+    """A tick without powers."""
+    return f"{value:g}"

@@ -1,0 +1,187 @@
+"""The figures of a run."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, PercentFormatter
+
+from ethbrake_marl.env.rendering import COLOURS, vehicle_colour
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.record import EpisodeRecord
+from ethbrake_marl.evaluation.statistics import mean
+from ethbrake_marl.evaluation.summary import SummaryRow
+from ethbrake_marl.extensions.report.style import GREY, band, finish, label_text, name_axes, new_panels, series_style
+from ethbrake_marl.files.sheet import Estimate
+
+_PANELS = (
+    ("first_impact_harm", "First-impact harm (m²/s²)"),
+    ("total_harm", "Total harm (m²/s²)"),
+    ("collision_rate", "Worlds with a collision"),
+)
+
+_POLICY_NUMBER = 3  # the series whose colour is the learning policy's
+
+_POLICY = COLOURS[_POLICY_NUMBER]
+
+
+def learning_curve(
+    points: Sequence[Mapping[str, float]], *, references: Sequence[SummaryRow] = (), caption: str = ""
+) -> Figure:
+    """Both harms and the collision rate of the policy on its fixed list, while it learns.
+
+    Each point has ``steps``, ``first_impact_harm``, ``total_harm`` and ``collision_rate``; ``references`` are drawn as
+    level lines. Raises ``InvalidInput`` without points.
+    """
+    if not points:
+        raise InvalidInput("learning_curve: no points; evaluate the policy at least once during training")
+    figure, panels = new_panels((10.0, 3.9), columns=3)
+    steps = [point["steps"] for point in points]
+    for axes, (name, label) in zip(panels, _PANELS, strict=True):
+        axes.plot(steps, [point[name] for point in points], color=_POLICY, marker="o", markersize=3.5, label="policy")
+        for number, row in enumerate(references):
+            style = series_style(number if number < _POLICY_NUMBER else number + 1)
+            axes.axhline(
+                getattr(row, name).value, color=style["color"], linestyle=style["linestyle"], linewidth=1.2,
+                label=label_text(row.agent),
+            )  # fmt: skip
+        name_axes(axes, label, "Training steps")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.set_ylim(bottom=0.0)
+    panels[2].yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+    return finish(figure, caption, panels[0])
+
+
+def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | None = None, bins: int = 12) -> Figure:
+    """Mean of both harms against the sum of the gaps at the alert, one line per agent, bands: 95 % intervals.
+
+    Worlds are grouped into ``bins`` equal parts of the range. Raises ``InvalidInput`` for an unknown agent or
+    ``bins < 1``.
+    """
+    if not bins >= 1:
+        raise InvalidInput(f"harm_against_total_gap: bins = {bins}; at least 1 is needed")
+    gap, gaps = evaluation.worlds.gaps_m.sum(axis=1), [f"d{p}" for p in range(1, evaluation.worlds.N)]
+    part = np.minimum(((gap - gap.min()) / (np.ptp(gap) or 1.0) * bins).astype(np.int64), bins - 1)
+    groups = [part == k for k in np.unique(part)]
+    sum_of_gaps = " + ".join(gaps) if len(gaps) <= 3 else f"d1 + … + {gaps[-1]}"
+    figure, panels = new_panels((10.0, 4.6), columns=2, sharey=True)
+    for axes, (name, label) in zip(panels, _PANELS[:2], strict=True):
+        for number, agent in enumerate(evaluation.outcomes if agents is None else agents):
+            harm, style = getattr(evaluation.outcome(agent), name), series_style(number)
+            estimates = [mean(harm[group]) for group in groups]
+            at = [float(gap[group].mean()) for group in groups]
+            axes.plot(at, [each.value for each in estimates], label=label_text(agent), **style)
+            ends = np.array([each.ends for each in estimates])
+            if len(groups) > 1:
+                band(axes, at, ends[:, 0], ends[:, 1], style)
+            else:
+                axes.vlines(at, ends[:, 0], ends[:, 1], color=str(style["color"]), linewidth=1.2)
+        name_axes(axes, label, f"Total gap at the alert, {sum_of_gaps} (m)")
+        axes.set_ylim(bottom=0.0)
+    caption = f"Mean per group of worlds; bands: 95 % intervals. {evaluation.conditions.line}."
+    return finish(figure, caption, panels[0])
+
+
+_ARROW_STEPS = 10  # the paper draws every tenth time step
+
+_ROW_CHARACTERS = 52  # of a line beside the axis
+
+
+def estimates_figure(
+    panels: Mapping[str, Mapping[str, Mapping[Any, Estimate]]], *, y_label: str, caption: str, x_label: str = ""
+) -> Figure:
+    """One panel per title, and in it one series of estimates per label.
+
+    Over numbers, which ``x_label`` names: lines, bands: 95 % intervals. Over texts: for each a bar for each label.
+    """
+    figure, every = new_panels((4.6 * len(panels), 4.2), columns=len(panels), sharey=True)
+    for axes, (title, lines) in zip(every, panels.items(), strict=True):
+        width, groups = 0.8 / len(lines), list(next(iter(lines.values())))
+        for number, (label, line) in enumerate(lines.items()):
+            style, y = series_style(number), [each.value for each in line.values()]
+            low, high = zip(*(each.ends for each in line.values()), strict=True)
+            if x_label:
+                axes.plot(list(line), y, label=label, **style)
+                band(axes, list(line), low, high, style)
+                continue
+            x = [k + (number - 0.5 * (len(lines) - 1)) * width for k in range(len(line))]
+            axes.bar(x, y, 0.9 * width, color=str(style["color"]), label=label)
+            axes.vlines(x, low, high, color="black", linewidth=1.0)
+        if not x_label:
+            axes.set_xticks(range(len(groups)), groups)
+        name_axes(axes, title, x_label)
+    if x_label:
+        every[0].set_ylim(bottom=0.0)
+    name_axes(every[0], y=y_label)
+    return finish(figure, caption, every[0], columns=3)
+
+
+def road_figure(records: Mapping[str, EpisodeRecord], *, caption: str) -> Figure:
+    """As the paper draws it: position along the road against the vehicle, an arrow at every tenth time step.
+
+    Dashed lines join the vehicles at the same time. One panel per record, two in a row.
+    """
+    figure, panels = _in_pairs(len(records), 1.9, "Position along the road (m)", "Vehicle")
+    for axes, (title, record) in zip(panels, records.items(), strict=False):
+        vehicles = np.arange(1, record.positions_m.shape[1] + 1)
+        times = np.arange(0.0, record.time_s[-1] + 1e-9, _ARROW_STEPS * record.scenario.time_step_s)
+        at = np.array([np.interp(times, record.time_s, column) for column in record.positions_m.T])
+        axes.plot(at, vehicles, color=GREY, linewidth=0.7, linestyle="--")
+        for i, number in enumerate(vehicles):
+            colour = vehicle_colour(i)
+            axes.plot([at[i].min(), at[i].max()], [number, number], color=colour, linewidth=1.4)
+            axes.plot(at[i], np.full(len(times), number), linestyle="none", marker=">", markersize=6, color=colour)
+        axes.set_yticks(vehicles)
+        axes.set_ylim(0.5, len(vehicles) + 0.5)
+        name_axes(axes, title)
+    return finish(figure, caption)
+
+
+def _in_pairs(panels: int, height_in: float, x: str, y: str) -> tuple[Figure, list[Axes]]:
+    """Panels on common scales, two in a row, named at the left and below."""
+    rows = (panels + 1) // 2
+    figure, every = new_panels((10.0, height_in * rows + 1.0), rows, 2, sharex=True, sharey=True)
+    for axes in every[::2]:
+        name_axes(axes, y=y)
+    for axes in every[-2:]:
+        name_axes(axes, x=x)
+    return figure, every
+
+
+def profiles_figure(panels: Mapping[str, Mapping[str, EpisodeRecord]], *, caption: str) -> Figure:
+    """The command of the driven vehicle over time: one panel per title, one line per label."""
+    figure, every = _in_pairs(len(panels), 2.3, "Time since Vehicle 1 began to brake (s)", "Command (m/s²)")
+    for axes, (title, records) in zip(every, panels.items(), strict=False):
+        axes.axhline(0.0, color=GREY, linewidth=0.8)
+        for number, (label, record) in enumerate(records.items()):
+            style = {**series_style(number), "marker": ""}
+            command = record.command_mps2[:, record.vehicle]
+            axes.plot(record.time_s, command, drawstyle="steps-post", label=label, **style)
+        name_axes(axes, title)
+    return finish(figure, caption, every[0], columns=4)
+
+
+def changes_figure(changes: Mapping[str, Mapping[str, Estimate]], *, x_label: str, caption: str) -> Figure:
+    """By how much each change moves a number: one row per change, one mark per label, with its interval."""
+    rows = list(changes)
+    labels = list(dict.fromkeys(label for each in changes.values() for label in each))
+    figure, (axes,) = new_panels((9.4, 0.3 * len(rows) + 1.6))
+    axes.axvline(0.0, color=GREY, linewidth=0.9)
+    for number, label in enumerate(labels):
+        at = [(len(rows) - 1 - k + 0.16 * (0.5 * (len(labels) - 1) - number), changes[row].get(label))
+              for k, row in enumerate(rows)]  # fmt: skip
+        known = [(y, each.value, *each.ends) for y, each in at if each is not None]
+        y, value, low, high = zip(*known, strict=True)
+        style = series_style(number)
+        axes.hlines(y, low, high, color=str(style["color"]), linewidth=1.4)
+        axes.plot(value, y, linestyle="none", marker=style["marker"], markersize=4.5, color=style["color"],
+                  label=label)  # fmt: skip
+    axes.set_yticks(range(len(rows)), [textwrap.fill(row, _ROW_CHARACTERS) for row in rows[::-1]], fontsize=8)
+    name_axes(axes, x=x_label)
+    return finish(figure, caption, axes, columns=3)

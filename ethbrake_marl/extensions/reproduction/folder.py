@@ -1,0 +1,282 @@
+"""The folder: ``reproduction.json`` says what was asked for, ``index.html`` shows everything, each item has a folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import chain
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass as model
+
+from ethbrake_marl.errors import InvalidInput, OnProgress, count_of
+from ethbrake_marl.extensions.report.page import Part
+from ethbrake_marl.extensions.reproduction.trainings import Group, groups
+from ethbrake_marl.extensions.reproduction.verdicts import (
+    LIST_SEED,
+    MOST_EPISODES,
+    WRITTEN,
+    Mode,
+    Verdict,
+    summarise_verdicts,
+)
+from ethbrake_marl.figures import Figure
+from ethbrake_marl.files.sheet import Estimate, Sheet, Shown, csv_text as csv_of
+from ethbrake_marl.files.store import check_target
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.training.run_folder import RunDirectory
+
+SETTINGS, RESULT = "reproduction.json", "result.json"
+
+FORMAT = {"format": "ethbrake-reproduction", "format_version": 2}
+
+LIMIT_BYTES = 16 << 20  # of a figure that is read again
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reproduction:
+    """What a reproduction is asked for."""
+
+    mode: Mode
+    folder: Path  # of everything; its trainings are read from there
+    episodes: int = MOST_EPISODES  # the most worlds of any list; the paper has 10,000
+    tell: OnProgress = lambda progress: None
+    machine: str = ""  # in words
+    docs: Path | None = None  # a page of the results as Markdown
+
+    def __post_init__(self) -> None:
+        """Refuse a page whose name does not end in ``.md``, or that cannot be written."""
+        if self.docs is not None:
+            if self.docs.suffix != ".md":
+                raise InvalidInput(f"{self.docs}: must end in .md")
+            check_target(self.docs, force=True)
+
+    def seeds_of(self, wanted: Collection[str]) -> list[tuple[Group, str, list[Path]]]:
+        """Each recipe of these groups of trainings, in their order, with the folders of its seeds; none of --quick."""
+        return [
+            (
+                group,
+                name,
+                [self.folder / "trainings" / group.name / f"{name}-seed{seed}" for seed in range(group.seeds)],
+            )
+            for group in groups().values()
+            if group.name in wanted and self.mode == "full"
+            for name in group.trained
+        ]
+
+    def trained(self, wanted: Collection[str]) -> dict[str, list[Path]]:
+        """The recipes of these groups all of whose seeds are trained, as ``group/recipe``, with their folders."""
+        return {
+            f"{group.name}/{name}": paths
+            for group, name, paths in self.seeds_of(wanted)
+            if all(RunDirectory(path).is_finished for path in paths)
+        }
+
+    def seconds_left(self, wanted: Collection[str]) -> float:
+        """Seconds of one core that the trainings of these groups still take, begun ones reckoned whole."""
+        return sum(
+            group.trained[name][0].decisions / group.trained[name][0].per_s
+            for group, name, paths in self.seeds_of(wanted)
+            for path in paths
+            if not RunDirectory(path).is_finished
+        )
+
+    def train(self, wanted: Collection[str]) -> bool:
+        """Train what is left of these groups, in their order; False when Ctrl-C stopped it."""
+        from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
+
+        for group in groups().values():
+            if group.name in wanted:
+                plan = [(recipe, group.seeds) for _, recipe in group.trained.values()]
+                place = self.folder / "trainings" / group.name
+                if not LearningCurves(load_scenario(group.scenario), plan, place).train(tell=self.tell):
+                    return False
+        return True
+
+    def cost(self, items: Sequence[Item]) -> str:
+        """What is left to do and about how long it takes, in one line."""
+        wanted = {group for item in items for group in item.trained} if self.mode == "full" else set()
+        told = (
+            f"to do: {count_of(len(items), 'item')}, at most about {sum(item.most_s for item in items)} s of one core"
+        )
+        training_s = self.seconds_left(wanted)
+        return f"{told}; trainings before them about {training_s / 60.0:.0f} min of one core" if wanted else told
+
+
+@model(frozen=True, config=WRITTEN)
+class Parameter:
+    """A quantity that shapes an item, and who says what it is."""
+
+    name: str
+    value: str
+    origin: str = "our default"
+
+
+def stated(name: str, value: str, where: str) -> Parameter:
+    """A quantity that the paper states there; an empty place makes it ours."""
+    return Parameter(name, value, f"stated in the paper ({where})") if where else Parameter(name, value)
+
+
+@model(frozen=True, config=WRITTEN)
+class Table:
+    """A table as it is shown: each cell a value, and an interval where there is one."""
+
+    title: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[Shown]]
+    note: str = ""
+
+
+@model(frozen=True, config=WRITTEN)
+class Drawn:
+    """A figure; ``text`` says in words what it shows."""
+
+    stem: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,63}$")]  # of its files
+    title: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """What became of an item."""
+
+    verdicts: Sequence[Verdict]
+    parameters: Sequence[Parameter]
+    tables: Sequence[Sheet] = ()
+    figures: Mapping[Drawn, Figure] = field(default_factory=dict)
+    data: Mapping[str, str] = field(default_factory=dict)  # stem of a CSV file -> its text
+    notes: Sequence[str] = ()  # computed sentences: what was run, what was not
+
+
+@model(frozen=True, config=WRITTEN, kw_only=True)
+class Result:
+    """An item and what became of it, as its file holds it and pages show it."""
+
+    name: str
+    labels: Sequence[str]
+    title: str
+    what: str
+    mode: Mode = "quick"
+    episodes: int = MOST_EPISODES
+    trained: Sequence[str]
+    processor_s: float
+    made_utc: str
+    machine: str
+    verdict: Verdict
+    comparisons: Sequence[Verdict]
+    parameters: Sequence[Parameter]
+    tables: Sequence[Table]
+    figures: Sequence[Drawn]
+    data: Sequence[str]
+    notes: Sequence[str]
+
+    def in_words(self) -> dict[str, Any]:
+        """As plain data, each cell of a table one text."""
+        tables = [
+            {**asdict(table), "rows": [[cell.in_words for cell in row] for row in table.rows]} for table in self.tables
+        ]
+        return asdict(self) | {"tables": tables}
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One figure or table of the paper, and what makes it again."""
+
+    name: str  # on the command line, and of its folder
+    labels: tuple[str, ...]  # in the paper's source
+    title: str
+    what: str  # the paper's figure or table, in a sentence
+    make: Callable[[Reproduction], Made]
+    most_s: float  # processor seconds at the paper's numbers of worlds, and a little more
+    trained: tuple[str, ...] = ()  # the groups of trainings that it shows with ``--full``
+    play: Callable[[], Part] | None = None  # episodes to watch on its page
+
+
+def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A CSV file; an estimate takes three columns: value, low, high."""
+    parts = ([(e.value, *(e.interval or ("", ""))) if isinstance(e, Estimate) else (e,) for e in row] for row in rows)
+    return csv_of([dict(zip(head, chain(*row), strict=True)) for row in parts], head)
+
+
+_SETTING = "sec:result, text to Fig:Harm-ivds"
+
+_QUANTITIES = (  # name, key of a scenario, unit, where the paper states it
+    ("braking capacities", "braking_capacity_mps2", "m/s²", _SETTING),
+    ("driving capacities", "driving_capacity_mps2", "m/s²", _SETTING),
+    ("masses", "mass_t", "t", _SETTING),
+    ("gaps", "gaps_m", "m", "the item's text"),
+    ("speeds", "speeds_mps", "m/s", "the item's text"),
+    ("latencies (Vehicle 1, 2, 3)", "latency_s", "s", _SETTING),
+    ("restitution e", "restitution", "", ""),
+    ("time step", "time_step_s", "s", ""),
+    ("horizon", "horizon_s", "s", ""),
+    ("speed limit v_max", "speed_limit_mps", "m/s", ""),
+)
+
+POLICIES = "PPO and SAC are the shipped policies, trained on paper-random at 0.5 and 0.8 s"
+
+FIRST_IMPACTS = stated("harm", "each pair's first impact", "sec:result, Experimental Set-Up")
+
+
+def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
+    """The quantities of a scenario, each with its origin.
+
+    ``places`` changes for a key where the paper states it; an empty text makes it ours.
+    """
+    content = scenario.model_dump(mode="json", exclude_none=True)
+    found = [
+        stated(name, f"{_plain(content[key])}{f' {unit}' if unit else ''}", places.get(key, where))
+        for name, key, unit, where in _QUANTITIES
+        if key in content
+    ]
+    early = "worlds in which Vehicle 2 is hit before it may act are drawn again"
+    return [*found, stated("early impacts", early, "sec:system_model, assumed away")]
+
+
+def list_parameter(episodes: int, where: str = "") -> Parameter:
+    """How many worlds were drawn, and from which seed (which is ours: the paper says "a fixed random seed")."""
+    return stated("worlds", f"{episodes:,}, the first of the list of seed {LIST_SEED}", where)
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, Mapping):
+        return "; ".join(f"{name} {_plain(each)}" for name, each in value.items())
+    if isinstance(value, list):
+        return "(" + ", ".join(_plain(each) for each in value) + ")"
+    return f"{value:g}" if isinstance(value, int | float) else str(value)
+
+
+H_STAR = stated("H*", "realised (ours) and predicted pair by pair (the paper's)", "sec:baseline_drl, Hybrid DRL")
+
+NOT_THEIRS = Parameter("policies", f"{POLICIES}; not the paper's")
+
+
+def json_text(content: Mapping[str, Any]) -> bytes:
+    return (json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
+
+
+def checked_result(content: Mapping[str, Any], where: Path | str, name: str) -> Result:
+    """The result in the file of an item.
+
+    Raises ``InvalidInput`` where what pages show is not there or of another kind, or another item's.
+    """
+    try:
+        result = TypeAdapter(Result).validate_json(json.dumps(content))
+    except ValidationError as error:
+        wrong = ": ".join(map(str, error.errors()[0]["loc"]))
+    else:
+        lines = [(each.head, row) for each in result.tables for row in [each.head, *each.rows]]
+        checks = {
+            "name": result.name == name,
+            "data": all(Path(file).name == file for file in result.data),
+            "tables: rows": all(head and len(row) == len(head) for head, row in lines),
+            "verdict": result.verdict == summarise_verdicts(result.comparisons),
+        }
+        wrong = next((what for what, is_right in checks.items() if not is_right), "")
+    if wrong:
+        raise InvalidInput(f"{where}: {wrong}: is not what a reproduction writes; make it again (--force)")
+    return result

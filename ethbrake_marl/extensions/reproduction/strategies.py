@@ -1,0 +1,115 @@
+"""Strategies on the paper's worlds, at the latencies that it states and with Vehicle 2 acting at 0.2 s."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.errors import Progress
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.named_worlds import make_agents
+from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.extensions.reproduction.folder import Reproduction
+from ethbrake_marl.extensions.reproduction.trainings import EARLY, STOPPED
+from ethbrake_marl.extensions.reproduction.verdicts import LIST_SEED, PREDICTED, PROVEN
+from ethbrake_marl.extensions.search.shipped import Unproven
+from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.policies.network import Policy, load_policy
+from ethbrake_marl.policies.shipped import load_shipped
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.paper_hybrid import HybridAgent
+from ethbrake_marl.training.run_folder import RunDirectory
+
+FULL_BRAKE, PAIRWISE, COUPLED = "full_brake", "e_v2x_bm:pairwise", "e_v2x_bm"
+
+SAC, PPO, UNIVERSAL = "sac@shipped/sac", "ppo@shipped/ppo", "universal@shipped"
+
+NAMES = {  # of the strategies in tables and figures
+    FULL_BRAKE: "Non-ethical (full braking)",
+    PAIRWISE: "E-V2X-BM, realised",
+    COUPLED: "E-V2X-BM, coupled",
+    SAC: "SAC",
+    PPO: "PPO",
+    UNIVERSAL: "universal policy",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """A time from which Vehicle 2 acts."""
+
+    name: str
+    acts_s: float | None = None  # None: the scenario's own
+
+    def scenario(self, name: str, **changes: object) -> Scenario:
+        """A shipped scenario so read."""
+        found = load_scenario(name).replace(**changes) if changes else load_scenario(name)
+        if self.acts_s is None:
+            return found
+        first, _, *others = found.model_dump()["latency_s"]
+        return found.replace(latency_s=[first, self.acts_s, *others])
+
+
+READINGS = (Reading("as stated"), Reading("Vehicle 2 acts at 0.2 s", 0.2))
+
+
+def lineup(scenario: Scenario, *specs: str) -> dict[str, Agent]:
+    """Agents by their names in ``NAMES``, else by their spec."""
+    return {NAMES.get(spec, spec): agent for spec, agent in make_agents(specs, scenario).items()}
+
+
+def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, settings: Reproduction) -> Evaluation:
+    """Let every agent drive the first worlds of the list."""
+    return evaluate(
+        scenario.sample(episodes, LIST_SEED),
+        agents,
+        scenario=scenario,
+        seed=LIST_SEED,
+        aftermath=False,
+        on_progress=lambda name, done: settings.tell(Progress(scenario.name, done, episodes)),
+    )
+
+
+def harms(evaluation: Evaluation) -> dict[str, Floats]:
+    """First-impact harm of each strategy in each world, what E-V2X-BM predicts, what nobody undercuts, [n] m2/s2."""
+    found = {name: outcome.first_impact_harm for name, outcome in evaluation.outcomes.items()}
+    pairwise = evaluation.outcomes.get(NAMES[PAIRWISE])
+    if pairwise is not None and pairwise.predicted_harm is not None:
+        found[PREDICTED] = pairwise.predicted_harm
+    if not isinstance(evaluation.limits, Unproven) and evaluation.limits.proof.harm is not None:
+        found[PROVEN] = evaluation.limits.proof.harm
+    return found
+
+
+_STAND_IN = "ppo-paper-random-obstacle"  # for one that has not converged, where nothing is trained
+
+
+def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:
+    """What stands for the paper's "PPO model obtained from training before convergence occurred", and what it is.
+
+    The one stopped early that ``--full`` has trained, else a shipped policy that stands in for it.
+    """
+    for (path,) in settings.trained([STOPPED]).values():
+        about = f"PPO stopped early: the last policy of {EARLY.decisions:,} decisions on paper-random"
+        return load_policy(RunDirectory(path).last_policy), about
+    about = f"the shipped policy {_STAND_IN!r}, trained for other worlds, stands in for one that has not converged"
+    return load_shipped(_STAND_IN), about
+
+
+def hybrid(policy: Policy, scenario: Scenario, bound: Literal["coupled", "pairwise"]) -> Agent:
+    """Algorithm 1 around a policy."""
+    return HybridAgent(LearnedAgent(policy, "policy"), scenario, bound=bound)
+
+
+FOUR = (FULL_BRAKE, PAIRWISE, COUPLED, SAC, PPO)  # the paper's four, E-V2X-BM twice
+
+BASELINES = (NAMES[PAIRWISE], NAMES[COUPLED], PREDICTED)
+
+ABOUT_BASELINE = (
+    "E-V2X-BM, predicted: what the closed form expects, pair by pair. Realised: what that deceleration does once speeds"
+    " are exchanged. Coupled: the constant deceleration of least harm in the same physics."
+)

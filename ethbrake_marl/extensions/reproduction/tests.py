@@ -1,0 +1,99 @@
+"""The three tests that are shown beside each other, and the rows that the paper prints for its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.task import Task
+
+TESTS = {
+    "paper-random": "Main test, the paper's rules: Vehicle 2 may drive, nothing stands ahead of Vehicle 1, and pushing"
+    " it on costs nothing in either count.",
+    "paper-random-brake-only": "Brake-only test: the same worlds, but Vehicle 2 may only brake and coast; it can"
+    " neither drive on nor push with its motor.",
+    "paper-random-obstacle": "Obstacle test: the same worlds with the obstacle that Vehicle 1 brakes for, 1.7 m beyond"
+    " where it stops by itself. Vehicle 1's impact with it is harm.",
+}
+
+
+def is_as_shipped(scenario: Scenario) -> bool:
+    """Whether every value of the scenario is that of the shipped one of its name, whatever its texts say."""
+    one, other = (
+        each.model_dump(exclude={"title", "description", "source"}) for each in (scenario, load_scenario(scenario.name))
+    )
+    return one == other
+
+
+def other_tests(scenario: Scenario) -> tuple[Scenario, ...]:
+    """The two tests that belong beside results on ``scenario``; none where it is not one of the three as shipped."""
+    if scenario.name not in TESTS or not is_as_shipped(scenario):
+        return ()
+    return tuple(load_scenario(name) for name in TESTS if name != scenario.name)
+
+
+@dataclass(frozen=True, slots=True)
+class PaperRow:
+    """One row of a table of the paper, as printed; the paper reports a single harm and no intervals."""
+
+    table: Literal["random test", "hybrid test"]
+    agent: str  # the paper's name
+    episodes: int
+    collisions: int
+    collision_rate: float
+    average_harm: float  # m2/s2
+    harm_decrease: float | None  # relative to Non-E, as printed
+
+
+PAPER_ROWS = (
+    PaperRow("random test", "Non-E", 10_000, 9391, 0.9391, 33.5878, 0.0),
+    PaperRow("random test", "E-V2X-BM", 10_000, 8520, 0.852, 9.8772, 0.7059),
+    PaperRow("random test", "Hybrid SAC", 10_000, 5896, 0.5896, 5.7001, 0.8302),
+    PaperRow("random test", "Hybrid PPO", 10_000, 5974, 0.5974, 5.6202, 0.8326),
+    PaperRow("hybrid test", "E-V2X-BM", 5_000, 4263, 0.8526, 9.8514, None),
+    PaperRow("hybrid test", "Standalone DRL", 5_000, 3737, 0.7474, 12.229, None),
+    PaperRow("hybrid test", "Hybrid", 5_000, 2995, 0.599, 7.3641, None),
+)
+
+PAPER_PARAMETERS = {
+    "random test": (
+        "10,000 worlds; d = 5–10 m; v = 18–22 m/s; braking and driving capacity (6, 7, 6) m/s²; τ2 = 0.5 s, τ3 = 0.8 s;"
+        " m = (4.5, 5.5, 5.9) t; not stated: e, time step, horizon, seed"
+    ),
+    "hybrid test": (
+        "5,000 worlds; d = 5–10 m; capacities, latencies and masses as in the random test; not stated: speeds for this"
+        " test, e, time step, horizon, seed"
+    ),
+}
+
+PAPER_NOTE = (
+    "The paper's rows cannot come from the parameters that it states: in 62.3 % of the worlds of its random test no"
+    " command of Vehicle 2 whatsoever avoids an impact (in 65.1 % none avoids contact), yet its hybrids collide in"
+    " 59 %; and in its 5,000-world test the hybrid avoids 2,005 collisions, although its two parts together avoid at"
+    " most 2,000. If Vehicle 2 could act at about 0.2 s instead of the stated 0.5 s, full braking would come close to"
+    " the paper's row (the scenario paper-random-early). The paper's E-V2X-BM harm is close to what the pairwise closed"
+    " form predicts at the alert, not to what those commands cause; for the 5,000-world table that holds only at the"
+    " speeds of the random test, since at those of the paper's figure of distances it predicts 3.07. Nothing here is"
+    " tuned to these rows. docs/paper.md goes through the paper's equations, figures and tables one by one."
+)
+
+_SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the variant of which the note speaks
+
+
+def is_papers_test(task: Task, seed: int | None) -> bool:
+    """Whether the paper's rows are about this: Vehicle 2 in a list of its random test, as shipped."""
+    scenario = task.scenario
+    return scenario.name in _SHOWN_WITH and seed is not None and task.vehicles == (1,) and is_as_shipped(scenario)
+
+
+def check_papers_test(task: Task, seed: int | None) -> None:
+    """Raise ``InvalidInput`` where the paper's rows are about something else."""
+    if not is_papers_test(task, seed):
+        raise InvalidInput(
+            f"paper: the paper's rows are about Vehicle 2 in a list of {' or '.join(_SHOWN_WITH)} as shipped, and these"
+            f" are {'worlds of no known seed' if seed is None else 'a list'} of {task.scenario.name!r};"
+            f" {'give evaluate the seed of the list, or ' if seed is None else ''}leave paper out"
+        )

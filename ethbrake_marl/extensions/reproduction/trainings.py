@@ -1,0 +1,91 @@
+"""The trainings of ``ethbrake reproduce --full``: learning curves, a policy stopped early, open weights of the reward.
+
+Each group is a folder of learning curves: finished trainings are kept, begun ones go on, by the rules of
+``learning_curves.train_all``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
+
+STOPPED, OPEN = "stopped", "open"
+
+CURVES = {delay: (delay, f"{delay}-ppo-paper", f"{delay}-sac-paper") for delay in ("low", "high")}  # -> groups
+
+HARM_COLUMN = "eval/first_impact_harm"  # column of a training's table
+
+_STATED_STATE = (  # positions and speeds of all, and the others' actions: no more is in the paper's state
+    "own.speed", "own.acceleration", "front_1.gap", "front_1.closing_speed", "front_1.acceleration", "rear_1.gap",
+    "rear_1.closing_speed", "rear_1.acceleration",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class TrainedRecipe:
+    """So many decisions of a recipe, measured every so many updates, and what they take.
+
+    ``per_s``: decisions per second of one core (Intel Xeon), for the estimate that is told beforehand.
+    """
+
+    recipe: str
+    decisions: int
+    every_updates: int
+    per_s: int
+
+    def load(self, name: str, **changes: Any) -> TrainingRecipe:
+        """The recipe under this name, with ``changes``."""
+        found = load_recipe(self.recipe)
+        evaluation = {**found.evaluation.model_dump(), "every_updates": self.every_updates}
+        if "log_every_updates" in type(found).model_fields:  # else a table has a row for every update
+            changes["log_every_updates"] = self.every_updates
+        return found.replace(name=name, total_steps=self.decisions, evaluation=evaluation, **changes)
+
+
+PPO_PAPER = TrainedRecipe("ppo-paper", 100_000, 1, 5_000)
+
+EARLY = TrainedRecipe("ppo", 100_000, 4, 16_000)  # a fifteenth of the recipe's own number
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Trainings on one scenario in one folder, in the order in which they are done."""
+
+    name: str
+    scenario: str  # a shipped one
+    trained: Mapping[str, tuple[TrainedRecipe, TrainingRecipe]]  # by the name that the recipe has there
+    seeds: int
+
+
+def groups() -> dict[str, Group]:
+    """Every group by its name, the quickest first, so that results are there early."""
+    base = PPO_PAPER.load("ppo-paper").reward.model_dump(exclude_defaults=True)
+    changed = {
+        "risk-0": {"risk": 0.0},
+        "risk-1": {"risk": 1.0},
+        "jerk-1e-4": {"jerk": 1e-4},
+        "terminal-0": {"terminal": 0.0},
+    }
+    variants: dict[str, dict[str, Any]] = {
+        "ppo-paper": {},
+        **{f"ppo-paper-{name}": {"reward": {**base, **own}} for name, own in changed.items()},
+        "ppo-paper-state": {"observation": _STATED_STATE},
+    }
+
+    def curves(suffix: str, *recipes: TrainedRecipe) -> list[Group]:
+        trained = {each.recipe: (each, each.load(each.recipe)) for each in recipes}
+        return [Group(f"{delay}{suffix}", f"paper-delay-{delay}", trained, 3) for delay in CURVES]
+
+    found = [
+        Group(STOPPED, "paper-random", {"ppo-stopped": (EARLY, EARLY.load("ppo-stopped"))}, 1),
+        *curves("", TrainedRecipe("ppo", 400_000, 4, 16_000), TrainedRecipe("sac", 60_000, 30, 3_000)),
+        *curves("-ppo-paper", PPO_PAPER),
+        Group(
+            OPEN, "paper-random", {name: (PPO_PAPER, PPO_PAPER.load(name, **own)) for name, own in variants.items()}, 2
+        ),
+        *curves("-sac-paper", TrainedRecipe("sac-paper", 20_000, 1_000, 170)),
+    ]
+    return {group.name: group for group in found}

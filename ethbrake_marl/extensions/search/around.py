@@ -1,0 +1,88 @@
+"""A search around the own episode of a policy at the alert: what it finds then drives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ethbrake_marl.agents.driving import record_commands
+from ethbrake_marl.agents.protocol import Agent, AgentAround, Source, check_agent, fixed_commands
+from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.env.harm import HarmCount, check_harm_count
+from ethbrake_marl.env.memory import Memory
+from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.errors import check_whole_number
+from ethbrake_marl.extensions.search.planner import MOST_CANDIDATES, Outlook
+from ethbrake_marl.extensions.search.refine import refine
+from ethbrake_marl.physics.episode import CLOCK
+from ethbrake_marl.physics.state import Floats, Worlds
+from ethbrake_marl.registry import Part
+from ethbrake_marl.scenario.schema import Scenario
+
+
+class Searched(AgentAround):
+    """Drives the commands that a search around the policy's episode found at the alert, step by step.
+
+    It knows the model of the line and the other vehicles' scripts, and does not react to what happens otherwise.
+    ``predicted_harm`` [n] (m2/s2) is never above the policy's own, and is realised to the bit if the others follow
+    their scripts. A world's commands do not depend on its batch. Raises ``InvalidInput`` for what is not an agent, a
+    number of candidates outside 1 to 1,000,000 and, when an episode begins, for another vehicle's script whose command
+    is not fixed at the alert.
+
+    Args:
+        policy: any agent.
+        scenario: in which it searches.
+        candidates: tried in each world.
+        harm_count: which harm is least, ``first`` or ``total``.
+
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> searched = eb.make_agent("constant:5+search", scenario=scenario)
+    >>> outcome = eb.evaluate(scenario.sample(2, seed=7), {"searched": searched}, scenario=scenario).outcome("searched")
+    >>> bool((outcome.first_impact_harm == outcome.predicted_harm).all())
+    True
+
+    """
+
+    adds = Source.MODEL
+
+    def __init__(
+        self, policy: Agent, scenario: Scenario, *, candidates: int = 500, harm_count: HarmCount = "first"
+    ) -> None:
+        check_agent(policy, "search")
+        check_whole_number("search: candidates", candidates, 1, MOST_CANDIDATES)
+        check_harm_count(harm_count)
+        super().__init__(policy, f"{policy.name}+search")
+        self.scenario, self._candidates = scenario, candidates
+        self._outlook = Outlook(harm_count, scenario.horizon_s, scenario.time_step_s)
+
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        """Search in these worlds."""
+        others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
+        problem = self._outlook.problem(alert, vehicle, others)
+        own = record_commands(self.policy, alert, self.scenario, vehicle, int(problem.last_step.max()))
+        commands, harm = refine(problem, own, budget=self._candidates)
+        return {
+            "commands_mps2": np.pad(commands, ((0, 0), (0, self._outlook.decisions - own.shape[1])), mode="edge"),
+            "start_s": problem.clock[:, CLOCK.START].copy(),  # of the first decision
+            "predicted_harm": harm,
+        }
+
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        """The command of the step, [n] m/s2."""
+        return self._outlook.command(worlds, memory), memory
+
+
+def search_around(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
+    """``+search`` around an agent, which takes no argument."""
+    return Searched(policy, settings.needed_scenario(), harm_count=settings.harm_count)
+
+
+SEARCH = Part(
+    search_around,
+    form="+search",
+    about="drives the best commands that a search around its own episode finds at the alert",
+    knows=Source.MODEL,
+    inner=True,
+)

@@ -1,0 +1,167 @@
+"""``planner``: an agent that searches whole command profiles at every decision."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
+from ethbrake_marl.agents.protocol import Agent, Source, fixed_commands
+from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.env.harm import HarmCount, check_harm_count
+from ethbrake_marl.env.memory import Memory, renew_memory, take_memory
+from ethbrake_marl.env.profiles import TIME_STEP_S, ProfileProblem, Profiles, profile_problem
+from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.certified.estimating_agents import Believing
+from ethbrake_marl.extensions.search.problem import search_profiles
+from ethbrake_marl.physics.episode import Decisions
+from ethbrake_marl.physics.state import Floats, Ints, Worlds
+from ethbrake_marl.registry import Part
+
+MOST_CANDIDATES = 1_000_000  # per world and decision
+
+
+class Outlook(NamedTuple):
+    """How an agent looks ahead for its vehicle: whose harm counts, how far, and when the vehicle decides."""
+
+    harm_count: HarmCount
+    horizon_s: float
+    time_step_s: float
+
+    @property
+    def decisions(self) -> int:
+        """Of a whole episode, at most."""
+        return int(np.ceil(self.horizon_s / self.time_step_s)) + 1
+
+    def problem(self, worlds: Worlds, vehicle: int, others_mps2: Floats) -> ProfileProblem:
+        """The search for the vehicle's profile from now on."""
+        return profile_problem(
+            worlds, [vehicle], harm_count=self.harm_count, horizon_s=self.horizon_s, time_step_s=self.time_step_s,
+            others_mps2=others_mps2,
+        )  # fmt: skip
+
+    def due(self, worlds: Worlds, planned_s: Floats) -> Ints:
+        """The worlds in which it is time to plan again: some vehicle moves, and a decision has come since."""
+        moving = (worlds.speeds_mps != 0.0).any(axis=1)
+        return np.flatnonzero((worlds.time_s > planned_s) & (worlds.time_s < self.horizon_s) & moving)
+
+    def command(self, worlds: Worlds, memory: Memory) -> Floats:
+        """What ``commands_mps2`` [n, decisions], from ``start_s`` on, say now, [n]."""
+        step = Decisions(memory["start_s"], self.time_step_s).latest(worlds.time_s)
+        now: Floats = memory["commands_mps2"][np.arange(worlds.n), np.clip(step, 0, self.decisions - 1)]
+        return now
+
+
+def budget_of(argument: str) -> int | None:
+    """The number of candidates that an argument is; None: it is none."""
+    number = int(argument) if re.fullmatch("[0-9]{1,7}", argument) else 0
+    return number if 1 <= number <= MOST_CANDIDATES else None
+
+
+CANDIDATES = 256  # per world and decision
+
+
+class Planner:
+    """Receding horizon: the own profile is searched anew at each decision, the others following their scripts.
+
+    Each search starts from the plan so far, from constants and, at first, from the pairwise optimum. ``predicted_harm``
+    [n] is that of the first plan (m2/s2); no more is done if the others do as expected. Vehicles without a script
+    (learners) are taken to brake fully. Raises ``InvalidInput`` for an unusable argument or count and, when
+    an episode begins, for another vehicle's script whose command is not fixed at the alert.
+
+    Args:
+        argument: candidates per world and decision.
+        harm_count: which harm it minimises, ``first`` or ``total``.
+        horizon_s: until when it looks ahead, s.
+        most_candidates: of a search, whatever the argument says.
+        time_step_s: between two decisions, s.
+
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> planner = eb.make_agent("planner:16", scenario=scenario)
+    >>> outcome = eb.evaluate(scenario.sample(2, seed=7), {"planner": planner}, scenario=scenario).outcome("planner")
+    >>> bool((outcome.first_impact_harm <= outcome.predicted_harm + 1e-9).all())
+    True
+
+    """
+
+    knows = Source.MODEL
+
+    def __init__(
+        self,
+        argument: str | None = None,
+        *,
+        harm_count: HarmCount = "first",
+        horizon_s: float = 8.0,
+        most_candidates: int | None = None,
+        time_step_s: float = TIME_STEP_S,
+    ) -> None:
+        check_harm_count(harm_count)
+        budget = CANDIDATES if argument is None else budget_of(argument)
+        if budget is None:
+            raise InvalidInput(
+                f"agent 'planner:{argument}': the argument must be a number of candidates per decision, for instance"
+                f" {CANDIDATES}, at most {MOST_CANDIDATES:,}"
+            )
+        self.name = "planner" if argument is None else f"planner:{argument}"
+        self._candidates = budget if most_candidates is None else min(budget, most_candidates)
+        self._outlook = Outlook(harm_count, horizon_s, time_step_s)
+
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        """Make the first plan of these episodes."""
+        others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
+        problem = self._outlook.problem(alert, vehicle, others)
+        pairwise = -optimise_pairwise(alert, vehicle).deceleration_mps2
+        plan, harm = self._search(problem, problem.constant(pairwise[:, np.newaxis, np.newaxis]))
+        start_s = np.maximum(alert.vehicles.latency_s[:, vehicle], alert.time_s)
+        return {"plan": plan, "planned_s": start_s, "others_mps2": others, "predicted_harm": harm}
+
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        """The first command of the new plans, [n] m/s2."""
+        rows = self._outlook.due(worlds, memory["planned_s"])
+        if rows.size:
+            now, held = worlds.take(rows), take_memory(memory, rows)
+            problem = self._outlook.problem(now, vehicle, held["others_mps2"])
+            plan, _ = self._search(problem, self._rest(held, now.time_s, problem))
+            memory = renew_memory(memory, rows, {"plan": plan, "planned_s": now.time_s})
+        return Profiles(*memory["plan"]).commands_mps2[:, 0, 0], memory
+
+    def _rest(self, held: Memory, time_s: Floats, problem: ProfileProblem) -> Profiles:
+        """What is left of the plans from ``time_s`` on."""
+        plan = Profiles(*held["plan"])
+        passed = np.rint((time_s - held["planned_s"]) / self._outlook.time_step_s).astype(np.int64)[:, np.newaxis]
+        ends = np.minimum(np.maximum(plan.ends - passed, 0), problem.last_step[:, np.newaxis])
+        ends[:, -1] = problem.last_step
+        return Profiles(ends, plan.commands_mps2)
+
+    def _search(self, problem: ProfileProblem, plan: Profiles) -> tuple[Profiles, Floats]:
+        """The best plans found from these and from constants, with their harm under the own count."""
+        constants = problem.constant(problem.even_grid(15))
+        n, K = plan.ends.shape  # each world's plan, then its constants: [n * Q]
+        ends = np.concatenate([plan.ends[:, np.newaxis], constants.ends.reshape(n, -1, K)], axis=1)
+        commands = constants.commands_mps2.reshape(n, -1, K, 1)
+        commands = np.concatenate([plan.commands_mps2[:, np.newaxis], commands], axis=1)
+        given = Profiles(ends.reshape(-1, K), commands.reshape(-1, K, 1))
+        plan, harm = search_profiles(problem, given, budget=self._candidates, seed=0)
+        return plan, harm[self._outlook.harm_count]
+
+
+def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
+    """``planner`` or ``planner:CANDIDATES``; with ``:believed`` behind, in the believed world."""
+    planner = Planner(
+        argument, harm_count=settings.harm_count, horizon_s=settings.horizon_s,
+        most_candidates=settings.most_candidates, time_step_s=settings.time_step_s,
+    )  # fmt: skip
+    return Believing(planner, settings.needed_scenario(), shows=True) if settings.believes else planner
+
+
+PLANNER = Part(
+    make_planner,
+    form="planner[:CANDIDATES][:believed]",
+    about="a search in the simulation at every decision, with so many candidates each; believed: as above",
+    knows=Source.MODEL,
+)

@@ -1,0 +1,59 @@
+"""The problem of choosing whole command profiles: whose, in which worlds, on which grid of decisions."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from ethbrake_marl.env.harm import HarmCount
+from ethbrake_marl.env.profiles import MOST_PHASES, ProfileProblem, Profiles, make_search_world
+from ethbrake_marl.errors import PhysicsError, check_whole_number
+from ethbrake_marl.extensions.search.profiles import search_world
+from ethbrake_marl.physics.state import Floats, UInt64s
+
+_MIX = 0xD1342543DE82EF95  # an odd number: spreads seeds over 64 bits
+
+
+def seeded(identity: UInt64s, seed: int) -> UInt64s:
+    """The first state of each world's random numbers, [n]: a function of its identity and the seed alone."""
+    with np.errstate(over="ignore"):
+        z = identity ^ np.uint64((int(seed) * _MIX) % 2**64)
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        return np.asarray(z ^ (z >> np.uint64(31)), np.uint64)
+
+
+Found = tuple[Profiles, dict[HarmCount, Floats]]
+
+
+def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, seed: int = 0, threads: int = 1) -> Found:
+    """The best profiles of at most ``MOST_PHASES`` phases that about ``budget`` candidates per world find.
+
+    And their harm [n] under each count (m2/s2), as the engine counts it.
+
+    ``given`` [n * Q]: Q profiles of each world, world by world, from which to start; the result is never worse than
+    any of them. Raises ``InvalidInput`` for a budget below 1 and ``PhysicsError`` naming the worlds of which no
+    profile could be followed.
+    """
+    for name, value, least in (("budget", budget, 1), ("threads", threads, 1), ("seed", seed, 0)):
+        check_whole_number(name, value, least)
+    n, C = problem.n, len(problem.vehicles)
+    ends = np.ascontiguousarray(given.ends.reshape(n, -1, MOST_PHASES))
+    commands = np.ascontiguousarray(given.commands_mps2.reshape(n, -1, MOST_PHASES, C))
+    best = Profiles(np.zeros((n, MOST_PHASES), np.int64), np.zeros((n, MOST_PHASES, C)))
+    random = seeded(problem.identity, seed)
+
+    def work(k: int) -> int:
+        world = make_search_world(problem, k, random)
+        return search_world(world, problem.start[k], ends[k], commands[k], budget, best.ends[k], best.commands_mps2[k])
+
+    if threads == 1:
+        used = [work(k) for k in range(n)]
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            used = list(pool.map(work, range(n)))
+    if 0 in used:
+        raise PhysicsError({k: "no profile could be followed" for k in range(n) if used[k] == 0})
+    first, total = problem.follow(best)
+    return best, {"first": first, "total": total}

@@ -1,0 +1,122 @@
+"""An agent that drives the best profile known: one kept beforehand where there is one, else searched at the alert."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from ethbrake_marl.agents.driving import record_commands
+from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.agents.protocol import Source, fixed_commands
+from ethbrake_marl.agents.registry import AgentSettings, make_agent
+from ethbrake_marl.env.harm import HarmCount, check_harm_count
+from ethbrake_marl.env.memory import Memory
+from ethbrake_marl.env.profiles import TIME_STEP_S, ProfileProblem, Profiles
+from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.errors import InvalidInput, renumbered
+from ethbrake_marl.extensions.search.planner import MOST_CANDIDATES, Outlook, budget_of
+from ethbrake_marl.extensions.search.problem import search_profiles
+from ethbrake_marl.extensions.search.refine import refine
+from ethbrake_marl.physics.episode import CLOCK
+from ethbrake_marl.physics.state import Bools, Floats, Worlds
+from ethbrake_marl.scenario.schema import Scenario
+
+PROFILE_BUDGET = 20_000  # candidates in a world of which nothing is known
+
+START = "universal@shipped"  # whose episode a search also starts from
+
+Recall = Callable[[ProfileProblem, HarmCount], tuple[Profiles, Bools]]
+"""Kept profiles [n] of a problem, and where there is one [n]; the others are ignored."""
+
+
+class BestHarm:
+    """Drives the profile of least harm known, while the others follow their scripts (without one: brake fully).
+
+    ``recall`` gives the kept profiles. A world without one is searched at the alert with ``budget`` candidates. Where
+    no other vehicle of a known ``scenario`` learns, a second search with as many candidates starts from the better of
+    that result and the episode of ``universal``: the harm is never above that policy's. Decisions fall every
+    ``time_step_s`` from the vehicle's latency on. ``predicted_harm`` [n] is what the engine will count (m2/s2), to the
+    same bits, if the engine's time step is that. Raises ``InvalidInput`` for a budget below 1 or an unknown count and,
+    when an episode begins, for another vehicle's script whose command is not fixed at the alert.
+    """
+
+    name = "best_harm"
+    knows = Source.MODEL
+
+    def __init__(
+        self,
+        recall: Recall,
+        *,
+        scenario: Scenario | None = None,
+        harm_count: HarmCount = "first",
+        horizon_s: float = 8.0,
+        budget: int = PROFILE_BUDGET,
+        time_step_s: float = TIME_STEP_S,
+    ) -> None:
+        if not budget >= 1:
+            raise InvalidInput(f"best_harm: budget = {budget}; at least 1 candidate is needed")
+        check_harm_count(harm_count)
+        self._recall, self._budget, self._scenario = recall, budget, scenario
+        self._outlook = Outlook(harm_count, horizon_s, time_step_s)
+
+    @classmethod
+    def make(cls, argument: str | None, settings: AgentSettings, recall: Recall) -> BestHarm:
+        """``best_harm`` or ``best_harm:CANDIDATES``; raises ``InvalidInput`` for an argument that is no such number."""
+        budget = PROFILE_BUDGET if argument is None else budget_of(argument)
+        if budget is None:
+            raise InvalidInput(
+                f"agent 'best_harm:{argument}': the argument must be a number of candidates, for instance"
+                f" {PROFILE_BUDGET}, at most {MOST_CANDIDATES:,}"
+            )
+        return cls(
+            recall, scenario=settings.scenario, harm_count=settings.harm_count, horizon_s=settings.horizon_s,
+            time_step_s=settings.time_step_s,
+            budget=budget if settings.most_candidates is None else min(budget, settings.most_candidates),
+        )  # fmt: skip
+
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        """Look these worlds up, and search those that are not known."""
+        others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
+        problem, outlook = self._outlook.problem(alert, vehicle, others), self._outlook
+        profiles, known = self._recall(problem, outlook.harm_count)
+        first, total = problem.follow(profiles)
+        harm, commands = (first if outlook.harm_count == "first" else total), self._stepwise(profiles)
+        unknown = np.flatnonzero(~known)
+        if unknown.size:
+            with renumbered(unknown):
+                commands[unknown], harm[unknown] = self._search(alert.take(unknown), vehicle, others[unknown])
+        return {
+            "predicted_harm": harm,
+            "searched": ~known,
+            "start_s": problem.clock[:, CLOCK.START].copy(),
+            "commands_mps2": commands,
+        }
+
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        """The command of the phase in force, [n] m/s2."""
+        return self._outlook.command(worlds, memory), memory
+
+    def _search(self, worlds: Worlds, vehicle: int, others: Floats) -> tuple[Floats, Floats]:
+        """The best commands that are found in these worlds, [n, decisions] m/s2, and their harm [n] m2/s2."""
+        problem, outlook = self._outlook.problem(worlds, vehicle, others), self._outlook
+        coupled = optimise_coupled(
+            worlds, vehicle, harm_count=outlook.harm_count, horizon_s=outlook.horizon_s, others_mps2=others
+        )
+        given = problem.constant(-coupled.deceleration_mps2[:, np.newaxis, np.newaxis])
+        found, harms = search_profiles(problem, given, budget=self._budget)
+        best = self._stepwise(found)
+        if self._scenario is None or set(self._scenario.learners) - {vehicle}:
+            return best, harms[outlook.harm_count]
+        policy, steps = make_agent(START, scenario=self._scenario), int(problem.last_step.max())
+        driven = record_commands(policy, worlds, self._scenario, vehicle, steps)
+        of_policy = refine(problem, driven, budget=1)[1]
+        better = (of_policy < harms[outlook.harm_count])[:, np.newaxis]
+        best[:, :steps], harm = refine(problem, np.where(better, driven, best[:, :steps]), budget=self._budget)
+        return best, harm
+
+    def _stepwise(self, profiles: Profiles) -> Floats:
+        """The commands of profiles decision by decision, [n, decisions] m/s2."""
+        n = len(profiles.ends)
+        steps = [profiles.at(np.full(n, step))[:, 0] for step in range(self._outlook.decisions)]
+        return np.stack(steps, axis=1)

@@ -1,0 +1,229 @@
+"""The refinement of an episode: a compiled search around the commands that somebody gives in its steps.
+
+Two climbs, each by random changes of a few neighbouring steps: one from the given commands, and one from the best of
+some random templates (one command, another one for a short while, then full braking), as what is best may lie in a
+valley of its own. Everything advances decision by decision, as the engine does: what is found will happen, to the
+bit.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.env.profiles import ProfileProblem, SearchWorld, copy_rows, make_search_world
+from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
+from ethbrake_marl.extensions.search.problem import seeded
+from ethbrake_marl.extensions.search.profiles import allowed, draw, draw_below, draw_command
+from ethbrake_marl.physics.elementary import exp
+from ethbrake_marl.physics.episode import (
+    CLOCK,
+    GOES_ON,
+    Episode,
+    grid_of,
+    harm_so_far,
+    restore,
+    save,
+    step_again,
+    value_of,
+)
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.rows import ROW
+from ethbrake_marl.physics.state import Bools, Floats, UInt64s
+
+TEMPLATE_SHARE, THEIR_CLIMB_SHARE = 0.3, 0.3  # of the budget; the rest is for the climb from the given commands
+
+ATTENTION_S = 3.0  # from the first decision on; later steps are changed only together with earlier ones
+
+LONGEST_CHANGE_S = 0.6
+
+LONGEST_WHILE_S = 0.8  # of a template
+
+SET_SHARE = 0.1  # of the changes, which replace commands; the others add to them
+
+FULL_BRAKE_SHARE = 0.8  # of the templates, which begin with full braking
+
+LN_SMALLEST_CHANGE = (
+    -6.907755278982138
+)  # amounts that are added range over three decades below the whole range of commands
+
+WORSE = 5.0  # m2/s2: a template may be worse by so much before it is climbed from
+
+NO_HARM = 1e-9  # m2/s2
+
+
+class Plan(NamedTuple):
+    """Commands of one world, and where they lead."""
+
+    commands: Floats  # [T]
+    states: Floats  # [T + 1, S] at the start of each step
+
+
+def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
+    """Search around ``commands_mps2`` [n, T] of the one controlled vehicle, with ``budget`` candidates per world.
+
+    Returns the commands found, never worse than the given ones, and their harm [n] under the problem's count, as
+    the engine counts it (m2/s2).
+    Worlds are independent of each other. Raises ``InvalidInput`` for several vehicles, commands of another shape or
+    beyond a capacity, or a budget below 1, ``PhysicsError`` naming worlds in which the given commands cannot be
+    played.
+    """
+    check_whole_number("budget", budget, 1)
+    n, steps = problem.n, int(problem.last_step.max(initial=0))
+    low, high = problem.bounds[:, :1, 0], problem.bounds[:, :1, 1]
+    if len(problem.vehicles) != 1 or commands_mps2.shape != (n, steps):
+        raise InvalidInput(f"refine: commands of shape {commands_mps2.shape}; ({n}, {steps}) of one vehicle are needed")
+    if not ((commands_mps2 >= low) & (commands_mps2 <= high)).all():
+        raise InvalidInput("refine: a command is beyond the vehicle's capacity")
+    best, first, total = commands_mps2.copy(), np.zeros(n), np.zeros(n)
+    failed = np.zeros(n, np.bool_)
+    _refine_worlds(problem, seeded(problem.identity, seed), budget, best, first, total, failed)
+    if failed.any():
+        raise PhysicsError({k: "its commands could not be played" for k in np.flatnonzero(failed).tolist()})
+    return best, np.where(problem.clock[:, CLOCK.HARM_IS_TOTAL] == 1.0, total, first)
+
+
+@compiled
+def _refine_worlds(
+    problem: ProfileProblem, random: UInt64s, budget: int, commands: Floats, first: Floats, total: Floats,
+    failed: Bools,
+) -> None:  # fmt: skip
+    """Improve ``commands`` in place, and fill the other outputs [n]."""
+    start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
+    mine, other = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))
+    room = Plan(np.zeros(T), np.zeros((T + 1, S)))
+    for k in range(start.shape[0]):
+        world = make_search_world(problem, k, random)
+        for plan in (mine, other, room):
+            copy_rows(start[k : k + 1], plan.states, 1)
+        copy_steps(commands[k], mine.commands, 0)
+        if not _refine_world(world, mine, other, room, budget):
+            failed[k] = True
+            continue
+        copy_steps(mine.commands, commands[k], 0)
+        follow_steps(world.episode, mine, 0, math.inf)
+        first[k], total[k] = harm_so_far(world.episode.table, 0.0), harm_so_far(world.episode.table, 1.0)
+
+
+@compiled(apart=True)
+def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budget: int) -> bool:
+    """Improve ``mine``; False if it cannot be played."""
+    templates, theirs = int(TEMPLATE_SHARE * budget), int(THEIR_CLIMB_SHARE * budget)
+    value, reached = follow_steps(world.episode, mine, 0, math.inf)
+    if reached < 0:
+        return False
+    value, reached = climb(world, mine, room, value, reached, budget - templates - theirs)
+    if value <= NO_HARM:
+        return True
+    least, played = draw_templates(world, other, room, value + WORSE, templates)
+    if played > 0:
+        least, played = climb(world, other, room, least, played, theirs)
+        if least < value:
+            copy_steps(other.commands, mine.commands, 0)
+    return True
+
+
+@compiled(apart=True)
+def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[float, int]:
+    """Play a plan from the start of step ``begin`` on, and fill its states; the value, and the steps up to the end.
+
+    Gives up as soon as the value is not below ``bound``: harm never falls again. -1 steps if the kernel failed.
+    """
+    table, clock = world.table, world.clock
+    grid, restitution, total, last = (
+        grid_of(clock),
+        clock[CLOCK.RESTITUTION],
+        clock[CLOCK.HARM_IS_TOTAL],
+        int(clock[CLOCK.LAST_STEP]),
+    )
+    no_rows = table[:0]
+    restore(table, plan.states[begin])
+    value = value_of(table, total)
+    for step in range(begin, last):
+        table[ROW.COMMAND, world.controlled[0]] = plan.commands[step]
+        outcome = step_again(table, restitution, grid, step, step + 1, no_rows)
+        if outcome < GOES_ON:
+            return value, -1
+        value = value_of(table, total)
+        save(table, plan.states[step + 1])
+        if value >= bound or outcome != GOES_ON:
+            return value, step + 1
+    return value, last
+
+
+@compiled(apart=True)
+def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int, budget: int) -> tuple[float, int]:
+    """Change a plan of this value for the better, in place, with ``budget`` candidates; its value and steps.
+
+    A success by addition is repeated twice as large.
+    """
+    low, high = world.bounds[0, 0], world.bounds[0, 1]
+    longest = steps_in(world.episode, LONGEST_CHANGE_S)
+    first, length, amount, adds, again = 0, 0, 0.0, True, False
+    for _ in range(budget):
+        if value <= NO_HARM:
+            break
+        if not again:
+            adds = draw(world.random) >= SET_SHARE
+            first = draw_below(world.random, min(reached, steps_in(world.episode, ATTENTION_S)))
+            u = draw(world.random)
+            length = 1 + int(u * u * longest)
+            if adds:  # of either sign; its logarithm is uniform over the decades below the whole range
+                sign = 1.0 if draw(world.random) < 0.5 else -1.0
+                amount = sign * (high - low) * exp(LN_SMALLEST_CHANGE * draw(world.random))
+            else:
+                amount = draw_command(world.random, low, high)
+        again = False
+        any_change = False
+        for t in range(first, plan.commands.shape[0]):
+            room.commands[t] = plan.commands[t]
+            if t < first + length:
+                room.commands[t] = allowed(plan.commands[t] + amount, low, high) if adds else amount
+                any_change = any_change or room.commands[t] != plan.commands[t]
+        if not any_change:
+            continue
+        copy_rows(plan.states[first:], room.states[first:], 1)
+        new, played = follow_steps(world.episode, room, first, value)
+        if played < 0 or not new < value:
+            continue
+        value, reached = new, played
+        copy_steps(room.commands, plan.commands, first)
+        copy_rows(room.states[first:], plan.states[first:], played - first + 1)
+        amount *= 2.0
+        again = adds
+    return value, reached
+
+
+@compiled(apart=True)
+def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, number: int) -> tuple[float, int]:
+    """Fill ``best`` with the best of some random templates; its value and steps, 0 if none is below ``bound``."""
+    low, high, T = world.bounds[0, 0], world.bounds[0, 1], room.commands.shape[0]
+    attention, longest = steps_in(world.episode, ATTENTION_S), steps_in(world.episode, LONGEST_WHILE_S)
+    reached = 0
+    for _ in range(number):
+        first, length = draw_below(world.random, attention), 1 + draw_below(world.random, longest)
+        between = draw_command(world.random, low, high)
+        before = low if draw(world.random) < FULL_BRAKE_SHARE else draw_command(world.random, low, high)
+        for t in range(T):
+            room.commands[t] = before if t < first else (between if t < first + length else low)
+        value, played = follow_steps(world.episode, room, 0, bound)
+        if played > 0 and value < bound:
+            bound, reached = value, played
+            copy_steps(room.commands, best.commands, 0)
+            copy_rows(room.states, best.states, played + 1)
+    return bound, reached
+
+
+@compiled
+def steps_in(world: Episode, duration_s: float) -> int:
+    """How many steps fit into a time, at least 1."""
+    return max(int(duration_s / world.clock[CLOCK.TIME_STEP] + 0.5), 1)
+
+
+@compiled
+def copy_steps(commands: Floats, to: Floats, first: int) -> None:
+    """Copy the commands from step ``first`` on."""
+    for t in range(first, commands.shape[0]):
+        to[t] = commands[t]

@@ -1,0 +1,243 @@
+"""Tables of best known harm: small files that are looked up by what a world is, never by its place in a list."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from ethbrake_marl.env.harm import HarmCount
+from ethbrake_marl.env.profiles import ProfileProblem, Profiles
+from ethbrake_marl.errors import CorruptBundle, InvalidInput
+from ethbrake_marl.files.arrays import ArrayArchive, ArrayRow
+from ethbrake_marl.files.store import parse_strict_json, read_plain, write_file
+from ethbrake_marl.files.yaml import first_mistake
+from ethbrake_marl.physics.state import Bools, Floats, Ints, UInt64s
+
+TABLE_FORMAT = 1
+
+SIZE_LIMIT_BYTES = 64 << 20  # of a file
+
+UNPACKED_LIMIT_BYTES = 256 << 20  # of its arrays
+
+DECODED_LIMIT = 1 << 26  # numbers of the profiles of one count, every world with as many phases as the longest
+
+TOLERANCE = 1e-6  # an agent must be this much (m2/s2) below the table to replace its value
+
+_ABOUT = ("scenario", "list_seed", "episodes", "vehicles")  # of the header, in an error
+
+LEFT_OUT = "left_out"  # key of a table's header: number in the list -> why the world is in no row
+
+LOWERED = "lowered_by"  # key of a table's header: agent -> count -> in how many worlds it did less harm
+
+COUNTS: tuple[HarmCount, ...] = ("first", "total")
+
+
+class BestKnown(NamedTuple):
+    """The least harm known under one count."""
+
+    harm: Floats  # [n] m2/s2
+    profiles: Profiles  # [n] that do it; all ends 0 where only the harm is known
+
+
+@dataclass(frozen=True, slots=True)
+class BestHarmTable:
+    """The least harm known in n worlds, for one or both counts, and how it was found (``header``)."""
+
+    identity: UInt64s  # [n]
+    best: Mapping[HarmCount, BestKnown]
+    header: Mapping[str, Any]
+
+    @classmethod
+    def load(cls, path: Path) -> BestHarmTable:
+        """Read a table. Raises ``InvalidInput`` if there is no file and ``CorruptBundle`` if it is not a table.
+
+        Names, types, shapes and sizes are checked from the headers before anything is unpacked. What a table says of a
+        world is believed; that its profiles fit a problem is for ``check_fits`` to say.
+        """
+        if not os.path.exists(path):
+            raise InvalidInput(f"{path}: there is no such table of best known harm")
+        data = read_plain(path, SIZE_LIMIT_BYTES, refusal=CorruptBundle)
+        try:
+            archive = ArrayArchive(data, UNPACKED_LIMIT_BYTES)
+            counts = [harm_count for harm_count in COUNTS if f"{harm_count}_harm" in archive.headers]
+            arrays = archive.unpack([row for harm_count in counts or COUNTS for row in _rows(harm_count)])
+            header = parse_strict_json(arrays["header"].tobytes())
+            _Header.model_validate(header)
+            best = {harm_count: _read_best(arrays, harm_count) for harm_count in counts}
+        except ValidationError as error:
+            raise CorruptBundle(f"{path}: is not a table of best known harm: header: {first_mistake(error)}") from None
+        except ValueError as error:
+            raise CorruptBundle(f"{path}: is not a table of best known harm: {error}") from None
+        del header["format"]
+        return cls(arrays["identity"].astype(np.uint64), best, header)
+
+    def save(self, path: Path) -> None:
+        """Write the table in one step."""
+        write_file(path, table_bytes(self))
+
+    @property
+    def left_out(self) -> Mapping[str, str]:
+        """Number in the list -> why the world is in no row."""
+        return dict(self.header.get(LEFT_OUT, {}))
+
+    def rows(self, identity: UInt64s) -> NDArray[np.int64]:
+        """Row of each world, -1 where it is not in the table."""
+        order = np.argsort(self.identity, kind="stable")
+        place = np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)
+        rows = order[place]
+        return np.where(self.identity[rows] == identity, rows, -1)
+
+    def check_holds_any(self, identity: UInt64s) -> None:
+        """Raise ``InvalidInput`` if none of these worlds is in the table: it is of another list."""
+        if not (self.rows(identity) >= 0).any():
+            made = ", ".join(f"{key} {self.header[key]}" for key in _ABOUT if key in self.header)
+            raise InvalidInput(
+                f"table of best known harm ({made}): holds none of these {len(identity)} worlds; give the scenario,"
+                " seed and vehicles that it was made for"
+            )
+
+    def check_fits(self, problem: ProfileProblem) -> None:
+        """Raise ``InvalidInput`` if a profile kept for one of these worlds cannot be driven there."""
+        for harm_count in self.best:
+            try:
+                problem.check(self.profiles(problem.identity, harm_count, problem.last_step)[0])
+            except InvalidInput as error:
+                raise InvalidInput(f"table of best known harm, {harm_count}: {error}") from None
+
+    def harm(self, identity: UInt64s, harm_count: HarmCount) -> Floats:
+        """Best known harm of each world (m2/s2), NaN where it is not in the table."""
+        rows = self.rows(identity)
+        if harm_count not in self.best:
+            return np.full(rows.shape, np.nan)
+        return np.where(rows >= 0, self.best[harm_count].harm[rows], np.nan)
+
+    def profiles(self, identity: UInt64s, harm_count: HarmCount, last_step: Ints) -> tuple[Profiles, Bools]:
+        """Kept profiles [n], and where there is one [n]; coasting elsewhere. ``last_step`` [n] ends each of them."""
+        rows = self.rows(identity)
+        if harm_count not in self.best:
+            controlled = next(iter(self.best.values())).profiles.commands_mps2.shape[2]
+            coasting = Profiles(last_step[:, np.newaxis].copy(), np.zeros((len(rows), 1, controlled)))
+            return coasting, np.zeros(len(rows), np.bool_)
+        kept = self.best[harm_count].profiles.take(rows)
+        known = (rows >= 0) & (kept.ends[:, -1] > 0)
+        ends = np.where(known[:, np.newaxis], kept.ends, last_step[:, np.newaxis])
+        return Profiles(ends, np.where(known[:, np.newaxis, np.newaxis], kept.commands_mps2, 0.0)), known
+
+    def improved(
+        self, identity: UInt64s, harm_count: HarmCount, harm: Floats, profiles: Profiles | None = None
+    ) -> tuple[BestHarmTable, Bools]:
+        """The table with every value replaced that ``harm`` [m] undercuts by more than ``TOLERANCE``; and where it did.
+
+        ``profiles`` [m] are what did it; without them only the harm is known there. Worlds that are not in the table
+        change nothing. Raises ``InvalidInput`` for a count that the table does not hold, or shapes that do not fit.
+        """
+        if harm_count not in self.best:
+            raise InvalidInput(f"table of {', '.join(self.best)}: holds no {harm_count!r} harm")
+        if harm.shape != identity.shape:
+            raise InvalidInput(f"improve: {harm.shape} harms for {identity.shape} worlds")
+        rows = self.rows(identity)
+        old = self.best[harm_count]
+        better = (rows >= 0) & (harm < old.harm[rows] - TOLERANCE)
+        at = rows[better]
+        new_harm = old.harm.copy()
+        new_harm[at] = harm[better]
+        if profiles is None:
+            profiles = Profiles(
+                np.zeros((len(harm), 1), np.int64), np.zeros((len(harm), 1, old.profiles.commands_mps2.shape[2]))
+            )
+        kept, new = Profiles.padded([old.profiles, profiles], 1)
+        kept.ends[at] = new.ends[better]
+        kept.commands_mps2[at] = new.commands_mps2[better]
+        return replace(self, best={**self.best, harm_count: BestKnown(new_harm, kept)}), better
+
+
+def table_bytes(table: BestHarmTable) -> bytes:
+    """The table as a compressed .npz without pickles: only the phases in use, bytes of like weight together."""
+    arrays: dict[str, NDArray[Any]] = {
+        "header": np.frombuffer(json.dumps({"format": TABLE_FORMAT, **table.header}).encode(), np.uint8),
+        "identity": table.identity.astype("<u8"),
+    }
+    for harm_count, best in table.best.items():
+        ends, commands = best.profiles
+        used = _used(ends)
+        inside = np.arange(ends.shape[1]) < used[:, np.newaxis]
+        arrays[f"{harm_count}_harm"] = best.harm.astype("<f8")
+        arrays[f"{harm_count}_phases"] = used.astype("<u2")
+        arrays[f"{harm_count}_ends"] = ends[inside].astype("<u2")
+        flat = np.ascontiguousarray(commands[inside], "<f8")
+        arrays[f"{harm_count}_commands"] = flat.view(np.uint8).reshape(*flat.shape, 8).transpose(2, 0, 1).copy()
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    return buffer.getvalue()
+
+
+def _rows(harm_count: HarmCount) -> list[ArrayRow]:
+    """What a table holds of one count: n worlds, m phases in all, C controlled vehicles."""
+    return [
+        ArrayRow("header", "|u1", ("bytes",)),
+        ArrayRow("identity", "<u8", ("n",)),
+        ArrayRow(f"{harm_count}_harm", "<f8", ("n",)),
+        ArrayRow(f"{harm_count}_phases", "<u2", ("n",)),
+        ArrayRow(f"{harm_count}_ends", "<u2", (f"m of {harm_count}",)),
+        ArrayRow(f"{harm_count}_commands", "|u1", (8, f"m of {harm_count}", "C")),
+    ]
+
+
+class _Header(BaseModel):
+    """What other code relies on in a header; it may say more."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+
+    format: Annotated[int, Field(ge=TABLE_FORMAT, le=TABLE_FORMAT)]  # neither true nor 1.0
+    scenario: str = ""
+    vehicles: list[str] = []
+    budget: int = 0
+    search_seed: int = 0
+    episodes: int = 0
+    list_seed: int = 0
+    after: dict[str, Any] = {}
+    lowered_by: dict[str, dict[str, int]] = {}
+
+
+def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> BestKnown:
+    """One count of a table whose arrays have the right shapes; raises ``ValueError`` for numbers that cannot be."""
+    harm = arrays[f"{harm_count}_harm"].astype(np.float64)
+    used = arrays[f"{harm_count}_phases"].astype(np.int64)
+    planes = arrays[f"{harm_count}_commands"]
+    flat = np.ascontiguousarray(planes.transpose(1, 2, 0)).view("<f8")[..., 0].astype(np.float64)
+    if not len(harm):
+        raise ValueError("it holds no world")
+    if not (np.isfinite(harm).all() and (harm >= 0.0).all()):
+        raise ValueError(f"{harm_count}_harm: a harm must be a finite number of at least 0 m2/s2")
+    if not np.isfinite(flat).all():
+        raise ValueError(f"{harm_count}_commands: a command must be a finite number")
+    if used.sum() != len(flat):
+        raise ValueError(f"{harm_count}_phases: {used.sum()} phases in all, but there are {len(flat)} commands")
+    width, controlled = max(int(used.max()), 1), flat.shape[1]
+    if not 1 <= controlled <= 64 or len(used) * width * (controlled + 1) > DECODED_LIMIT:
+        raise ValueError(f"{len(used)} worlds of {width} phases of {controlled} vehicles are beyond what is kept")
+    inside = np.arange(width) < used[:, np.newaxis]
+    ends, commands = np.zeros(inside.shape, np.int64), np.zeros((*inside.shape, controlled))
+    ends[inside] = arrays[f"{harm_count}_ends"]
+    commands[inside] = flat
+    last = np.maximum(used - 1, 0)
+    rows = np.arange(len(used))
+    ends = np.where(inside, ends, ends[rows, last][:, np.newaxis])
+    commands = np.where(inside[..., np.newaxis], commands, commands[rows, last][:, np.newaxis])
+    if not ((np.diff(ends, axis=1) >= 0).all() and ((ends[:, -1] > 0) == (used > 0)).all()):
+        raise ValueError(f"{harm_count}_ends: the phases of a world must end in order, the last one after step 0")
+    return BestKnown(harm, Profiles(ends, commands))
+
+
+def _used(ends: NDArray[np.int64]) -> NDArray[np.int64]:
+    """How many phases each profile uses, [n]; 0 where there is none."""
+    return np.where(ends[:, -1] > 0, np.argmax(ends == ends[:, -1:], axis=1) + 1, 0)

@@ -1,0 +1,49 @@
+"""Random templates of a whole episode, of which the best one in each world is kept: brake fully, give way, brake
+again.
+
+They show how a world could be driven quite otherwise than a policy drives it (``refine`` climbs from the same
+ones). Nothing is improved: what does little harm as it was drawn stands on no edge, and a policy can imitate it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ethbrake_marl.env.profiles import ProfileProblem, copy_rows, make_search_world
+from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.extensions.search.problem import seeded
+from ethbrake_marl.extensions.search.refine import Plan, copy_steps, draw_templates
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Floats, Ints, UInt64s
+
+
+def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed: int = 0) -> tuple[Floats, Ints]:
+    """The best of ``number`` templates below ``bound`` [n] (m2/s2) in each world, of the one controlled vehicle.
+
+    Returns its commands [n, T] (m/s2), and in how many steps it was played to its end [n]: 0 where none was below.
+    Each world draws its own; worlds are independent of each other. Raises ``InvalidInput`` for several vehicles, or
+    no template.
+    """
+    check_whole_number("templates", number, 1)
+    if len(problem.vehicles) != 1:
+        raise InvalidInput(f"templates: {len(problem.vehicles)} vehicles; they are of one")
+    commands = np.zeros((problem.n, int(problem.last_step.max(initial=0))))
+    steps = np.zeros(problem.n, np.int64)
+    _best_templates(problem, seeded(problem.identity, seed), bound, number, commands, steps)
+    return commands, steps
+
+
+@compiled
+def _best_templates(
+    problem: ProfileProblem, random: UInt64s, bound: Floats, number: int, commands: Floats, steps: Ints
+) -> None:
+    """Fill ``commands`` and ``steps``."""
+    start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
+    best, room = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))
+    for k in range(start.shape[0]):
+        world = make_search_world(problem, k, random)
+        copy_rows(start[k : k + 1], best.states, 1)
+        copy_rows(start[k : k + 1], room.states, 1)
+        steps[k] = draw_templates(world, best, room, bound[k], number)[1]
+        if steps[k] > 0:
+            copy_steps(best.commands, commands[k], 0)

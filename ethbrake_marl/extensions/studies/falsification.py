@@ -1,0 +1,127 @@
+"""An adaptive search of the unit cube for the points of highest score, of which several far apart are wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.errors import check_whole_number
+from ethbrake_marl.evaluation.named_worlds import NamedWorld
+from ethbrake_marl.physics.state import Floats, Ints
+from ethbrake_marl.scenario.sample import Sample
+
+Score = Callable[[Floats], Floats]  # points [n, d] of [0, 1) -> scores [n]; minus infinity: the point does not count
+
+Watcher = Callable[[int, int], None]  # points scored so far, and in all
+
+ROUND = 256  # points that are scored together
+
+APART = 0.1  # of two finds, in some coordinate
+
+_PARENTS = 24  # of the next round, far apart
+
+_EXPLORING = 0.5  # share of each round that is spread evenly over the cube
+
+_NEAREST, _FARTHEST = 1e-3, 0.3  # typical steps from a parent
+
+_LAST = np.nextafter(1.0, 0.0)
+
+
+class Scored(NamedTuple):
+    """All points that were tried, in their order."""
+
+    points: Floats  # [n, d]
+    scores: Floats  # [n]
+
+
+def search(
+    score: Score, dimensions: int, budget: int, seed: int, *, adaptive: bool = True, on_round: Watcher | None = None
+) -> Scored:
+    """Score ``budget`` points. ``adaptive``: look around the best so far; otherwise independent uniform points.
+
+    A round's points are partly spread evenly (scrambled Sobol), partly one step from the best points so far that are
+    far apart: a normal step in some coordinates, or the difference of two other ones (differential evolution). While
+    no point is better than the median, all are spread evenly. The same seed gives the same points.
+    """
+    check_whole_number("search: budget", budget, 1)
+    check_whole_number("search: seed", seed, 0)
+    rng = np.random.default_rng([seed, dimensions])
+    spread = _spread(dimensions, seed)
+    points, scores = np.empty((0, dimensions)), np.empty(0)
+    while len(points) < budget:
+        count = min(ROUND, budget - len(points))
+        if not adaptive:
+            new = rng.random((count, dimensions))
+        else:
+            parents = points[far_apart(_above_median(Scored(points, scores)), _PARENTS)]
+            steps = int(count * (1.0 - _EXPLORING)) if len(parents) else 0
+            new = np.vstack([_children(parents, steps, rng), *islice(spread, count - steps)])
+        points, scores = np.vstack([points, new]), np.concatenate([scores, score(new)])
+        if on_round is not None:
+            on_round(len(points), budget)
+    return Scored(points, scores)
+
+
+def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
+    """Scrambled Sobol points, drawn a whole round at a time: their balance needs powers of two."""
+    from scipy.stats import qmc  # takes a second to load, and most commands search nothing
+
+    sobol = qmc.Sobol(dimensions, rng=np.random.default_rng([seed, dimensions, 1]))
+    while True:
+        yield from np.minimum(sobol.random(ROUND), _LAST)
+
+
+def far_apart(found: Scored, count: int) -> Ints:
+    """Rows of the best points, at most ``count``, best first, of which any two are ``APART`` in some coordinate."""
+    order = np.argsort(-found.scores, kind="stable")
+    order = order[np.isfinite(found.scores[order])]
+    kept: list[int] = []
+    while len(order) and len(kept) < count:
+        best = order[0]
+        kept.append(int(best))
+        order = order[np.abs(found.points[order] - found.points[best]).max(axis=1) >= APART]
+    return np.array(kept, np.int64)
+
+
+def _above_median(found: Scored) -> Scored:
+    """The same points, but those that are no better than the median do not count."""
+    good = np.isfinite(found.scores)
+    if not good.any():
+        return found
+    return found._replace(scores=np.where(found.scores > np.median(found.scores[good]), found.scores, -np.inf))
+
+
+def _children(parents: Floats, count: int, rng: np.random.Generator) -> Floats:
+    """Points near parents, [count, d]; every parent has as many as any other."""
+    if count == 0:
+        return parents[:0]
+    parent = parents[np.arange(count) % len(parents)]
+    size = _NEAREST * (_FARTHEST / _NEAREST) ** rng.random((count, 1))
+    moved = rng.random(parent.shape) < 0.5
+    moved[np.arange(count), rng.integers(parent.shape[1], size=count)] = True
+    step = np.where(moved, size * rng.standard_normal(parent.shape), 0.0)
+    one, other = (parents[rng.integers(len(parents), size=count)] for _ in range(2))
+    crossing = rng.random((count, 1)) < 1.0 / 3.0
+    moved_to = parent + np.where(crossing, 0.5 * (one - other) + 0.1 * step, step)
+    inside: Floats = 1.0 - np.abs(np.mod(moved_to, 2.0) - 1.0)  # what left the cube is thrown back at its faces
+    return np.clip(inside, 0.0, _LAST)
+
+
+@dataclass(frozen=True, slots=True)
+class Falsified:
+    """The worst worlds that a search found, worst first, and what all that it tried were like."""
+
+    sample: Sample  # the worst worlds
+    worlds: list[NamedWorld]  # the same by name, and what was measured in them
+    scores: Floats  # of every world tried, in their order; minus infinity: the scenario does not have it
+    first_above: int | None  # how many worlds were tried until one had a score above zero
+
+    @property
+    def share_above(self) -> float:
+        """Share of the tried worlds, of those that count, with a score above zero."""
+        good = self.scores[np.isfinite(self.scores)]
+        return float((good > 0.0).mean()) if len(good) else 0.0

@@ -1,0 +1,102 @@
+"""One training of a sweep or a tuning: bring it to its end in its folder, and the figures of it for a table."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.extensions.studies.trainings import TrainingJob
+from ethbrake_marl.files.store import remove_folder
+from ethbrake_marl.policies.network import Policy
+from ethbrake_marl.policies.teams import read_trained
+from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.train import StopAt
+
+_MEASURED = ("first_impact_harm", "total_harm", "collision_rate")
+
+FIGURES = (
+    "steps",  # decisions of learners in whole updates
+    "policy_steps",  # decisions after which the kept policy was taken: the best one on the recipe's list
+    *_MEASURED,  # of the kept policy on that list
+    RunDirectory.OBJECTIVE,  # likewise, where a learner has another objective than total
+    *(f"last_{name}" for name in _MEASURED),  # of the last one
+    "policy_sha256",  # of the kept policy's manifest, of several vehicle_i=... each
+)
+
+HARM = "harm"  # beside them: what the kept policy has least of
+
+REASON = "reason"  # in their place: why a training cannot be done, however often it is tried
+
+Evaluation = Mapping[str, float]  # steps, and what was measured then
+
+
+def is_done(job: TrainingJob) -> bool:
+    """Whether the folder holds the training to its end, and its policies; raises ``InvalidInput`` for another one."""
+    run = RunDirectory(job.folder)
+    if not run.is_finished:
+        return False
+    run.check_same(job.training)
+    return all(Policy.stands_in(job.folder / place) for place in job.training.drivers.values())
+
+
+def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
+    """Bring a training to its end, from where it stopped; False where ``stop_at`` stopped it.
+
+    Raises what a training raises, ``InvalidInput`` where the folder holds another one, and ``BlockingIOError`` where
+    another worker has just begun it.
+    """
+    run = RunDirectory(job.folder)
+    if run.status.is_file():
+        run.wait_for_others(60.0)  # a worker that has lost its driver may hold the folder for a moment
+        run.check_same(job.training)
+        if run.is_finished and not is_done(job):
+            remove_folder(job.folder)  # a finished run has no checkpoint: it is trained anew
+    try:
+        return bool(job.finish(stop_at=stop_at))
+    except AlreadyExists as error:
+        raise BlockingIOError(str(error)) from None
+
+
+def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
+    """What its folder says was measured so far; raises ``InvalidInput`` where its table is damaged."""
+    run, names = RunDirectory(job.folder), (*_MEASURED, RunDirectory.OBJECTIVE)
+    try:
+        rows = [row for row in (run.rows() if run.progress.is_file() else []) if row.get(f"eval/{_MEASURED[0]}")]
+        found = [
+            {"steps": int(row["steps"])} | {n: float(row[f"eval/{n}"]) for n in names if row.get(f"eval/{n}")}
+            for row in rows
+        ]
+        if any(not {*_MEASURED} <= each.keys() or not all(map(math.isfinite, each.values())) for each in found):
+            raise ValueError("a measure is missing or not finite")
+    except (ValueError, LookupError, csv.Error) as error:
+        raise InvalidInput(f"{run.progress}: is damaged ({error}); delete its folder to train anew") from None
+    return found
+
+
+def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, Any]:
+    """``HARM`` and the ``FIGURES`` after these evaluations, without a hash."""
+    harm = RunDirectory.chosen_by(evaluations, job.training.recipe.reward.harm_count)
+    kept, last = min(evaluations, key=lambda each: each[harm]), evaluations[-1]
+    return {
+        HARM: kept[harm],
+        "steps": last["steps"],
+        "policy_steps": kept["steps"],
+        **{name: kept[name] for name in (*_MEASURED, RunDirectory.OBJECTIVE) if name in kept},
+        **{f"last_{name}": last[name] for name in _MEASURED},
+    }
+
+
+def final_figures(job: TrainingJob) -> dict[str, Any]:
+    """``HARM`` and all ``FIGURES`` of a training that is done; raises ``InvalidInput`` for a damaged file."""
+    run, evaluations = RunDirectory(job.folder), evaluations_of(job)
+    if not evaluations:
+        raise InvalidInput(f"{run.progress}: holds no evaluation; delete its folder to train anew")
+    trained = read_trained(run.policy)
+    if isinstance(trained, Policy):
+        sha256 = trained.manifest.manifest_sha256
+    else:
+        sha256 = " ".join(f"{name}={policy.manifest.manifest_sha256}" for name, policy in trained.drivers.items())
+    return {**figures(job, evaluations), "policy_sha256": sha256}

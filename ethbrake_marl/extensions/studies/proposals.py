@@ -1,0 +1,86 @@
+"""Proposals of Optuna for a tuning, through Ray Tune, kept in a file: those that stand there are proposed again first.
+
+A sampler is made anew for each trial, of a seed and the trial's number: what is proposed depends on what had
+ended by then, and not on how often the command was stopped in between.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import optuna
+from optuna.samplers import BaseSampler
+from ray.tune.search.optuna import OptunaSearch
+
+from ethbrake_marl.extensions.studies.figures import HARM
+from ethbrake_marl.files.store import write_file
+
+if TYPE_CHECKING:
+    from optuna import Study
+    from optuna.distributions import BaseDistribution
+    from optuna.trial import FrozenTrial
+
+Proposal = Mapping[str, Any]  # key -> value as Optuna has it
+
+
+class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
+    """Optuna's search of a space; a trial's configuration is its ``trial``, a number, and its ``values``.
+
+    Args:
+        file: of the proposals; made with the first one.
+        known: what stands in it.
+        space: the distribution of each key.
+        sampler: makes the sampler for the trial of a number.
+        first: the first proposal, where none is known.
+
+    """
+
+    def __init__(
+        self,
+        file: Path,
+        known: Sequence[Proposal],
+        space: Mapping[str, BaseDistribution],
+        sampler: Callable[[int], BaseSampler],
+        first: Proposal | None,
+    ) -> None:
+        optuna.logging.set_verbosity(optuna.logging.ERROR)
+        self._file, self.known, self._asked = file, [*known], 0
+        points = self.known or ([] if first is None else [first])
+        super().__init__(
+            dict(space),
+            metric=HARM,
+            mode="min",
+            points_to_evaluate=[dict(each) for each in points],
+            sampler=_SamplerOfTrial(sampler),
+        )
+
+    def suggest(self, trial_id: str) -> dict[str, Any] | None:
+        """The next trial."""
+        values, number = super().suggest(trial_id), self._asked
+        if number == len(self.known):
+            self.known.append(values)
+            write_file(self._file, (json.dumps({"trials": self.known}, indent=1) + "\n").encode())
+        self._asked += 1
+        return {"trial": number, "values": values}
+
+
+class _SamplerOfTrial(BaseSampler):
+    """A sampler of its own for each trial."""
+
+    def __init__(self, of: Callable[[int], BaseSampler]) -> None:
+        self._of = of
+
+    def before_trial(self, study: Study, trial: FrozenTrial) -> None:
+        self._sampler = self._of(trial.number)
+
+    def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
+        return {}
+
+    def sample_relative(self, study: Study, trial: FrozenTrial, search_space: Mapping[str, Any]) -> dict[str, Any]:
+        return {}
+
+    def sample_independent(self, study: Study, trial: FrozenTrial, name: str, distribution: BaseDistribution) -> Any:
+        return self._sampler.sample_independent(study, trial, name, distribution)

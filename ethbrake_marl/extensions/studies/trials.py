@@ -1,0 +1,110 @@
+"""Many trials on Ray Tune: a core and a thread each, here or on a cluster; one whose process was lost is tried again.
+
+Ray keeps notes about its work as pickles, in a temporary folder that ends with the command. ``Tuner.restore`` would
+load them, and run what a stranger put there, so it is not used: a trial knows from its own folder where it goes on.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout
+from io import StringIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from ray import tune
+
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, OnProgress, Progress, describe_error
+from ethbrake_marl.extensions.studies.figures import HARM, REASON
+
+
+def run_trials(
+    work: Callable[..., None],
+    given: Mapping[str, Any],
+    folder: Path,
+    config: tune.TuneConfig,
+    space: Mapping[str, Any],
+    *,
+    jobs: int | None,
+    retries: int,
+    told: Told,
+) -> list[dict[str, Any]]:
+    """The last report of each trial that began, in order; Ctrl-C ends all of them early. Ray must be connected.
+
+    One that came to its end has ``done``, one that failed a ``REASON``.
+
+    Args:
+        work: is called as ``work(config, **given)`` in a worker process, and reports with ``tune.report``.
+        given: the same for all trials.
+        folder: of everything; every computer of a cluster must see it.
+        config: what Ray Tune searches, and how.
+        space: of the trials.
+        jobs: trials at once; None: as many as there are cores.
+        retries: further attempts at a trial whose process was lost, or that failed by no error of this package.
+        told: hears of the ends.
+
+    """
+    config.max_concurrent_trials, config.reuse_actors = jobs, True
+    with TemporaryDirectory(prefix="ethbrake-ray-") as notes, redirect_stdout(StringIO()):
+        trainable = tune.with_parameters(_attempt, work=work, given=given, folder=folder.absolute())
+        results = tune.Tuner(
+            tune.with_resources(trainable, {"CPU": 1}),
+            param_space=dict(space),
+            tune_config=config,
+            run_config=tune.RunConfig(
+                storage_path=notes, failure_config=tune.FailureConfig(max_failures=retries), callbacks=[told], verbose=0
+            ),
+        ).fit()
+    return [
+        {
+            **(each.metrics or {}),
+            **(
+                {REASON: describe_error(getattr(each.error, "cause", None) or each.error)}
+                if each.error is not None
+                else {}
+            ),
+        }
+        for each in results
+    ]
+
+
+def _attempt(config: dict[str, Any], work: Callable[..., None], given: Mapping[str, Any], folder: Path) -> None:
+    """One attempt at a trial. An error of this package would come again, so Ray is not to try again."""
+    try:
+        if not folder.is_dir():
+            raise InvalidInput(f"{folder}: is not there on {os.uname().nodename}; every computer must see this folder")
+        work(config, **given)
+    except EthBrakeError as error:
+        tune.report({REASON: str(error), HARM: math.inf})
+
+
+class Told(tune.Callback):  # type: ignore[misc]  # Ray ships no types
+    """Tells how many trials have ended, and why some failed."""
+
+    def __init__(self, name: str, done: int, total: int, tell: OnProgress | None) -> None:
+        self._name, self._done, self._total, self._tell = name, done, total, tell or (lambda progress: None)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Nothing: Ray's notes are not read."""
+        return {}
+
+    def say(self, note: str = "") -> None:
+        """Tell how many have ended, with a note."""
+        self._tell(Progress(self._name, self._done, self._total, note=note))
+
+    def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        """A trial came to its end, or cannot be done."""
+        self._done += 1
+        self.say(str(trial.last_result.get(REASON, "")))
+
+    def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        """A trial was tried often enough."""
+        self._done += 1
+        self.say("a process was lost or failed, too often: the table says why")
+
+    def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        """A trial is tried again."""
+        self.say("a process was lost or failed: tried again")

@@ -1,0 +1,626 @@
+"""A tuning: the settings of a recipe that do least harm, searched by Optuna on Ray Tune, and one table of the trials.
+
+No time and no place stands in the table: with one job at once it is the same, byte for byte, however often the search
+was stopped.
+"""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, Discriminator, Field, PlainValidator, Tag, WithJsonSchema, model_validator
+
+from ethbrake_marl.errors import InvalidInput, OnProgress, count_of, naming_extras
+from ethbrake_marl.extensions.studies.cluster import connected
+from ethbrake_marl.extensions.studies.figures import (
+    FIGURES,
+    HARM,
+    REASON,
+    Evaluation,
+    evaluations_of,
+    figures,
+    final_figures,
+    finish,
+)
+from ethbrake_marl.extensions.studies.folder import StudyFolder
+from ethbrake_marl.extensions.studies.study_file import Seed, StudyFile, load_parts, refused_part, texts_of
+from ethbrake_marl.extensions.studies.trainings import TrainingJob
+from ethbrake_marl.files.sheet import csv_text
+from ethbrake_marl.files.store import read_object, remove_unfinished, write_file
+from ethbrake_marl.files.yaml import FileModel, FileSchema, flow_text
+from ethbrake_marl.parallel import LOCAL
+from ethbrake_marl.policies.manifest import installed_versions
+from ethbrake_marl.scenario.catalogue import check_file_name
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.training.run_folder import Training
+from ethbrake_marl.training.settings import read_settings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from optuna.distributions import BaseDistribution
+    from optuna.samplers import BaseSampler
+    from ray.tune.schedulers import TrialScheduler
+
+_Count = Annotated[int, Field(ge=0, le=1_000_000)]
+
+
+def _check_number(value: Any) -> int | float:
+    """A whole number stays one: it says that whole numbers alone are tried."""
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        raise ValueError("must be a number")
+    if not math.isfinite(value):
+        raise ValueError("must be a finite number")
+    return value
+
+
+_Number = Annotated[int | float, PlainValidator(_check_number), WithJsonSchema({"type": "number"})]
+
+
+class Range(FileModel):
+    """From ``low`` to ``high``, both included; whole numbers where both are written without a point."""
+
+    low: _Number = Field(description="the least value, included")
+    high: _Number = Field(description="the largest value, included; with low: whole numbers where neither has a point")
+    log: bool = Field(default=False, description="the logarithm is searched, not the number")
+
+    def __str__(self) -> str:
+        """The range in words."""
+        kind = ", whole" * self.whole + ", by its logarithm" * self.log
+        return f"from {flow_text(self.low)} to {flow_text(self.high)}{kind}"
+
+    @property
+    def whole(self) -> bool:
+        """Whether whole numbers alone are tried."""
+        return isinstance(self.low, int) and isinstance(self.high, int)
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Range:
+        if not self.low < self.high:
+            raise ValueError(f"low {flow_text(self.low)} must be less than high {flow_text(self.high)}")
+        if self.log and not self.low > 0:
+            raise ValueError(f"low {flow_text(self.low)} must be greater than 0, for its logarithm is searched")
+        return self
+
+    @property
+    def ends(self) -> tuple[Any, ...]:
+        """The values that are tried before anything starts."""
+        return self.low, self.high
+
+    def own(self, value: Any) -> int | float | None:
+        """A recipe's value as it would be tried; None where it is not in the range."""
+        if not isinstance(value, int | float) or isinstance(value, bool) or not self.low <= value <= self.high:
+            return None
+        if not self.whole:
+            return float(value)
+        return int(value) if value == int(value) else None
+
+    def distribution(self) -> BaseDistribution:
+        """The same for Optuna."""
+        from optuna.distributions import FloatDistribution, IntDistribution
+
+        if self.whole:
+            return IntDistribution(int(self.low), int(self.high), log=self.log)
+        return FloatDistribution(float(self.low), float(self.high), log=self.log)
+
+    def stored(self, value: Any) -> Any:
+        """A value as Optuna has it: as it is."""
+        return value
+
+    value = stored
+
+
+class Choices(FileModel):
+    """One of a list of values, of any kind."""
+
+    choices: tuple[Any, ...] = Field(strict=False, min_length=2, description="values of any kind that the recipe takes")
+
+    def __str__(self) -> str:
+        """The values in words."""
+        return f"one of {', '.join(map(flow_text, self.choices))}"
+
+    @model_validator(mode="after")
+    def _once_each(self) -> Choices:
+        texts = [*map(flow_text, self.choices)]
+        twice = [text for k, text in enumerate(texts) if text in texts[:k]]
+        if twice:
+            raise ValueError(f"{twice[0]} stands there twice")
+        return self
+
+    @property
+    def ends(self) -> tuple[Any, ...]:
+        """The values that are tried before anything starts."""
+        return self.choices
+
+    def own(self, value: Any) -> Any:
+        """A recipe's value as it would be tried; None where it is no choice."""
+        return next((each for each in self.choices if flow_text(each) == flow_text(value)), None)
+
+    def distribution(self) -> BaseDistribution:
+        """The same for Optuna."""
+        from optuna.distributions import CategoricalDistribution
+
+        return CategoricalDistribution([*map(flow_text, self.choices)])
+
+    def stored(self, value: Any) -> str:
+        """A value as Optuna has it: its text, for Optuna chooses among no lists."""
+        return flow_text(value)
+
+    def value(self, stored: Any) -> Any:
+        """What Optuna has as a value."""
+        return {flow_text(value): value for value in self.choices}[stored]
+
+
+def _form(value: Any) -> str:
+    return "#choices" if isinstance(value, Choices) or (isinstance(value, dict) and "choices" in value) else "#range"
+
+
+Dimension = Annotated[Annotated[Range, Tag("#range")] | Annotated[Choices, Tag("#choices")], Discriminator(_form)]
+
+
+def _check_recipe_keys(value: dict[str, Any]) -> dict[str, Any]:
+    for key in value:
+        if not key or "=" in key:
+            raise ValueError(f"{flow_text(key, 60)}: must be a key of the recipe, with dots inside a part")
+    return value
+
+
+class Measuring(FileModel):
+    """The list by which trials are judged and pruned, and how often in a training."""
+
+    worlds: int = Field(default=1000, ge=1, le=1_000_000, description="of the list")
+    seed: Seed = Field(default=4007, description="of the list")
+    times: int = Field(default=10, ge=1, le=1000, description="how often a training is measured")
+
+
+class Pruning(FileModel):
+    """A trial stops whose least harm so far is above the median of the others' means until then (Ray's median rule)."""
+
+    after_trials: _Count = Field(default=5, description="so many others must have come as far before one is stopped")
+    after_times: _Count = Field(default=3, description="nobody is stopped before it was measured so often")
+
+    def rule(self) -> TrialScheduler:
+        """The same for Ray Tune."""
+        from ray.tune.schedulers import MedianStoppingRule
+
+        return MedianStoppingRule(
+            "training_iteration",
+            HARM,
+            "min",
+            grace_period=self.after_times + 1,  # the first is that of an untrained policy
+            min_samples_required=self.after_trials,
+            min_time_slice=math.inf,  # no trial waits for others
+        )
+
+
+class Sampling(FileModel):
+    """Who proposes: Optuna's TPE, or chance."""
+
+    name: Literal["tpe", "random"] = Field(default="tpe", description="Optuna's TPE, or chance")
+    seed: Seed = Field(default=0, description="of what is proposed")
+    random_trials: _Count = Field(default=10, description="trials by chance before TPE begins")
+
+    def of_trial(self, number: int) -> BaseSampler:
+        """The same for Optuna, for one trial."""
+        from optuna.samplers import RandomSampler, TPESampler
+
+        seed = int(np.random.SeedSequence([self.seed, number]).generate_state(1)[0])
+        if self.name == "random":
+            return RandomSampler(seed=seed)
+        return TPESampler(seed=seed, n_startup_trials=self.random_trials)
+
+
+class TuningFile(StudyFile):
+    """The whole file."""
+
+    scenario: str = Field(description="a name or a path, as train --scenario")
+    recipe: str = Field(description="a name or a path, as train --recipe")
+    seed: Seed = Field(default=0, description="of every training")
+    settings: Annotated[dict[str, Any], AfterValidator(_check_recipe_keys)] = Field(
+        default={}, alias="set", description="settings of every trial, as train --set"
+    )
+    search: Annotated[dict[str, Dimension], AfterValidator(_check_recipe_keys)] = Field(
+        min_length=1, description="the space: a dotted key of the recipe, with a range or a list of choices"
+    )
+    measure: Measuring = Field(default=Measuring(), description="the list on which trials are judged, and how often")
+    prune: Pruning | None = Field(default=Pruning(), description="when a trial is given up; null: never")
+    sampler: Sampling = Field(default=Sampling(), description="who proposes")
+
+    def values(self, proposal: Mapping[str, Any]) -> dict[str, Any]:
+        """What Optuna proposes, as YAML has it."""
+        return {key: self.search[key].value(value) for key, value in proposal.items()}
+
+    def space(self) -> dict[str, BaseDistribution]:
+        """The space for Optuna."""
+        return {key: dimension.distribution() for key, dimension in self.search.items()}
+
+    def points(self, number: int) -> Iterator[dict[str, Any]]:
+        """Points of the space by chance, the same ones each time."""
+        with naming_extras():
+            import optuna
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+        space = self.space()
+        return (self.values(study.ask(space).params) for _ in range(number))
+
+
+Values = Mapping[str, Any]  # of a trial: key -> value, as YAML has it
+
+_NOT_SEARCHED = {  # key -> why; what is inside it, too
+    "seed": "a seed is luck; give one for all trials, as seed",
+    "evaluation": "trials are judged on one list; give it as measure",
+    "algorithm": "each algorithm has a recipe of its own; tune one at a time",
+    "total_steps": "every trial gets the same number of decisions; give it in set",
+    "checkpoint_every_updates": "it changes no result",
+    "reward.harm_count": "it says which harm is least; give it in set",
+}
+
+PRUNED = "pruned: too much harm for so many decisions"
+
+_TRIED = 200  # points of the space that are checked before anything starts
+
+TABLE, TRIALS, PROPOSALS = "trials.csv", "trials", "proposals.json"  # inside the folder
+
+
+@dataclass(frozen=True)
+class TuningPlan:
+    """What every trial has in common."""
+
+    file: TuningFile
+    recipe: TrainingRecipe  # with the file's settings, its seed and its list
+    scenario: Scenario
+    question: Mapping[str, Any]  # all that makes a trial's harm what it is, versions included
+
+    @staticmethod
+    def json_schema() -> dict[str, Any]:
+        """JSON Schema of the file of a tuning, for editors that complete and check YAML."""
+        return FileSchema.publish({**TuningFile.model_json_schema(), "title": "Tuning"})
+
+    @classmethod
+    def read(cls, path: str | Path) -> TuningPlan:
+        """Read the file of a tuning, resolve it and try its space.
+
+        Raises ``InvalidInput`` with file and line: an unknown scenario or recipe, a key that the recipe does not have
+        or that is not to be searched, a value that it does not allow, values that do not go together.
+        """
+        file = TuningFile.read_as(path, "tuning", "with scenario, recipe and search")
+        at = file._document.refusing_at
+        with at(("recipe",)):
+            recipe = load_recipe(file.recipe)
+        for key in file.search:
+            with at(("search", key)):
+                _check_searched(key, recipe, file)
+        for key in file.settings:
+            with at(("set", key)):
+                if key.removeprefix("recipe.").partition(".")[0] in ("seed", "evaluation"):
+                    raise InvalidInput(f"set.{key}: is no setting here; give seed and measure beside it")
+        asked = file.scenario, file.recipe, texts_of(file.settings)
+        try:
+            scenario, recipe = load_parts(*asked)
+        except InvalidInput:
+            part = refused_part(*asked)
+            with at(("set", part) if part in file.settings else (part or "set",)):
+                raise
+        recipe = recipe.replace(seed=file.seed)
+        with at(("scenario",)):
+            content = Training.of(recipe, scenario).content()
+        told = {
+            "training": content,
+            **file.model_dump(mode="json", include={"search", "measure", "prune", "sampler"}),
+            "order": [*file.search],
+            "versions": installed_versions(),
+        }
+        plan = cls(file, recipe, scenario, told)
+        for key, dimension in file.search.items():
+            with at(("search", key)):
+                plan._check_dimension(key, dimension)
+        points = [
+            *({key: each.ends[end] for key, each in file.search.items()} for end in (0, -1)),
+            *file.points(_TRIED),
+        ]
+        with at(("search",)):
+            for point in points:
+                plan._check_point(point)
+        return plan
+
+    def training(self, values: Values) -> Training:
+        """The training of a trial, measured so often that all trials can be compared on the way.
+
+        Raises ``InvalidInput`` where the values do not go together.
+        """
+        recipe = read_settings(texts_of(values), [self.recipe]).change(self.recipe)
+        asked = self.file.measure
+        every = -(-self.updates(recipe) // asked.times)
+        listed = {"every_updates": every, "worlds": asked.worlds, "seed": asked.seed}
+        return Training.of(recipe.replace(evaluation=listed), self.scenario)
+
+    def updates(self, recipe: TrainingRecipe) -> int:
+        """Updates of a whole training."""
+        return -(-recipe.total_steps // (recipe.n_envs * len(self.scenario.learners) * recipe.rounds))
+
+    def own_values(self) -> dict[str, Any] | None:
+        """The values that the recipe has, None where one of them is not in the space."""
+        content = self.recipe.model_dump(mode="json")
+        own = {key: dimension.own(_value_at(content, key)) for key, dimension in self.file.search.items()}
+        return None if None in own.values() else own
+
+    def example(self) -> str:
+        """The command line that trains what a trial trains: the first one, where the space holds the recipe's values.
+
+        Else one with values of the space by chance.
+        """
+        values = self.own_values() or next(self.file.points(1))
+        measured = {"evaluation": self.training(values).recipe.evaluation.model_dump(mode="json")}
+        words = ["ethbrake", "train", "--scenario", self.file.scenario, "--recipe", self.file.recipe]
+        words += ["--seed", str(self.file.seed)]
+        for text in texts_of({**self.file.settings, **values, **measured}):
+            words += ["--set", text]
+        return shlex.join(words)
+
+    def _check_dimension(self, key: str, dimension: Range | Choices) -> None:
+        own = _value_at(self.recipe.model_dump(mode="json"), key)
+        if isinstance(dimension, Range) and not dimension.whole and type(own) is int:
+            try:
+                self.training({key: math.nextafter(dimension.low, math.inf)})
+            except InvalidInput:
+                written = f"{{low: {dimension.low!r}, high: {dimension.high!r}}}"  # with the points that make it wrong
+                right = "must be whole numbers, written without a decimal point"
+                raise InvalidInput(f"search.{key} = {written}: {right}") from None
+        for value in dimension.ends:
+            self._check_point({key: value})
+
+    def _check_point(self, values: Values) -> None:
+        try:
+            self.training(values)
+        except InvalidInput as error:
+            raise InvalidInput(f"search, at {', '.join(texts_of(values))}: {error}") from None
+
+    def folder(self, path: Path) -> StudyFolder:
+        """The folder, which no other tuning may have."""
+        return StudyFolder(path, "a tuning", self.question, record="tuning.json", writes=(TABLE,))
+
+    def proposals(self, path: Path) -> list[Values]:
+        """What was proposed in a folder, as Optuna has it; raises ``InvalidInput`` unless it is all in the space."""
+        file, space = path / PROPOSALS, self.file.search
+        if not file.exists():
+            return []
+        known: Any = read_object(file).get("trials")
+        try:
+            for proposal in known:
+                values = self.file.values(proposal)
+                if values.keys() != space.keys() or None in (space[key].own(value) for key, value in values.items()):
+                    raise ValueError
+        except (TypeError, ValueError, AttributeError, LookupError):
+            raise InvalidInput(f"{file}: is damaged: a trial has other keys or values than the space") from None
+        return [*known]
+
+    def job(self, values: Values, path: Path) -> TrainingJob:
+        """The training of a trial in the folder of a tuning; equal trials are one training."""
+        training = self.training(values)
+        return TrainingJob(training, path / TRIALS / training.identity[:16], texts_of({**self.file.settings, **values}))
+
+    def run(
+        self,
+        path: Path,
+        trials: int,
+        *,
+        jobs: int = 1,
+        ray: str = LOCAL,
+        retries: int = 2,
+        tell: OnProgress | None = None,
+    ) -> TuningResult:
+        """Bring the trials of a folder to so many, and write their table, after Ctrl-C too.
+
+        The search begins anew each time, with what was proposed before; a training that is done is answered from its
+        folder, and one that was stopped goes on.
+
+        Args:
+            path: the folder of everything; made if it is not there.
+            trials: that this folder shall have altogether.
+            jobs: trials at once; more than one change what is proposed.
+            ray: address of a Ray cluster; ``local``: this machine alone.
+            retries: further attempts at a trial whose process was lost.
+            tell: hears how many trials have ended, and why some failed.
+
+        Raises ``InvalidInput`` where another process works in the folder, for a damaged file, or without the cluster.
+
+        """
+        with self.folder(path).work():
+            (path / TRIALS).mkdir(exist_ok=True)
+            remove_unfinished(path / TRIALS)
+            known = self.proposals(path)
+            with connected(ray, jobs):
+                proposed, ends = self._search(path, known, trials, jobs, retries, tell)
+            records = [
+                Trial.of(number, self.file.values(values), end)
+                for number, (values, end) in enumerate(zip(proposed, ends, strict=False))
+            ]
+            rows = [
+                {
+                    "trial": each.number,
+                    "state": each.state,
+                    "hash": self.training(each.values).identity,
+                    **{key: flow_text(value) for key, value in each.values.items()},
+                    **each.figures,
+                    "reason": each.reason,
+                }
+                for each in records
+                if each.state != "running"
+            ]
+            columns = ["trial", "state", "hash", *self.file.search, *FIGURES, "reason"]
+            write_file(path / TABLE, csv_text(rows, columns).encode())
+        return TuningResult(path / TABLE, max(trials, len(proposed)), tuple(records))
+
+    def _search(
+        self, path: Path, known: list[Values], trials: int, jobs: int, retries: int, tell: OnProgress | None
+    ) -> tuple[list[Values], list[dict[str, Any]]]:
+        """What was proposed, and how each trial of these ended."""
+        from ray import tune
+
+        from ethbrake_marl.extensions.studies.proposals import Proposals
+        from ethbrake_marl.extensions.studies.trials import Told, run_trials
+
+        own = self.own_values()
+        first = None if own is None else {key: self.file.search[key].stored(value) for key, value in own.items()}
+        search = Proposals(path / PROPOSALS, known, self.file.space(), self.file.sampler.of_trial, first)
+        total, prune = max(trials, len(known)), self.file.prune
+        told = Told("tuning", 0, total, tell)
+        if known:
+            told.say(f"{count_of(len(known), 'trial')} begun before: what ended is kept, the rest goes on")
+        elif own is None:
+            told.say("the recipe's own values are not in the space, so no trial has them")
+        ends = run_trials(
+            do_trial,
+            {"plan": self, "path": path.absolute()},
+            path,
+            tune.TuneConfig(search_alg=search, num_samples=total, scheduler=prune and prune.rule()),
+            {},
+            jobs=jobs,
+            retries=retries,
+            told=told,
+        )
+        return search.known, ends
+
+    def best_recipe(self, values: Values, file: Path, source: str) -> str:
+        """The text of a recipe that trains what the trial with these values trained, named as its file.
+
+        Raises ``InvalidInput`` for a file whose name cannot be a recipe's.
+        """
+        check_file_name("recipe", file.stem)
+        described = f"Settings of {self.file.recipe} that `ethbrake study tune` found."
+        recipe = self.training(values).recipe.replace(
+            name=file.stem, title=self.file.title, description=described, source=source
+        )
+        parts = {*type(self.recipe).model_fields, "recipe"}
+        of_scenario = {  # no recipe has these
+            key: value
+            for key, value in self.file.settings.items()
+            if key.startswith("scenario.") or key.partition(".")[0] not in parts
+        }
+        settings = "".join(f" --set {text}" for text in texts_of(of_scenario))
+        command = f"ethbrake train --scenario {self.file.scenario}{settings} --recipe {file.name}"
+        return recipe.text(f"# The best trial of a tuning, trained again: {command}\n")
+
+    def has_exported(self, path: Path, file: Path) -> bool:
+        """Whether a file is what the tuning in this folder exported: the recipe of one of its trials."""
+        try:
+            source, text = load_recipe(file).source, file.read_text("utf-8")
+        except InvalidInput:
+            return False
+        values = map(self.file.values, self.proposals(path))
+        return any(self.best_recipe(each, file, source) == text for each in values)
+
+
+State = Literal["running", "finished", "pruned", "failed"]
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """How a trial ended."""
+
+    number: int  # from 0
+    state: State
+    values: Values
+    harm: float | None  # m2/s2 on the tuning's list, of a finished one
+    figures: Mapping[str, Any]  # those of a pruned one say how it stood when it stopped
+    reason: str  # why it failed
+
+    @classmethod
+    def of(cls, number: int, values: Values, end: Mapping[str, Any]) -> Trial:
+        """From the last report of the trial."""
+        reason = str(end.get(REASON, ""))
+        state: State = "running"
+        if reason:
+            state = "failed"
+        elif end.get("done"):
+            state = "finished" if "policy_sha256" in end else "pruned"
+        found = {name: end[name] for name in FIGURES if name in end and not reason}
+        return cls(number, state, values, end[HARM] if state == "finished" else None, found, reason)
+
+
+@dataclass(frozen=True, slots=True)
+class TuningResult:
+    """What a tuning left behind."""
+
+    table: Path
+    asked: int
+    trials: tuple[Trial, ...]
+
+    @property
+    def counts(self) -> Counter[State]:
+        """How many trials ended in which way."""
+        return Counter(each.state for each in self.trials)
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether some trials did not come to an end."""
+        return len(self.trials) < self.asked or "running" in self.counts
+
+    @property
+    def best(self) -> Trial | None:
+        """The finished trial of least harm, of equals the first; None where none has finished."""
+        finished = [each for each in self.trials if each.harm is not None]
+        return min(finished, key=lambda each: (each.harm, each.number), default=None)
+
+
+def do_trial(config: dict[str, Any], plan: TuningPlan, path: Path) -> None:
+    """Train to the end and report every evaluation; Ray ends it there where the trial is pruned."""
+    from ray.tune import report
+
+    job = plan.job(plan.file.values(config["values"]), path)
+    evaluations: list[Evaluation] = []
+    last = plan.updates(job.training.recipe) * job.per_update
+
+    def judge(evaluation: Evaluation) -> None:
+        if evaluations and evaluation["steps"] <= evaluations[-1]["steps"]:
+            return  # measured again, after a stop
+        evaluations.append(evaluation)
+        if evaluation["steps"] < last:
+            report(figures(job, evaluations))
+
+    def stop_at(evaluation: Evaluation) -> str | None:
+        try:
+            judge(evaluation)
+        except SystemExit:  # how Ray ends a trial: the training is to close its folder first
+            return PRUNED
+        return None
+
+    for evaluation in evaluations_of(job):
+        judge(evaluation)
+    if not finish(job, stop_at):
+        raise SystemExit
+    report(final_figures(job))
+
+
+def _check_searched(key: str, recipe: TrainingRecipe, file: TuningFile) -> None:
+    bare = key.removeprefix("recipe.")
+    for inner, reason in _NOT_SEARCHED.items():
+        if bare == inner or bare.startswith(f"{inner}."):
+            raise InvalidInput(f"search.{key}: is not searched: {reason}")
+    for other in (*file.settings, *(each for each in file.search if each != key)):
+        if f"{bare}.".startswith(f"{other.removeprefix('recipe.')}."):
+            raise InvalidInput(f"search.{key}: {other} stands there too; leave one of them out")
+    if read_settings([f"{key}=0"], [recipe]).scenario:
+        raise InvalidInput(
+            f"search.{key}: is the scenario's; a search changes the recipe, so that harms can be compared"
+        )
+
+
+def _value_at(content: Any, key: str) -> Any:
+    """What stands at a dotted key; None where nothing does."""
+    for part in key.removeprefix("recipe.").split("."):
+        if isinstance(content, list) and part.isdecimal() and int(part) < len(content):
+            content = content[int(part)]
+        elif isinstance(content, Mapping):
+            content = content.get(part)
+        else:
+            return None
+    return content

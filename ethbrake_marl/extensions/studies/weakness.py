@@ -1,0 +1,134 @@
+"""Measures of an agent's weakness, world by world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from ethbrake_marl.agents.protocol import Driver
+from ethbrake_marl.env.harm import HarmCount
+from ethbrake_marl.errors import InvalidInput, PhysicsError, unknown_name
+from ethbrake_marl.evaluation.named_worlds import NamedWorld, make_lineup, states_of
+from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.extensions.studies.falsification import Falsified, Watcher, far_apart, search
+from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.schema import Scenario
+
+MeasureName = Literal["harm", "regret", "difference", "bound"]
+
+MEASURES: tuple[MeasureName, ...] = get_args(MeasureName)
+
+HINDSIGHT = "best_harm"  # the reference of regret, unless another is given
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What was measured in some worlds, [n] each, m2/s2; minus infinity and NaN where the physics failed."""
+
+    score: Floats
+    harm: Floats
+    reference: Floats | None  # harm of the agent that it is compared with, or the bound that a shield told
+
+
+@dataclass(frozen=True, slots=True)
+class Measure:
+    """How bad a world is for an agent.
+
+    ``harm``: its harm. ``regret``: what it does more than the reference, by default the best profile that a search
+    finds with hindsight. ``difference``: by how much it and the reference differ, either way. ``bound``: its harm less
+    the bound that its shield told at the alert; above zero the bound is broken.
+    """
+
+    name: MeasureName
+    agents: Mapping[str, Driver]  # the agent, and the reference if there is one
+    scenario: Scenario
+    harm_count: HarmCount
+
+    def __call__(self, sample: Sample) -> Measured:
+        """Measure in these worlds; where the physics fails with one of the agents the score is minus infinity."""
+        n = sample.worlds.n
+        score, harm, reference = np.full(n, -np.inf), np.full(n, np.nan), np.full(n, np.nan)
+        try:
+            found = evaluate(sample, self.agents, scenario=self.scenario, aftermath=False)
+        except PhysicsError:
+            return Measured(score, harm, reference)
+        rows = np.searchsorted(sample.index, found.index)
+        agent, *other = (found.outcome(name) for name in self.agents)
+        harm[rows] = agent.ledger.world_harm(self.harm_count)
+        if self.name == "harm":
+            score[rows] = harm[rows]
+            return Measured(score, harm, None)
+        beside = other[0].ledger.world_harm(self.harm_count) if other else agent.predicted_harm
+        if beside is None:
+            raise InvalidInput(
+                f"agent {next(iter(self.agents))!r}: tells no bound; --measure bound is for an agent behind a shield,"
+                " for instance ppo@shipped+step"
+            )
+        reference[rows] = beside
+        more = harm[rows] - beside
+        score[rows] = np.abs(more) if self.name == "difference" else more
+        return Measured(score, harm, reference)
+
+    def falsify(
+        self, budget: int, seed: int, *, most: int = 20, adaptive: bool = True, on_round: Watcher | None = None
+    ) -> Falsified:
+        """Try ``budget`` worlds of the scenario, and keep the worst, at most ``most``, that are far apart.
+
+        Worlds without harm, regret or difference are not kept: the result may hold none.
+
+        Raises ``InvalidInput`` where the scenario draws nothing, or has none of the worlds that were tried, and what
+        ``Scenario.ranges`` raises.
+        """
+        ranges = self.scenario.ranges()
+
+        def score(points: Floats) -> Floats:
+            sample, accepted = ranges.sample(points)
+            found, rows = np.full(len(points), -np.inf), np.flatnonzero(accepted)
+            if len(rows):
+                found[rows] = self(sample.take(rows)).score
+            return found
+
+        tried = search(score, len(ranges.names), budget, seed, adaptive=adaptive, on_round=on_round)
+        worst = far_apart(tried, most)
+        if self.name != "bound":
+            worst = worst[tried.scores[worst] > 0.0]
+        if not np.isfinite(tried.scores).any():
+            raise InvalidInput(
+                f"scenario {self.scenario.name!r}: none of {budget:,} worlds tried counts: all have an impact before"
+                " anybody may act, or the physics fails; give early_impacts: keep, or a larger --budget"
+            )
+        above = np.flatnonzero(tried.scores > 0.0)
+        sample, kept = ranges.sample(tried.points[worst])[0], []
+        if len(worst):
+            found = self(sample)
+            kept = [
+                NamedWorld(
+                    name=f"{self.name}-{k + 1}",
+                    score=float(found.score[k]),
+                    harm=float(found.harm[k]),
+                    reference=None if found.reference is None else float(found.reference[k]),
+                    state={name: each for name, each in state.items() if each is not None},
+                )
+                for k, state in enumerate(states_of(sample.worlds, self.scenario))
+            ]
+        return Falsified(sample, kept, tried.scores, int(above[0]) + 1 if len(above) else None)
+
+    @classmethod
+    def of(cls, name: str, agent: str, against: str | None, scenario: Scenario, harm_count: HarmCount) -> Measure:
+        """The measure of that name; raises ``InvalidInput`` for a reference that is missing or not asked for."""
+        chosen = next((each for each in MEASURES if each == name), None)
+        if chosen is None:
+            raise unknown_name("measure", name, MEASURES)
+        if name in ("harm", "bound") and against is not None:
+            raise InvalidInput(f"--against {against}: --measure {name} compares with nobody; use regret or difference")
+        if name == "difference" and against is None:
+            raise InvalidInput("--measure difference: compares two agents; say which is the other one, --against AGENT")
+        specs = [agent] if name in ("harm", "bound") else [agent, against or HINDSIGHT]
+        lineup = make_lineup(specs, scenario, harm_count=harm_count)
+        if len(lineup) != len(specs):
+            raise InvalidInput(f"agent {' or '.join(specs)}: stands for several agents; one is needed here")
+        return cls(chosen, lineup, scenario, harm_count)

@@ -1,0 +1,441 @@
+"""Brakes that build up: the force moves towards the command at a constant rate, so the motion is a cubic in time.
+
+What a vehicle's brakes or engine call for (FORCE) falls at BRAKE_RATE and rises at RELEASE_RATE until it is the
+command; before the latency has elapsed the command is 0. It goes on while a vehicle stands, is held, or is struck.
+Between events each vehicle, and each body of joined vehicles, has a constant jerk. Two more events bound a piece: the
+force reaches the command or passes 0; and joined vehicles part, or a body that is held is so no more. A world in
+which all rates are infinite never comes here.
+"""
+
+from __future__ import annotations
+
+import math
+
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.motion import BOUND, contact
+from ethbrake_marl.physics.pieces import begin_piece, force_now, pieces_to_come
+from ethbrake_marl.physics.rows import ROW
+from ethbrake_marl.physics.state import Floats
+
+_SAME_MPS2 = 5e-13  # touching vehicles whose accelerations differ by less are one body: less than parting needs
+
+_PARTS_LATE_S = 1e-9  # joined vehicles part this much late, so that rounding cannot undo it: it costs 1e-26 m
+
+_PARTS_LATE_MPS2 = 1e-12  # and by no smaller a difference of accelerations
+
+
+@compiled(bare=True)
+def built_up(table: Floats) -> bool:
+    """Whether every force is the command in effect, so that until the next onset the motion is that of ``move``."""
+    there = True
+    for i in range(table.shape[1]):
+        there = there and table[ROW.FORCE, i] == table[ROW.COMMAND, i] * table[ROW.ACTIVE, i]
+    return there and not pieces_to_come(table)
+
+
+@compiled
+def first_return(value: float, rate: float, jerk: float) -> float:
+    """First time > 0 at which ``value + rate t + jerk t^2 / 2`` is 0; infinite: never. A start at 0 does not count."""
+    if value == 0.0:
+        return -2.0 * rate / jerk if rate * jerk < 0.0 else math.inf
+    if jerk == 0.0:
+        return -value / rate if value * rate < 0.0 else math.inf
+    squared = rate * rate - 2.0 * jerk * value
+    if squared < 0.0:
+        return math.inf
+    root = math.sqrt(squared)
+    both = -(rate + root) if rate >= 0.0 else root - rate
+    early = both / jerk
+    late = 2.0 * value / both if both != 0.0 else early
+    if early <= 0.0 or 0.0 < late < early:
+        early = late
+    return early if early > 0.0 else math.inf
+
+
+@compiled
+def gap_after(gap: float, closing: float, pressing: float, jerk: float, time: float) -> float:
+    """Gap after ``time`` of constant closing jerk: ``g - (w + (b + j t / 3) t / 2) t``. [m]"""
+    return gap - (closing + 0.5 * (pressing + jerk * time / 3.0) * time) * time
+
+
+@compiled
+def contact_within(gap: float, closing: float, pressing: float, jerk: float, end: float) -> tuple[float, float]:
+    """``contact`` of a pair whose closing acceleration changes at the rate ``jerk`` (m/s3), until ``end`` (s).
+
+    The closing speed ``w + b t + j t^2 / 2`` has at most two roots, between which the gap is monotone. The first
+    stretch at whose end the gap is not positive holds the contact. Newton's method finds it, kept inside by bisection.
+    """
+    if jerk == 0.0:
+        return contact(gap, closing, pressing)
+    first, second = -math.inf, -math.inf  # the turning points of the gap, in order
+    squared = pressing * pressing - 2.0 * jerk * closing
+    if squared > 0.0:
+        root = math.sqrt(squared)
+        both = -(pressing + root) if pressing >= 0.0 else root - pressing
+        one, other = both / jerk, 2.0 * closing / both
+        first, second = min(one, other), max(one, other)
+    elif jerk < 0.0:
+        return math.inf, 0.0
+    for stretch in range(2):
+        if jerk > 0.0:  # closing up to the first turning point, and from the second one on
+            low, high = (0.0, min(first, end)) if stretch == 0 else (max(second, 0.0), end)
+        else:
+            low, high = (max(first, 0.0), min(second, end)) if stretch == 0 else (0.0, 0.0)
+        if not low < high or gap_after(gap, closing, pressing, jerk, high) > 0.0:
+            continue
+        time = low
+        for _ in range(200):
+            beyond = gap_after(gap, closing, pressing, jerk, time)
+            if beyond > 0.0:
+                low = time
+            else:
+                high = time
+            speed = closing + (pressing + 0.5 * jerk * time) * time
+            after = time + beyond / speed if speed > 0.0 else math.inf
+            if not low < after < high:
+                after = 0.5 * (low + high)
+                if after <= low or after >= high:
+                    break
+            if after == time:
+                break
+            time = after
+        return time, max(closing + (pressing + 0.5 * jerk * time) * time, 0.0)
+    return math.inf, 0.0
+
+
+@compiled(bare=True)
+def plan_force(table: Floats, i: int, wanted: float) -> None:
+    """Where the force of vehicle ``i`` goes from now on, and when it is there: the command, or 0 on the way to it."""
+    force = table[ROW.FORCE, i]
+    force = force_now(force, wanted, table[ROW.BRAKE_RATE, i], table[ROW.RELEASE_RATE, i])
+    table[ROW.FORCE, i] = force
+    table[ROW.FORCE_RATE, i] = 0.0
+    table[ROW.FORCE_TIME, i] = math.inf
+    if wanted == force:
+        return
+    rate = -table[ROW.BRAKE_RATE, i] if wanted < force else table[ROW.RELEASE_RATE, i]
+    goal = 0.0 if (force < 0.0 < wanted) or (wanted < 0.0 < force) else wanted
+    table[ROW.FORCE_RATE, i] = rate
+    table[ROW.FORCE_TIME, i] = (goal - force) / rate
+    table[ROW.FORCE_VALUE, i] = goal
+
+
+@compiled
+def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple[float, float, float, float]:
+    """``force_range``, and the rates at which both ends move."""
+    if force < 0.0 or (force == 0.0 and rate < 0.0):
+        if speed > 0.0:
+            return force, force, rate, rate
+        if speed < 0.0:
+            return -force, -force, -rate, -rate
+        return force, -force, rate, -rate
+    if force > 0.0 or rate > 0.0:
+        if speed < limit:
+            return force, force, rate, rate
+        if speed == limit:
+            return 0.0, force, 0.0, rate
+    return 0.0, 0.0, 0.0, 0.0
+
+
+@compiled
+def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) -> tuple[float, float]:
+    """Acceleration and jerk of a free body whose forces range over a moving ``[low, high]``."""
+    if low > 0.0 or (low == 0.0 and low_jerk > 0.0):
+        return low, low_jerk
+    if high < 0.0 or (high == 0.0 and high_jerk < 0.0):
+        return high, high_jerk
+    return 0.0, 0.0
+
+
+@compiled(apart=True, bare=True)
+def pool_moving(table: Floats, first: int, last: int) -> float:
+    """Accelerations and jerks of touching vehicles ``first..last`` of equal speed; the time until one of them parts.
+
+    The regression of ``pool``, but vehicles of equal acceleration are joined, and part by their jerks. Accelerations
+    that differ by rounding alone are equal.
+    """
+    count = 0
+    for i in range(first, last + 1):
+        mass, heavy = table[ROW.MASS, i], table[ROW.MASS, i] == math.inf
+        table[ROW.BLOCK_MASS, count] = mass
+        table[ROW.BLOCK_LOW, count] = 0.0 if heavy else mass * table[ROW.FORCE_LOW, i]
+        table[ROW.BLOCK_HIGH, count] = 0.0 if heavy else mass * table[ROW.FORCE_HIGH, i]
+        table[ROW.BLOCK_LOW_JERK, count] = 0.0 if heavy else mass * table[ROW.LOW_JERK, i]
+        table[ROW.BLOCK_HIGH_JERK, count] = 0.0 if heavy else mass * table[ROW.HIGH_JERK, i]
+        table[ROW.BLOCK_FIRST, count] = i
+        top = count + first
+        settle_block(table, count, top)
+        while count > 0 and table[ROW.ACCELERATION, top] >= table[ROW.ACCELERATION, top - 1] - _SAME_MPS2:
+            count -= 1
+            top -= 1
+            for row in (ROW.BLOCK_MASS, ROW.BLOCK_LOW, ROW.BLOCK_HIGH, ROW.BLOCK_LOW_JERK, ROW.BLOCK_HIGH_JERK):
+                table[row, count] += table[row, count + 1]
+            settle_block(table, count, top)
+        count += 1
+    soonest, end = math.inf, last + 1
+    for k in range(count - 1, -1, -1):
+        head, value, jerk = (
+            int(table[ROW.BLOCK_FIRST, k]),
+            table[ROW.ACCELERATION, k + first],
+            table[ROW.JERK, k + first],
+        )
+        soonest = min(soonest, parting_s(table, head, end - 1, value, jerk))
+        for i in range(head, end):
+            table[ROW.ACCELERATION, i], table[ROW.JERK, i] = value, jerk
+            table[ROW.JOINED, i] = 1.0 if i < end - 1 else 0.0
+        end = head
+    return soonest
+
+
+@compiled(bare=True)
+def settle_block(table: Floats, block: int, out: int) -> None:
+    """Acceleration and jerk of a block, into column ``out``."""
+    mass = table[ROW.BLOCK_MASS, block]
+    table[ROW.ACCELERATION, out], table[ROW.JERK, out] = settle_moving(
+        table[ROW.BLOCK_LOW, block] / mass, table[ROW.BLOCK_HIGH, block] / mass,
+        table[ROW.BLOCK_LOW_JERK, block] / mass, table[ROW.BLOCK_HIGH_JERK, block] / mass,
+    )  # fmt: skip
+
+
+@compiled(bare=True)
+def parting_s(table: Floats, head: int, tail: int, value: float, jerk: float) -> float:
+    """Time until the block of vehicles ``head..tail`` is one no more.
+
+    A block that moves parts where the front ones of it alone would be faster than it; one that is held moves where its
+    front ones drive away or its rear ones would be pushed back.
+    """
+    soonest = math.inf
+    held = value == 0.0 and jerk == 0.0
+    forward = value > 0.0 or (value == 0.0 and jerk > 0.0)
+    mass, force, rate = 0.0, 0.0, 0.0
+    for i in range(head, tail + (1 if held else 0)):  # the front ones, up to i
+        if table[ROW.MASS, i] == math.inf:
+            mass = math.inf
+            continue
+        mass += table[ROW.MASS, i]
+        side = ROW.FORCE_LOW if held or forward else ROW.FORCE_HIGH
+        force += table[ROW.MASS, i] * table[side, i]
+        rate += table[ROW.MASS, i] * table[side + ROW.LOW_JERK - ROW.FORCE_LOW, i]
+        soonest = min(soonest, crossing_s(force / mass - value, rate / mass - jerk))
+    mass, force, rate = 0.0, 0.0, 0.0
+    for i in range(tail if held else head - 1, head - 1, -1):  # the rear ones, from i on
+        if table[ROW.MASS, i] == math.inf:
+            break
+        mass += table[ROW.MASS, i]
+        force += table[ROW.MASS, i] * table[ROW.FORCE_HIGH, i]
+        rate += table[ROW.MASS, i] * table[ROW.HIGH_JERK, i]
+        soonest = min(soonest, crossing_s(-force / mass, -rate / mass))
+    return soonest
+
+
+@compiled
+def crossing_s(below: float, rate: float) -> float:
+    """When a difference of accelerations that is not positive is surely positive; infinite: never. [m/s2, m/s3]"""
+    if rate <= 0.0:
+        return math.inf
+    return max(-below / rate, 0.0) + _PARTS_LATE_S + _PARTS_LATE_MPS2 / rate
+
+
+@compiled(apart=True, bare=True)
+def accelerate_moving(table: Floats) -> float:
+    """``accelerate`` where brakes build up: accelerations and jerks; the time until touching vehicles part."""
+    vehicles = table.shape[1]
+    for i in range(vehicles):
+        plan_force(table, i, table[ROW.COMMAND, i] * table[ROW.ACTIVE, i])
+        low, high, low_jerk, high_jerk = force_ranges(
+            table[ROW.FORCE, i], table[ROW.FORCE_RATE, i], table[ROW.SPEED, i], table[ROW.LIMIT, i]
+        )
+        table[ROW.FORCE_LOW, i], table[ROW.FORCE_HIGH, i] = low, high
+        table[ROW.LOW_JERK, i], table[ROW.HIGH_JERK, i] = low_jerk, high_jerk
+    soonest, first = math.inf, 0
+    while first < vehicles:
+        last = first
+        while (
+            last < vehicles - 1 and table[ROW.GAP, last] <= 0.0 and table[ROW.SPEED, last] == table[ROW.SPEED, last + 1]
+        ):
+            last += 1
+        if last == first:
+            table[ROW.ACCELERATION, first], table[ROW.JERK, first] = settle_moving(
+                table[ROW.FORCE_LOW, first], table[ROW.FORCE_HIGH, first],
+                table[ROW.LOW_JERK, first], table[ROW.HIGH_JERK, first],
+            )  # fmt: skip
+            table[ROW.JOINED, first] = 0.0
+        else:
+            soonest = min(soonest, pool_moving(table, first, last))
+        first = last + 1
+    return soonest
+
+
+@compiled(apart=True, bare=True)
+def next_moving_event(table: Floats, now: float, end: float, parting: float) -> float:
+    """``next_event`` where brakes build up."""
+    vehicles = table.shape[1]
+    soonest = min(end - now, parting)
+    for i in range(vehicles):
+        soonest = min(soonest, table[ROW.FORCE_TIME, i])
+        if table[ROW.ACTIVE, i] == 0.0:
+            soonest = min(soonest, table[ROW.ONSET, i] - now)
+        if table.shape[0] > ROW.OF_BUILD_UP:
+            soonest = min(soonest, table[ROW.NEXT_PIECE, i] - now)
+    for i in range(vehicles):
+        speed, rate, jerk, limit = (
+            table[ROW.SPEED, i],
+            table[ROW.ACCELERATION, i],
+            table[ROW.JERK, i],
+            table[ROW.LIMIT, i],
+        )
+        most = (abs(rate) + abs(jerk) * soonest) * soonest  # by so much the speed can change
+        time, value = math.inf, 0.0
+        if most >= abs(speed):
+            time = first_return(speed, rate, jerk)
+        if most >= abs(speed - limit) and (table[ROW.FORCE, i] > 0.0 or table[ROW.FORCE_RATE, i] > 0.0):
+            reach = first_return(speed - limit, rate, jerk)
+            if reach < time:
+                time, value = reach, limit
+        table[ROW.SPEED_TIME, i] = time
+        table[ROW.SPEED_VALUE, i] = value
+        soonest = min(soonest, time)
+    for p in range(vehicles - 1):
+        time, speed = math.inf, 0.0
+        if table[ROW.JOINED, p] == 0.0:
+            gap, closing = table[ROW.GAP, p], table[ROW.SPEED, p + 1] - table[ROW.SPEED, p]
+            pressing = table[ROW.ACCELERATION, p + 1] - table[ROW.ACCELERATION, p]
+            jerk = table[ROW.JERK, p + 1] - table[ROW.JERK, p]
+            most = max(closing, 0.0) + (max(pressing, 0.0) + max(jerk, 0.0) * soonest) * soonest
+            if most * soonest >= gap:  # else it cannot close in this piece
+                time, speed = contact_within(gap, closing, pressing, jerk, soonest)
+        table[ROW.CONTACT_TIME, p] = time
+        table[ROW.CONTACT_SPEED, p] = speed
+        soonest = min(soonest, time)
+    return soonest
+
+
+@compiled(apart=True, bare=True)
+def move_on_cubics(table: Floats, duration: float) -> bool:
+    """``move`` where brakes build up: gaps, speeds and forces."""
+    vehicles, sound = table.shape[1], True
+    for p in range(vehicles - 1):
+        if table[ROW.CONTACT_TIME, p] <= duration:
+            table[ROW.GAP, p] = 0.0
+        else:
+            table[ROW.CONTACT_TIME, p] = math.inf
+            table[ROW.CONTACT_SPEED, p] = 0.0
+            if table[ROW.JOINED, p] == 0.0:
+                after = gap_after(
+                    table[ROW.GAP, p], table[ROW.SPEED, p + 1] - table[ROW.SPEED, p],
+                    table[ROW.ACCELERATION, p + 1] - table[ROW.ACCELERATION, p],
+                    table[ROW.JERK, p + 1] - table[ROW.JERK, p], duration,
+                )  # fmt: skip
+                sound = sound and after >= -BOUND.PENETRATION_M
+                table[ROW.GAP, p] = max(after, 0.0)
+    first = 0
+    while first < vehicles:
+        rate, jerk = table[ROW.ACCELERATION, first], table[ROW.JERK, first]
+        value = table[ROW.SPEED, first] + (rate + 0.5 * jerk * duration) * duration
+        last = first
+        if table[ROW.SPEED_TIME, first] <= duration:
+            value = table[ROW.SPEED_VALUE, first]
+        while table[ROW.JOINED, last] == 1.0:
+            last += 1
+            if table[ROW.SPEED_TIME, last] <= duration:
+                value = table[ROW.SPEED_VALUE, last]
+        if first > 0 and table[ROW.CONTACT_TIME, first - 1] <= duration:
+            value = table[ROW.SPEED, first - 1] + table[ROW.CONTACT_SPEED, first - 1]
+        for i in range(first, last + 1):
+            table[ROW.SPEED, i] = value
+        first = last + 1
+    for i in range(vehicles):
+        if table[ROW.FORCE_TIME, i] <= duration:
+            table[ROW.FORCE, i] = table[ROW.FORCE_VALUE, i]
+        else:
+            table[ROW.FORCE, i] += table[ROW.FORCE_RATE, i] * duration
+    return sound
+
+
+@compiled(apart=True, bare=True)
+def move_apart_on_cubics(table: Floats, duration: float) -> bool:
+    """``move_apart`` where brakes build up: each vehicle from event to event on its own, and how near two can come."""
+    vehicles = table.shape[1]
+    slowest_in_front = math.inf
+    for i in range(vehicles):
+        speed = table[ROW.SPEED, i]
+        if speed < 0.0:
+            return False
+        onset, before = table[ROW.ONSET, i], table[ROW.FORCE, i]
+        table[ROW.WAY, i], table[ROW.SPEED_VALUE, i] = 0.0, speed
+        slowest, fastest = speed, speed
+        if onset > 0.0:
+            slowest, fastest = move_alone(table, i, 0.0, min(onset, duration))
+        in_pieces, now = table.shape[0] > ROW.OF_BUILD_UP, max(onset, 0.0)
+        if in_pieces:
+            begin_piece(table, i, 0.0)
+        while in_pieces and table[ROW.NEXT_PIECE, i] <= duration:
+            begins = table[ROW.NEXT_PIECE, i]
+            low, high = move_alone(table, i, table[ROW.COMMAND, i], begins - now)
+            slowest, fastest, now = min(slowest, low), max(fastest, high), begins
+            begin_piece(table, i, now)
+        if now < duration:
+            low, high = move_alone(table, i, table[ROW.COMMAND, i], duration - now)
+            slowest, fastest = min(slowest, low), max(fastest, high)
+        table[ROW.FORCE_VALUE, i] = table[ROW.FORCE, i]
+        table[ROW.FORCE, i] = before
+        if i > 0:
+            closing = fastest - slowest_in_front
+            if closing > 0.0 and closing * duration >= table[ROW.GAP, i - 1]:
+                return False
+        slowest_in_front = slowest
+    for i in range(vehicles):
+        table[ROW.SPEED, i] = table[ROW.SPEED_VALUE, i]
+        table[ROW.FORCE, i] = table[ROW.FORCE_VALUE, i]
+    for p in range(vehicles - 1):
+        table[ROW.GAP, p] = max(table[ROW.GAP, p] + (table[ROW.WAY, p] - table[ROW.WAY, p + 1]), 0.0)
+    return True
+
+
+@compiled(bare=True)
+def move_alone(table: Floats, i: int, wanted: float, duration: float) -> tuple[float, float]:
+    """Move vehicle ``i`` under one command, from SPEED_VALUE on, and add its WAY; its lowest and its highest speed."""
+    speed = table[ROW.SPEED_VALUE, i]
+    force = force_now(table[ROW.FORCE, i], wanted, table[ROW.BRAKE_RATE, i], table[ROW.RELEASE_RATE, i])
+    rate, building = 0.0, 0.0  # at which the force moves towards the command, and for how long
+    if wanted != force:
+        rate = -table[ROW.BRAKE_RATE, i] if wanted < force else table[ROW.RELEASE_RATE, i]
+        building = duration if abs(rate * duration) < abs(wanted - force) else (wanted - force) / rate
+    built = wanted if building < duration else force + rate * duration
+    if speed == 0.0 and force <= 0.0 and built <= 0.0:
+        table[ROW.FORCE, i] = built
+        return 0.0, 0.0
+    between = speed + (force + 0.5 * rate * building) * building
+    after = between + built * (duration - building)
+    turning = speed - 0.5 * force * force / rate if force * built < 0.0 else speed  # where the force passes 0
+    slowest, fastest = min(min(speed, between), min(after, turning)), max(max(speed, between), max(after, turning))
+    if slowest <= 0.0 or fastest >= table[ROW.LIMIT, i]:
+        return move_alone_by_events(table, i, wanted, duration)
+    table[ROW.WAY, i] += (speed + 0.5 * (force + rate * building / 3.0) * building) * building
+    table[ROW.WAY, i] += (between + 0.5 * built * (duration - building)) * (duration - building)
+    table[ROW.FORCE, i], table[ROW.SPEED_VALUE, i] = built, after
+    return slowest, fastest
+
+
+@compiled(apart=True, bare=True)
+def move_alone_by_events(table: Floats, i: int, wanted: float, duration: float) -> tuple[float, float]:
+    """``move_alone`` where the vehicle may come to rest, or to its speed limit."""
+    speed, limit, now = table[ROW.SPEED_VALUE, i], table[ROW.LIMIT, i], 0.0
+    slowest, fastest = speed, speed
+    while now < duration:
+        plan_force(table, i, wanted)
+        force, rate = table[ROW.FORCE, i], table[ROW.FORCE_RATE, i]
+        acceleration, jerk = settle_moving(*force_ranges(force, rate, speed, limit))
+        passed = min(duration - now, table[ROW.FORCE_TIME, i])
+        reach, value = first_return(speed, acceleration, jerk), 0.0
+        if (force > 0.0 or rate > 0.0) and first_return(speed - limit, acceleration, jerk) < reach:
+            reach, value = first_return(speed - limit, acceleration, jerk), limit
+        passed = min(passed, reach)
+        table[ROW.WAY, i] += (speed + 0.5 * (acceleration + jerk * passed / 3.0) * passed) * passed
+        speed = value if reach <= passed else speed + (acceleration + 0.5 * jerk * passed) * passed
+        there = table[ROW.FORCE_TIME, i] <= passed
+        table[ROW.FORCE, i] = table[ROW.FORCE_VALUE, i] if there else force + rate * passed
+        slowest, fastest = min(slowest, speed), max(fastest, speed)
+        now = duration if passed >= duration - now else now + passed
+    table[ROW.SPEED_VALUE, i] = speed
+    return slowest, fastest

@@ -1,0 +1,153 @@
+"""Impacts and resting contact of touching vehicles: one order-free law for both.
+
+Pairs resolved one after another give results that depend on their order. Here a whole cluster of touching
+vehicles is resolved at once by a mass-weighted isotonic regression ``P`` (pool adjacent violators):
+
+* impact: ``v+ = (1 + e) P(v-) - e v-``; for two vehicles this is the paper's eq. (13);
+* resting contact: accelerations are ``P`` of the vehicles' own ones, a block's common acceleration being
+  ``sum(m u) / sum(m)``; forces that hold (brakes at rest) enter as a range, so a block at rest moves only when
+  pushed harder than its braked members hold.
+
+Vehicles are ordered front to rear; feasible means that no vehicle is faster than the one before it.
+
+The kernels work on one table of floats for one world, ``table[row, vehicle or pair]``; the rows are named here. (One
+array is cheap to hand from function to function; twenty small ones cost more than the physics.)
+"""
+
+from __future__ import annotations
+
+import math
+
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.motion import BOUND, settle
+from ethbrake_marl.physics.rows import LISTED, ROW
+from ethbrake_marl.physics.state import Floats
+
+
+@compiled(bare=True)
+def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) -> int:
+    """Mass-weighted isotonic regression of vehicles ``first..last`` (inclusive) into row ``out``; the number of blocks.
+
+    Rows ``low`` and ``high`` bound each vehicle's own value (equal for an ordinary one). All members of a pooled
+    block get the same bits. Rows BLOCK_* describe the blocks. A vehicle of infinite mass (``obstacle``) stands, and
+    so does its block.
+    """
+    count = 0
+    for i in range(first, last + 1):
+        mass = table[ROW.MASS, i]
+        table[ROW.BLOCK_MASS, count] = mass
+        table[ROW.BLOCK_LOW, count] = mass * table[low, i] if mass < math.inf else 0.0
+        table[ROW.BLOCK_HIGH, count] = mass * table[high, i] if mass < math.inf else 0.0
+        table[ROW.BLOCK_FIRST, count] = i
+        top = count + first
+        table[out, top] = settle(table[low, i], table[high, i])
+        while count > 0 and table[out, top] > table[out, top - 1]:
+            count -= 1
+            top -= 1
+            table[ROW.BLOCK_MASS, count] += table[ROW.BLOCK_MASS, count + 1]
+            table[ROW.BLOCK_LOW, count] += table[ROW.BLOCK_LOW, count + 1]
+            table[ROW.BLOCK_HIGH, count] += table[ROW.BLOCK_HIGH, count + 1]
+            mass = table[ROW.BLOCK_MASS, count]
+            table[out, top] = settle(table[ROW.BLOCK_LOW, count] / mass, table[ROW.BLOCK_HIGH, count] / mass)
+        count += 1
+    member = last
+    for k in range(count - 1, -1, -1):
+        value = table[out, k + first]
+        while member >= table[ROW.BLOCK_FIRST, k]:
+            table[out, member] = value
+            member -= 1
+    return count
+
+
+@compiled(bare=True)
+def resolve_cluster(table: Floats, restitution: float, first: int, last: int) -> None:
+    """Replace the speeds of touching vehicles ``first..last`` by their speeds after the impact.
+
+    One restitution holds per world, so clusters never mix two; the cluster is plastic when its largest closing speed
+    is below ``PLASTIC_SPEED_MPS``. A block's common speed is refined by the mean of what is left over, so the momentum
+    error stays within 4 eps of ``sum(m |v|)`` whatever the masses; a vehicle that nobody strikes keeps its bits.
+
+    The exact blocks are ordered, their refined speeds only up to rounding. A plastic cluster is therefore put in order
+    at the end (front to rear, nobody faster than the one before): then no pair approaches any more, and the instant has
+    no further round. Without it two blocks can hand the last bit to and fro for ever.
+    """
+    largest = 0.0
+    for p in range(first, last):
+        largest = max(largest, table[ROW.CLOSING, p])
+    bounce = restitution if largest >= BOUND.PLASTIC_SPEED_MPS else 0.0
+    end = last + 1
+    for block in range(pool(table, ROW.SPEED, ROW.SPEED, first, last, ROW.POOLED) - 1, -1, -1):
+        head = int(table[ROW.BLOCK_FIRST, block])
+        pooled = table[ROW.POOLED, head]
+        if table[ROW.BLOCK_MASS, block] < math.inf:
+            rest = 0.0
+            for i in range(head, end):
+                rest += table[ROW.MASS, i] * (table[ROW.SPEED, i] - pooled)
+            pooled += rest / table[ROW.BLOCK_MASS, block]
+        for i in range(head, end):
+            table[ROW.SPEED, i] = pooled + bounce * (pooled - table[ROW.SPEED, i])
+        end = head
+    if bounce == 0.0:
+        for i in range(first + 1, last + 1):
+            table[ROW.SPEED, i] = min(table[ROW.SPEED, i], table[ROW.SPEED, i - 1])
+
+
+@compiled(bare=True)
+def resolve_impacts(table: Floats, restitution: float) -> bool:
+    """One round of impacts of one world: every cluster that holds an approaching pair, once. False if there is none.
+
+    Rows CLOSING, BEFORE and STRUCK tell what happened. CONTACT_SPEED is used up.
+    """
+    pairs = table.shape[1] - 1
+    approaching = False
+    for p in range(pairs):
+        closing = 0.0
+        if table[ROW.GAP, p] <= 0.0:
+            closing = table[ROW.CONTACT_SPEED, p]
+            if closing == 0.0:
+                closing = table[ROW.SPEED, p + 1] - table[ROW.SPEED, p]
+        table[ROW.CLOSING, p] = closing
+        approaching = approaching or closing > 0.0
+    if not approaching:
+        return False
+    for i in range(pairs + 1):
+        table[ROW.BEFORE, i] = table[ROW.SPEED, i]
+    first = 0
+    while first < pairs:
+        last = first
+        approaching = False
+        while last < pairs and table[ROW.GAP, last] <= 0.0:
+            approaching = approaching or table[ROW.CLOSING, last] > 0.0
+            last += 1
+        if approaching:
+            resolve_cluster(table, restitution, first, last)
+        first = last + 1
+    for p in range(pairs):
+        table[ROW.CONTACT_SPEED, p] = 0.0
+        table[ROW.STRUCK, p] = 1.0 if table[ROW.CLOSING, p] > BOUND.TOUCH_SPEED_MPS else 0.0
+    return True
+
+
+@compiled(bare=True)
+def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recorded: int) -> int:
+    """Add the last round of impacts to the harm, and to the list of impacts."""
+    for p in range(table.shape[1] - 1):
+        if table[ROW.STRUCK, p] == 0.0:
+            continue
+        closing = table[ROW.CLOSING, p]
+        harm = closing * closing
+        if recorded < rows.shape[0]:
+            rows[recorded, LISTED.WORLD] = world
+            rows[recorded, LISTED.PAIR] = p
+            rows[recorded, LISTED.TIME] = time_s
+            rows[recorded, LISTED.CLOSING] = closing
+            rows[recorded, LISTED.FIRST] = 1.0 - table[ROW.HIT, p]
+            rows[recorded, LISTED.FRONT_CHANGE] = table[ROW.SPEED, p] - table[ROW.BEFORE, p]
+            rows[recorded, LISTED.REAR_CHANGE] = table[ROW.SPEED, p + 1] - table[ROW.BEFORE, p + 1]
+        recorded += 1
+        table[ROW.TOTAL_HARM, p] += harm
+        table[ROW.COUNT, p] += 1.0
+        if table[ROW.HIT, p] == 0.0:
+            table[ROW.HIT, p] = 1.0
+            table[ROW.FIRST_HARM, p] += harm
+    return recorded

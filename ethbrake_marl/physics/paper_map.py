@@ -1,0 +1,237 @@
+"""The paper's fixed-step map (eq. dynamics2): impacts are looked for, and take effect, at sample times only.
+
+With the sampling period h, one step of a vehicle with command u, from sample n to sample n + 1, is
+
+    x(n + 1) = x(n) + h f(n) + h^2 / 2 u(n)
+    v(n + 1) = f(n) + h u(n)
+
+where f(n) is the vehicle's speed after the impacts of sample n. A pair whose gap is <= 0 at a sample and which is
+closing exchanges velocity by the paper's eq. (13): for Vehicle 2 that is f = f1 after f3, the rear impact first, then
+the front impact with the already changed speed; the vehicle on the other side of the pair is updated with it.
+
+How the paper's open points are read here:
+
+* f1 is handed the state that f3 has changed, so the closing speed of the front impact is the changed one. Its harm is
+  the square of that same speed; the printed J_harm takes the speeds before both, which differs only where both pairs
+  meet at one sample.
+* The printed f1 and f3 also act on overlapping vehicles that separate, which would pull them together again. The text
+  below eq. (13) asks for a positive relative velocity, and so does this map, for the exchange and for its harm.
+* Samples are at ``tau_2 + n h``, tau_2 being the latency of Vehicle 2. Before its first sample a world moves exactly
+  and no impact is looked for: the paper assumes that there is none.
+* The command of a step is the one in force at the sample that begins it (zero-order hold); a latency that ends
+  between two samples takes effect at the later one.
+* ``0 <= v <= v_max`` is a constraint on u in the paper and no part of its map. Here each command is cut to the
+  largest one that keeps the constraint at the next sample, for every vehicle. An impact can leave a negative speed;
+  clamping it would destroy momentum, so it stays, and brakes bring it to rest from below.
+
+Only N = 3 is defined by the paper. For any N, the pairs are treated once per sample, from the rear pair to the front
+pair. Gaps become negative between a contact and its sample and while vehicles overlap; nothing pushes them apart.
+Source: the paper, section "Optimization Problem".
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics.advance import refuse_bad, shaped
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.left_out import Impacts
+from ethbrake_marl.physics.motion import BOUND, has_acted, solo_motion
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+
+SHORTEST_STEP_S = 1e-6
+
+MOST_STEPS = 10**9  # of one call
+
+_ON_SAMPLE = 1e-6  # part of a step within which two times are one sample: time is rounded, the grid is not
+
+
+@compiled
+def exchange(
+    front_mps: float, rear_mps: float, front_t: float, rear_t: float, restitution: float
+) -> tuple[float, float]:
+    """Speeds of a pair after its impact, the paper's eq. (13).
+
+    With w = v_{i+1} - v_i: ``v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})`` and
+    ``v_{i+1}+ = v_{i+1} - m_i (1 + e) w / (m_i + m_{i+1})``. [m/s, t]
+    """
+    impulse = (1.0 + restitution) * (rear_mps - front_mps) / (front_t + rear_t)
+    return front_mps + rear_t * impulse, rear_mps - front_t * impulse
+
+
+@compiled
+def exchange_at_sample(
+    k: int, gaps: Floats, speeds: Floats, mass: Floats, restitution: float, hit: Bools, first_harm: Floats,
+    total_harm: Floats, count: Ints,
+) -> None:  # fmt: skip
+    """The impacts of world ``k`` at a sample, from the rear pair to the front pair, each counted in the ledger.
+
+    As in ``advance``, harm is the squared closing speed of the impact itself, and a closing speed of at most
+    ``TOUCH_SPEED_MPS`` is a touch, which does none.
+    """
+    for p in range(gaps.shape[1] - 1, -1, -1):
+        closing = speeds[k, p + 1] - speeds[k, p]
+        if gaps[k, p] > 0.0 or closing <= 0.0:
+            continue
+        front, rear = exchange(speeds[k, p], speeds[k, p + 1], mass[k, p], mass[k, p + 1], restitution)
+        speeds[k, p] = front
+        speeds[k, p + 1] = rear
+        if closing <= BOUND.TOUCH_SPEED_MPS:
+            continue
+        harm = closing * closing
+        total_harm[k, p] += harm
+        count[k, p] += 1
+        if not hit[k, p]:
+            hit[k, p] = True
+            first_harm[k, p] += harm
+
+
+@compiled
+def held_motion(speed: float, command: float, limit: float, step: float) -> tuple[float, float]:
+    """Speed after a step of held command, and the way: ``v + h u`` and ``h v + h^2 / 2 u``. [m/s, m]
+
+    u is the command, cut so that the speed ends on standstill or on its limit instead of beyond it. The way is written
+    as the mean of both speeds times h, which is the same for a constant u. Brakes act against the motion.
+    """
+    after = speed
+    if command < 0.0:
+        after = max(speed + command * step, 0.0) if speed >= 0.0 else min(speed - command * step, 0.0)
+    elif command > 0.0 and speed < limit:
+        after = min(speed + command * step, limit)
+    return after, 0.5 * (speed + after) * step
+
+
+@compiled
+def held_speeds(speeds: Floats, command: Floats, limit: Floats, step: float) -> Floats:
+    """The speeds of ``held_motion`` after a step, [n, N] m/s."""
+    after = np.empty(speeds.shape)
+    for k in range(speeds.shape[0]):
+        for i in range(speeds.shape[1]):
+            after[k, i] = held_motion(speeds[k, i], command[k, i], limit[k, i], step)[0]
+    return after
+
+
+@compiled
+def move_to_grid(
+    k: int, duration: float, time: float, gaps: Floats, speeds: Floats, command: Floats, latency: Floats, limit: Floats
+) -> None:
+    """Exact motion of world ``k`` before its first sample, without impacts."""
+    way_in_front = 0.0
+    for i in range(speeds.shape[1]):
+        after, way, _ = solo_motion(speeds[k, i], command[k, i], latency[k, i] - time, limit[k, i], duration)
+        speeds[k, i] = after
+        if i > 0:
+            gaps[k, i - 1] += way_in_front - way
+        way_in_front = way
+
+
+@compiled
+def sample_worlds(
+    gaps: Floats, speeds: Floats, time: Floats, hit: Bools, command: Floats, until: Floats, step: float, first: Ints,
+    last: Ints, latency: Floats, mass: Floats, limit: Floats, restitution: Floats, first_harm: Floats,
+    total_harm: Floats, count: Ints,
+) -> None:  # fmt: skip
+    """Take every world from its sample ``first`` to its sample ``last``, in place; -1 is the time before sample 0."""
+    for k in range(speeds.shape[0]):
+        start = latency[k, 1]
+        begin = first[k]
+        if begin < 0:
+            end = until[k] if last[k] < 0 else start
+            move_to_grid(k, end - time[k], time[k], gaps, speeds, command, latency, limit)
+            time[k] = end
+            begin = 0
+        for n in range(begin, last[k]):
+            exchange_at_sample(k, gaps, speeds, mass, restitution[k], hit, first_harm, total_harm, count)
+            now = start + n * step + _ON_SAMPLE * step
+            way_in_front = 0.0
+            for i in range(speeds.shape[1]):
+                wanted = command[k, i] if latency[k, i] <= now else 0.0
+                speeds[k, i], way = held_motion(speeds[k, i], wanted, limit[k, i], step)
+                if i > 0:
+                    gaps[k, i - 1] += way_in_front - way
+                way_in_front = way
+        if last[k] > begin:
+            time[k] = start + last[k] * step
+
+
+def advance_sampled(
+    worlds: Worlds, command_mps2: ArrayLike, *, until_s: ArrayLike, step_s: float = 0.1
+) -> tuple[Worlds, Impacts]:
+    """Advance ``worlds`` by the paper's fixed-step map, each under its constant command, and report the impacts.
+
+    ``command_mps2`` [n, N] is the signed acceleration each vehicle wants, ignored before its latency; ``until_s`` an
+    absolute time (scalar or [n]). Steps are whole: a world ends at its first sample at or after ``until_s``, or at
+    ``until_s`` itself where that is before its first sample. Impacts of the last sample belong to the next call, so
+    calls can be chained; the state returned is the paper's s(n), before them. ``Impacts.rows`` is None. The result of
+    a world does not depend on the batch it is in. Inputs are left alone.
+
+    Gaps of the result may be negative: it can be continued here, but not by ``advance``.
+
+    Raises ``InvalidInput`` for a command beyond a vehicle's capacity, an end before a world's time, a step below
+    1e-6 s, a world whose time is between two samples, negative speeds before the first sample, or an obstacle ahead.
+    """
+    if worlds.obstacle_ahead.any():
+        k = int(np.argmax(worlds.obstacle_ahead))
+        raise InvalidInput(
+            f"advance_sampled: world {k} has an obstacle ahead (obstacle_gap_m = {worlds.obstacle_gap_m[k]:g}); the"
+            " paper's fixed-step map knows none, use advance"
+        )
+    worlds.refuse_build_up("advance_sampled")
+    command = shaped("command_mps2", command_mps2, worlds.speeds_mps.shape)
+    until = shaped("until_s", until_s, (worlds.n,))
+    refuse_bad(worlds, command, until, np.ones(worlds.n, np.bool_))
+    _refuse_unsampled(worlds, until, step_s)
+    after = worlds.copy()
+    impacts = sample_on(after, command, until, step_s)
+    after.command_mps2[...] = np.where(has_acted(worlds.vehicles.latency_s, after.time_s[:, np.newaxis]), command, 0.0)
+    return after, impacts
+
+
+def sample_on(worlds: Worlds, command: Floats, until: Floats, step_s: float) -> Impacts:
+    """``advance_sampled`` of what it would accept, in place; it checks nothing, and leaves ``command_mps2`` alone."""
+    vehicles = worlds.vehicles
+    start = vehicles.latency_s[:, 1]
+    position, end = (worlds.time_s - start) / step_s, (until - start) / step_s  # times on the grid may be rounded
+    first = np.where(position < -_ON_SAMPLE, -1.0, np.rint(position)).astype(np.int64)
+    last = np.where(end < -_ON_SAMPLE, -1.0, np.ceil(end - _ON_SAMPLE)).astype(np.int64)
+    gaps, time = worlds.gaps_m, worlds.time_s
+    first_harm, total_harm, count = np.zeros(gaps.shape), np.zeros(gaps.shape), np.zeros(gaps.shape, np.int64)
+    sample_worlds(
+        gaps, worlds.speeds_mps, time, worlds.pair_hit, command, until, float(step_s), first, last, vehicles.latency_s,
+        vehicles.mass_t, vehicles.speed_limit_mps, vehicles.restitution, first_harm, total_harm, count,
+    )  # fmt: skip
+    return Impacts(first_harm, total_harm, count, *Impacts.no_obstacle(worlds.n))
+
+
+def _refuse_unsampled(worlds: Worlds, until: Floats, step_s: float) -> None:
+    """Refuse a step, an end or a state that the map does not know."""
+    if not (SHORTEST_STEP_S <= step_s < math.inf):
+        raise InvalidInput(f"step_s = {step_s:g}: must be finite and at least {SHORTEST_STEP_S:g} s")
+    good = (until >= worlds.time_s) & (until <= worlds.time_s + MOST_STEPS * step_s)
+    if not good.all():
+        k = int(np.argmin(good))
+        raise InvalidInput(
+            f"advance_sampled: world {k} is at {worlds.time_s[k]:g} s and cannot be advanced to {until[k]:g} s in 0 to"
+            f" {MOST_STEPS:,} steps of {step_s:g} s"
+        )
+    start = worlds.vehicles.latency_s[:, 1]
+    position = (worlds.time_s - start) / step_s
+    before = position < -_ON_SAMPLE
+    good = before | (np.abs(position - np.rint(position)) <= _ON_SAMPLE)
+    if not good.all():
+        k = int(np.argmin(good))
+        raise InvalidInput(
+            f"advance_sampled: world {k} is at {worlds.time_s[k]:g} s, between two of its samples"
+            f" {start[k]:g} s + n * {step_s:g} s; begin at a sample or before the first"
+        )
+    good = ~before[:, np.newaxis] | (worlds.speeds_mps >= 0.0)
+    if not good.all():
+        k = int(np.argmin(good.all(axis=1)))
+        raise InvalidInput(
+            f"advance_sampled: world {k} has a negative speed at {worlds.time_s[k]:g} s, before its first sample at"
+            f" {start[k]:g} s; the map knows no impacts before that"
+        )

@@ -1,0 +1,582 @@
+"""State and parameters of ``n`` independent lines of ``N`` vehicles.
+
+Shape letters, used everywhere in this package:
+
+===  =========================================================
+n    worlds, advanced together and independent of each other
+N    vehicles in a line, index 0 = ``vehicle_1`` = the front one
+P    pairs, ``P = N - 1``; pair p is (vehicle p, vehicle p + 1)
+L    learners
+F    features of an observation
+===  =========================================================
+
+Only gaps and speeds are stored: absolute positions would lose digits as the line moves on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ethbrake_marl.errors import InvalidInput, count_of
+
+Floats = NDArray[np.float64]
+
+Bools = NDArray[np.bool_]
+
+Ints = NDArray[np.int64]
+
+UInt64s = NDArray[np.uint64]
+
+GRAVITY_MPS2 = 9.81
+
+_ON_ROADS = ("braking_capacity_mps2", "driving_capacity_mps2")  # what friction limits
+
+
+def as_road_allows(quantities: Mapping[str, Floats], friction: Floats) -> dict[str, Floats]:
+    """The quantities, of which no capacity is above ``friction * GRAVITY_MPS2``."""
+    most = friction * GRAVITY_MPS2
+    return {key: np.minimum(value, most) if key in _ON_ROADS else value for key, value in quantities.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Vehicles:
+    """What does not change during an episode."""
+
+    braking_capacity_mps2: Floats  # [n, N] largest deceleration, > 0
+    driving_capacity_mps2: Floats  # [n, N] largest forward acceleration, >= 0
+    latency_s: Floats  # [n, N] commands are ignored before this time, >= 0; a channel (``v2x``) may add to the own part
+    mass_t: Floats  # [n, N] > 0
+    speed_limit_mps: Floats  # [n, N] driving stops here, > 0
+    restitution: Floats  # [n] in [0, 1]
+    # [n, N] > 0, how fast the acceleration in force falls to a lower command, and rises to a higher one (m/s3);
+    # infinite: at once
+    brake_rate_mps3: Floats
+    release_rate_mps3: Floats
+    # [n, N, 2 K] when each piece of a vehicle's braking begins (s after its latency), then their commands (m/s2), which
+    # it has whatever else it is told; infinite: no such piece; [n, N, 0]: nobody brakes in pieces
+    pieces: Floats
+    own_latency_s: Floats  # [n, N] the vehicle's own part of its latency, which is what others are told of it
+    # [n, N, N] from when on vehicle i acts on news of vehicle j; infinite: never. Never before latency_s of vehicle i,
+    # and of itself (i is j) exactly from then on. Without a channel both of these share the memory of ``latency_s``
+    known_from_s: Floats
+
+    def __repr__(self) -> str:
+        n, N = self.mass_t.shape
+        return f"Vehicles({count_of(n, 'world')} of {N}, masses {_span(self.mass_t)} t)"
+
+    def take(self, rows: ArrayLike) -> Vehicles:
+        """Select worlds by index or mask (always a copy)."""
+        index = np.asarray(rows)
+        return _combined(lambda column: np.ascontiguousarray(column[index]), self)
+
+    @classmethod
+    def at_once(
+        cls,
+        braking_mps2: Floats,
+        driving_mps2: Floats,
+        latency_s: Floats,
+        mass_t: Floats,
+        limit_mps: Floats,
+        restitution: Floats,
+        brake_rate_mps3: Floats | None = None,
+        release_rate_mps3: Floats | None = None,
+        pieces: Floats | None = None,
+    ) -> Vehicles:
+        """Vehicles without a channel: latencies are all own, and all news is known from them on.
+
+        Without rates the acceleration in force is the command at once; without pieces nobody brakes in such.
+        """
+        known = cls.known_at_once(latency_s)
+        at_once = np.full(mass_t.shape, np.inf)
+        return cls(
+            braking_mps2, driving_mps2, latency_s, mass_t, limit_mps, restitution,
+            at_once if brake_rate_mps3 is None else brake_rate_mps3,
+            at_once if release_rate_mps3 is None else release_rate_mps3,
+            np.zeros((*mass_t.shape, 0)) if pieces is None else pieces, latency_s, known,
+        )  # fmt: skip
+
+    @staticmethod
+    def known_at_once(latency_s: Floats) -> Floats:
+        """``known_from_s`` [n, N, N] without a channel: all news, from the own latency [n, N] on.
+
+        A view of ``latency_s`` that takes no memory (its last axis has stride 0) and cannot be written.
+        """
+        latency = np.ascontiguousarray(latency_s, np.float64)
+        (n, N), size = latency.shape, latency.itemsize
+        view: Floats = np.ndarray((n, N, N), np.float64, latency, strides=(N * size, size, 0))
+        view.flags.writeable = False
+        return view
+
+    @property
+    def build_up(self) -> Bools:
+        """Worlds in which some vehicle's brakes build up, its rates not infinite, or brake in pieces, [n]."""
+        rates = np.minimum(self.brake_rate_mps3, self.release_rate_mps3)
+        return np.asarray(np.isfinite(rates).any(axis=1) | self.in_pieces)
+
+    @property
+    def in_pieces(self) -> Bools:
+        """Worlds in which some vehicle brakes in pieces, [n]."""
+        return np.asarray(np.isfinite(self.pieces).any(axis=(1, 2)))
+
+    def piece_commands(self, command_mps2: Floats, time_s: Floats) -> Floats:
+        """The commands [n, N] m/s2 at the times ``time_s`` [n]: whoever brakes in pieces has that of its piece."""
+        command, count = command_mps2, self.pieces.shape[2] // 2
+        for piece in range(count):
+            begins = self.latency_s + self.pieces[:, :, piece]
+            begun = (begins <= time_s[:, np.newaxis]) if piece else np.isfinite(begins)
+            command = np.where(begun, self.pieces[:, :, count + piece], command)
+        return command
+
+    def hide_from(self, vehicle: int) -> Bools:
+        """Worlds in which a channel hides something of the line from ``vehicle`` at its first decision, [n].
+
+        Either news of another vehicle has not arrived by then, or another one reacts later than the own part of its
+        latency, which is all that a message tells. Never without a channel.
+        """
+        late = self.latency_s > self.own_latency_s
+        hidden = (self.known_from_s[:, vehicle] > self.latency_s[:, [vehicle]]) | late
+        hidden[:, vehicle] = False
+        return np.asarray(hidden.any(axis=1))
+
+    @property
+    def is_known_at_once(self) -> bool:
+        """Whether nothing comes link by link, whatever memory says so: no channel, or one that changes nothing."""
+        if self._is_view:
+            return True
+        own, latency = self.own_latency_s, self.latency_s
+        return bool((own == latency).all() and (self.known_from_s == latency[:, :, np.newaxis]).all())
+
+    @property
+    def _is_view(self) -> bool:
+        """Whether own latency and news are the latency's memory, as ``at_once`` makes them."""
+        latency, news = self.latency_s, self.known_from_s
+        return self.own_latency_s is latency and news.base is latency and news.strides[1:] == (latency.itemsize, 0)
+
+
+_OF_VEHICLES = tuple(f.name for f in fields(Vehicles))
+
+_WITHOUT_NEWS = _OF_VEHICLES[:-2]
+
+
+@dataclass(frozen=True, slots=True)
+class Worlds:
+    """The state of ``n`` worlds at their times ``time_s``.
+
+    >>> import ethbrake_marl as eb
+    >>> worlds = eb.make_worlds(
+    ...     [7.0, 7.0], [20.0, 18.0, 20.0], braking_capacity_mps2=[6.0, 7.0, 6.0], driving_capacity_mps2=3.0,
+    ...     latency_s=[0.0, 0.5, 0.8], mass_t=[4.5, 5.5, 5.9], restitution=0.1,
+    ... )
+    >>> worlds.n, worlds.N, worlds.gaps_m
+    (1, 3, array([[7., 7.]]))
+
+    """
+
+    vehicles: Vehicles  # what does not change
+    gaps_m: Floats  # [n, P] bumper to bumper, >= 0 (below only in the sampled map)
+    speeds_mps: Floats  # [n, N] forward positive; negative only after a bounce-back
+    time_s: Floats  # [n] since Vehicle 1 began to brake
+    pair_hit: Bools  # [n, P] this pair has had an impact
+    command_mps2: Floats  # [n, N] signed acceleration in force up to this time; 0 up to the latency
+    obstacle_gap_m: Floats  # [n] from Vehicle 1's front to an unmovable obstacle ahead, >= 0; infinite: there is none
+    obstacle_hit: Bools  # [n] Vehicle 1 has had an impact with it
+    messages: Floats  # [n, M] what periodic messages have told whom (``physics.messages``); [n, 0] without them
+    # [n, 1 + 2 N] friction of the road, and what brakes and engines of each vehicle can on a dry one (m/s2), of which
+    # the capacities are what the road allows; [n, 0]: nothing is known of a road
+    road: Floats
+
+    def __repr__(self) -> str:
+        found = f"gaps {_span(self.gaps_m)} m, speeds {_span(self.speeds_mps)} m/s, at {_span(self.time_s)} s"
+        return f"Worlds({count_of(self.n, 'world')} of {self.N} vehicles: {found})"
+
+    @property
+    def n(self) -> int:
+        """Number of worlds."""
+        return int(self.speeds_mps.shape[0])
+
+    @property
+    def N(self) -> int:
+        """Number of vehicles in each line."""
+        return int(self.speeds_mps.shape[1])
+
+    def _each(self, change: Callable[..., NDArray[Any]], *others: Worlds) -> Worlds:
+        """``change`` of each column of these worlds and of the others, which picks or joins rows."""
+        parts = (self, *others)
+        columns = (change(*(getattr(w, name) for w in parts)) for name in _OF_WORLDS)
+        return Worlds(_combined(change, *(w.vehicles for w in parts)), *columns)
+
+    def copy(self) -> Worlds:
+        """The same worlds in memory of their own, but for ``vehicles``, which do not change."""
+        return Worlds(self.vehicles, *(getattr(self, name).copy() for name in _OF_WORLDS))
+
+    def take(self, rows: ArrayLike) -> Worlds:
+        """Select worlds by index or mask (always a copy)."""
+        index = np.asarray(rows)
+        return self._each(lambda column: np.ascontiguousarray(column[index]))
+
+    @staticmethod
+    def concatenate(parts: Sequence[Worlds]) -> Worlds:
+        """Join worlds with the same number of vehicles into one batch."""
+        parts = _alike(parts)
+        return parts[0]._each(lambda *columns: np.concatenate(columns), *parts[1:])
+
+    def assign(self, rows: Ints, fresh: Worlds) -> Worlds:
+        """The batch with ``rows`` replaced by the len(rows) worlds of ``fresh``; nothing is changed in place."""
+
+        def assigned(whole: NDArray[Any], part: NDArray[Any]) -> NDArray[Any]:
+            copy = whole.copy()
+            copy[rows] = part
+            return copy
+
+        whole, part = _alike((self, fresh))
+        return whole._each(assigned, part)
+
+    def running(
+        self,
+        time_s: ArrayLike,
+        gaps_m: ArrayLike,
+        speeds_mps: ArrayLike,
+        *,
+        command_mps2: ArrayLike = 0.0,
+        pair_hit: ArrayLike = False,
+    ) -> Worlds:
+        """These lines as they run at a later time, each to its full shape: as another simulator has moved them.
+
+        Raises ``InvalidInput`` naming the field and its first bad entry.
+
+        >>> import ethbrake_marl as eb
+        >>> alert = eb.load_scenario("paper-random").sample(2, seed=7).worlds
+        >>> alert.running(0.7, [4.0, 6.0], [18.0, 17.0, 19.0], command_mps2=[-5.0, -2.0, 0.0]).time_s
+        array([0.7, 0.7])
+
+        """
+        (n, N), inf = self.speeds_mps.shape, math.inf
+        return replace(
+            self,
+            time_s=_full("time_s", time_s, (n,), 0.0, inf),
+            gaps_m=_full("gaps_m", gaps_m, (n, N - 1), 0.0, inf),
+            speeds_mps=_full("speeds_mps", speeds_mps, (n, N), -inf, inf),
+            command_mps2=_full("command_mps2", command_mps2, (n, N), -inf, inf),
+            pair_hit=_full("pair_hit", np.asarray(pair_hit, np.float64), (n, N - 1), 0.0, 1.0) == 1.0,
+        )
+
+    def read_only(self) -> Worlds:
+        """The same worlds as arrays that cannot be written to; these stay as they are."""
+        return self._each(_unwritable)
+
+    def on_road(self, friction: Floats, dry: Mapping[str, Floats] | None = None) -> Worlds:
+        """These worlds on a road of that ``friction`` [n]; ``dry``: other capacities on a dry one, [n, N]."""
+        on_dry = {name: self.dry(name) for name in _ON_ROADS} | dict(dry or {})
+        vehicles = replace(self.vehicles, **as_road_allows(on_dry, friction[:, np.newaxis]))
+        return replace(
+            self, vehicles=vehicles, road=np.concatenate([friction[:, np.newaxis], *on_dry.values()], axis=1)
+        )
+
+    @property
+    def friction(self) -> Floats:
+        """Friction of the road, [n]; infinite where nothing is known of it."""
+        return self.road[:, 0] if self.road.shape[1] else np.full(self.n, np.inf)
+
+    def dry(self, name: str) -> Floats:
+        """A field of ``vehicles``, a capacity as it is on a dry road, [n, N]."""
+        value: Floats = getattr(self.vehicles, name)
+        if self.road.shape[1] and name in _ON_ROADS:
+            begin = 1 + self.N * _ON_ROADS.index(name)
+            value = self.road[:, begin : begin + self.N]
+        return value
+
+    def play_pieces(self, pieces: Mapping[int, Sequence[tuple[float, float]]]) -> Worlds:
+        """These worlds, in which the vehicles (index from 0) brake in these pieces, and nobody else does.
+
+        A piece is its time (s after the latency has elapsed; the first is 0) and its braking (m/s2).
+        """
+        several = {i: np.array(each, np.float64) for i, each in pieces.items() if len(each) > 1}
+        if not several and not self.vehicles.pieces.shape[2]:
+            return self
+        most = max(map(len, several.values()), default=0)
+        found = np.full((self.n, self.N, 2, most), np.inf)
+        for i, each in several.items():
+            found[:, i, 0, : len(each)], found[:, i, 1, : len(each)] = each[:, 0], 0.0 - each[:, 1]
+        return replace(self, vehicles=replace(self.vehicles, pieces=found.reshape(self.n, self.N, 2 * most)))
+
+    def refuse_build_up(self, who: str) -> None:
+        """Raise ``InvalidInput`` where brakes of a world build up, or come in pieces: ``who`` has no exact answer."""
+        slow = self.vehicles.build_up
+        if self.vehicles.in_pieces.any():
+            raise InvalidInput(
+                f"{who}: a vehicle of world {int(np.argmax(self.vehicles.in_pieces))} brakes in pieces (profile), and"
+                " nothing exact is known for these; give a constant command"
+            )
+        if slow.any():
+            raise InvalidInput(
+                f"{who}: brakes of world {int(np.argmax(slow))} build up (brake_rate_mps3, release_rate_mps3), and"
+                " nothing exact is known for these; leave the rates out"
+            )
+
+    def first_decision_s(self, deciders: Sequence[int]) -> Floats:
+        """Time of the first decision, [n] s: the least latency of the ``deciders``, or the worlds' time if it is later.
+
+        With nobody to decide it is the worlds' time.
+        """
+        if len(deciders) == 0:
+            return self.time_s.copy()
+        first: Floats = np.maximum(self.vehicles.latency_s[:, list(deciders)].min(axis=1), self.time_s)
+        return first
+
+    # The obstacle ahead of Vehicle 1 is for the kernels one more vehicle in front, which nothing moves. Everybody else
+    # keeps the numbers of the vehicles, and the obstacle has columns of its own.
+
+    @property
+    def obstacle_ahead(self) -> Bools:
+        """Which worlds have an obstacle ahead of Vehicle 1, [n]."""
+        return np.isfinite(self.obstacle_gap_m)
+
+    def with_obstacle(self) -> Worlds:
+        """These worlds, all with an obstacle ahead, with that obstacle as vehicle 0 and the vehicles one later."""
+
+        def ahead(value: float, columns: Floats) -> Floats:
+            return np.concatenate([np.full((len(columns), 1), value), columns], axis=1)
+
+        vehicles = self.vehicles
+        written_out = Vehicles.at_once(  # inside the physics nobody observes
+            ahead(0.0, vehicles.braking_capacity_mps2),
+            ahead(0.0, vehicles.driving_capacity_mps2),
+            ahead(0.0, vehicles.latency_s),
+            ahead(math.inf, vehicles.mass_t),
+            ahead(0.0, vehicles.speed_limit_mps),
+            vehicles.restitution,
+            ahead(math.inf, vehicles.brake_rate_mps3),
+            ahead(math.inf, vehicles.release_rate_mps3),
+            np.concatenate([np.full((self.n, 1, vehicles.pieces.shape[2]), np.inf), vehicles.pieces], axis=1),
+        )
+        return Worlds(
+            written_out,
+            np.concatenate([self.obstacle_gap_m[:, np.newaxis], self.gaps_m], axis=1),
+            ahead(0.0, self.speeds_mps),
+            self.time_s,
+            np.concatenate([self.obstacle_hit[:, np.newaxis], self.pair_hit], axis=1),
+            ahead(0.0, self.command_mps2),
+            np.full(self.n, np.inf),
+            np.zeros(self.n, np.bool_),
+            self.messages,
+            np.zeros((self.n, 0)),
+        )
+
+    def with_post_ahead(self, duration_s: Floats) -> Worlds:
+        """These worlds, each with an obstacle ahead: its own, or one that Vehicle 1 cannot reach in ``duration_s`` [n].
+
+        Worlds know gaps and speeds, no places. Such a post makes the way of Vehicle 1 the change of one more gap, and
+        changes no motion. It is farther than Vehicle 1 can travel, ``T sqrt(2 E / m_1)``, had it all the energy E the
+        line can ever have: impacts and brakes only take energy; driving adds at most ``m a v`` per second, and never
+        above the speed limit.
+        """
+        vehicles = self.vehicles
+        driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
+        energy = sum_rows(vehicles.mass_t * (self.speeds_mps * self.speeds_mps / 2.0 + driving))
+        farthest = 1.01 * duration_s * np.sqrt(2.0 * energy / vehicles.mass_t[:, 0])
+        return replace(self, obstacle_gap_m=np.where(self.obstacle_ahead, self.obstacle_gap_m, farthest + 1.0))
+
+
+def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
+    """The same worlds, all with as many pieces; a road known of some is of infinite friction for the others."""
+    most = max(part.vehicles.pieces.shape[2] for part in parts)
+    if any(part.vehicles.pieces.shape[2] < most for part in parts):
+        parts = [
+            replace(part, vehicles=replace(part.vehicles, pieces=_padded(part.vehicles.pieces, most))) for part in parts
+        ]
+    if len({part.road.shape[1] for part in parts}) == 1:
+        return parts
+    return [part if part.road.shape[1] else part.on_road(part.friction) for part in parts]
+
+
+def _padded(pieces: Floats, most: int) -> Floats:
+    """Pieces [n, N, 2 K] as [n, N, most]."""
+    n, N, width = pieces.shape
+    halves = pieces.reshape(n, N, 2, width // 2)
+    more = [(0, 0), (0, 0), (0, 0), (0, (most - width) // 2)]
+    return np.pad(halves, more, constant_values=np.inf).reshape(n, N, most)
+
+
+_OF_WORLDS = tuple(f.name for f in fields(Worlds))[1:]
+
+
+def _unwritable(array: NDArray[Any]) -> NDArray[Any]:
+    """The same array, which cannot be written to; the one given can."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def _span(values: Floats) -> str:
+    """The least and the largest of the values, or the one that all have; ``none`` where there are none."""
+    if not values.size:
+        return "none"
+    low, high = float(values.min()), float(values.max())
+    return f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+
+
+def _combined(change: Callable[..., NDArray[Any]], *parts: Vehicles) -> Vehicles:
+    """``change`` of each column of these vehicles, which picks or joins rows; without a channel it stays one memory."""
+    at_once = all(part._is_view for part in parts)
+    columns = [
+        change(*(getattr(part, name) for part in parts)) for name in (_WITHOUT_NEWS if at_once else _OF_VEHICLES)
+    ]
+    return Vehicles.at_once(*columns) if at_once else Vehicles(*columns)
+
+
+def sum_rows(values: Floats) -> Floats:
+    """``values.sum(axis=1)`` to the same bits; faster where a row is short, which NumPy adds up entry by entry."""
+    if not 0 < values.shape[1] < 8:
+        total: Floats = values.sum(axis=1)
+        return total
+    total = values[:, 0].copy()
+    for column in values.T[1:]:
+        total += column
+    return total
+
+
+def real_numbers(value: ArrayLike) -> Floats:
+    """``value`` as float64, the same array where it is one already.
+
+    Raises ``ValueError``, with the reason as its text, for what is no number, or which numpy would make one of: truth
+    values, masked entries, texts, tensors that need gradients or lie on another device.
+    """
+    if type(value) is np.ndarray and value.dtype.kind in "fiu":
+        return np.asarray(value, np.float64)
+    if isinstance(value, list | tuple):
+        parts = [real_numbers(part) for part in value]
+        if len({part.shape for part in parts}) > 1:
+            raise ValueError("has rows of different lengths")
+        return np.array(parts, np.float64)
+    if np.ma.is_masked(value):
+        raise ValueError("is masked")
+    if getattr(value, "requires_grad", False):
+        raise ValueError("needs gradients; pass its .detach()")
+    try:
+        array = np.asarray(value)
+        if array.dtype.hasobject and array.ndim > 0:
+            return real_numbers(list(array))
+        entry = array.item() if array.dtype.hasobject else None
+        if array.dtype.kind == "b" or isinstance(entry, bool | np.bool_):
+            raise ValueError("is a truth value")
+        if array.dtype.kind in "fiu" or hasattr(entry, "__float__"):
+            return array.astype(np.float64)
+    except (TypeError, RuntimeError, OverflowError):
+        pass
+    raise ValueError("is not a number")
+
+
+def checked_numbers(name: str, value: ArrayLike) -> Floats:
+    """``real_numbers``; raises ``InvalidInput``, which names the value, where that raises."""
+    try:
+        return real_numbers(value)
+    except ValueError as error:
+        raise InvalidInput(f"{name} = {value!r}: {error}; must be a number or an array of numbers") from None
+
+
+def make_worlds(
+    gaps_m: ArrayLike,
+    speeds_mps: ArrayLike,
+    *,
+    braking_capacity_mps2: ArrayLike,
+    driving_capacity_mps2: ArrayLike,
+    latency_s: ArrayLike,
+    mass_t: ArrayLike,
+    restitution: ArrayLike,
+    speed_limit_mps: ArrayLike = 40.0,
+    brake_rate_mps3: ArrayLike = np.inf,
+    release_rate_mps3: ArrayLike = np.inf,
+    obstacle_gap_m: ArrayLike | None = None,
+    friction: ArrayLike | None = None,
+) -> Worlds:
+    """Build checked worlds at ``t = 0``; every parameter broadcasts to its full shape.
+
+    Args:
+        gaps_m: bumper to bumper, [n, P], [P] or one number, m.
+        speeds_mps: [n, N] or [N], m/s.
+        braking_capacity_mps2: largest deceleration, to [n, N], m/s2.
+        driving_capacity_mps2: largest forward acceleration, to [n, N], m/s2.
+        latency_s: commands are ignored before this time, to [n, N], s.
+        mass_t: to [n, N], t.
+        restitution: of every impact, in [0, 1], to [n].
+        speed_limit_mps: driving stops here, to [n, N], m/s.
+        brake_rate_mps3: how fast the acceleration in force falls to a lower command, to [n, N], m/s3; inf: at once.
+        release_rate_mps3: how fast it rises to a higher one.
+        obstacle_gap_m: distance to an obstacle ahead of Vehicle 1, to [n], m; None: there is none.
+        friction: of the road, to [n]: capacities are at most ``friction * GRAVITY_MPS2``; None: as they are given.
+
+    Raises ``InvalidInput`` naming the field, the first bad entry and its range.
+
+    """
+    speeds = np.atleast_2d(checked_numbers("speeds_mps", speeds_mps))
+    if speeds.ndim != 2 or speeds.shape[1] < 2:
+        raise InvalidInput(f"speeds_mps: shape {speeds.shape}; a line needs at least 2 vehicles, as [n, N]")
+    gaps = checked_numbers("gaps_m", gaps_m)
+    n = speeds.shape[0] if gaps.ndim < 2 else max(speeds.shape[0], gaps.shape[0])
+    N = speeds.shape[1]
+    restitution_ = _full("restitution", restitution, (n,), 0.0, 1.0)
+    vehicles = Vehicles.at_once(
+        _full("braking_capacity_mps2", braking_capacity_mps2, (n, N), 0.0, np.inf, open_low=True),
+        _full("driving_capacity_mps2", driving_capacity_mps2, (n, N), 0.0, np.inf),
+        _full("latency_s", latency_s, (n, N), 0.0, np.inf),
+        _full("mass_t", mass_t, (n, N), 0.0, np.inf, open_low=True),
+        _full("speed_limit_mps", speed_limit_mps, (n, N), 0.0, np.inf, open_low=True),
+        restitution_,
+        _full("brake_rate_mps3", brake_rate_mps3, (n, N), 0.0, np.inf, open_low=True, finite=False),
+        _full("release_rate_mps3", release_rate_mps3, (n, N), 0.0, np.inf, open_low=True, finite=False),
+    )
+    speeds = _full("speeds_mps", speeds, (n, N), 0.0, np.inf)
+    if not np.all(speeds <= vehicles.speed_limit_mps):
+        world, vehicle = np.argwhere(~(speeds <= vehicles.speed_limit_mps))[0]
+        raise InvalidInput(
+            f"speeds_mps[{world}, {vehicle}] = {speeds[world, vehicle]:g}: above this vehicle's"
+            f" speed_limit_mps {vehicles.speed_limit_mps[world, vehicle]:g}"
+        )
+    worlds = Worlds(
+        vehicles,
+        _full("gaps_m", gaps, (n, N - 1), 0.0, np.inf),
+        speeds,
+        np.zeros(n),
+        np.zeros((n, N - 1), dtype=np.bool_),
+        np.zeros((n, N)),
+        np.full(n, np.inf) if obstacle_gap_m is None else _full("obstacle_gap_m", obstacle_gap_m, (n,), 0.0, np.inf),
+        np.zeros(n, dtype=np.bool_),
+        np.zeros((n, 0)),
+        np.zeros((n, 0)),
+    )
+    return worlds if friction is None else worlds.on_road(_full("friction", friction, (n,), 0.0, np.inf, open_low=True))
+
+
+def _full(
+    name: str,
+    value: ArrayLike,
+    shape: tuple[int, ...],
+    low: float,
+    high: float,
+    *,
+    open_low: bool = False,
+    finite: bool = True,
+) -> Floats:
+    """Broadcast ``value`` to ``shape`` in its own memory and check that it is in range, and ``finite``."""
+    given = checked_numbers(name, value)
+    try:
+        full = np.array(np.broadcast_to(given, shape), dtype=np.float64, order="C")
+    except ValueError:
+        raise InvalidInput(f"{name}: shape {given.shape} does not fit {shape}") from None
+    good = (
+        (np.isfinite(full) if finite else ~np.isnan(full))
+        & (full <= high)
+        & ((full > low) if open_low else (full >= low))
+    )
+    if not good.all():
+        at = tuple(int(k) for k in np.argwhere(~good)[0])
+        bracket = "(" if open_low else "["
+        finite_too = "finite and " if finite else ""
+        raise InvalidInput(f"{name}{list(at)} = {full[at]:g}: must be {finite_too}in {bracket}{low:g}, {high:g}]")
+    return full

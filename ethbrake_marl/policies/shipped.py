@@ -1,0 +1,75 @@
+"""Policies that come with the package, and how they are chosen by name.
+
+Each is a folder of ``_policies/``: a bundle, and beside it ``card.md``, which says what it was trained on, how good
+it is and where it is bad.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ethbrake_marl.env.harm import HarmCount
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.policies.network import Policy, load_policy
+from ethbrake_marl.scenario.schema import Scenario
+
+SHIPPED = "shipped"
+
+_FOLDER = Path(__file__).resolve().parents[1] / "_policies"
+
+
+def shipped_policies() -> dict[str, Path]:
+    """Name -> folder of every policy that ships."""
+    return {path.parent.name: path.parent for path in sorted(_FOLDER.glob("*/policy"))}
+
+
+def shipped_name(kind: str, scenario: Scenario | None, harm_count: HarmCount) -> str:
+    """Name of the policy of this kind for ``scenario``, of those trained for ``harm_count`` if there is one.
+
+    ``universal`` is for all scenarios, ``ppo`` and ``sac`` for the one that they were trained on, ``ppo-SCENARIO`` and
+    ``sac-SCENARIO`` for that one; ``-total`` behind says that a policy was trained for total harm. ``policy`` is the
+    one whose name ends in the scenario's, where ``universal`` does more harm, and ``universal`` elsewhere. Raises
+    ``InvalidInput`` listing what ships.
+    """
+    names, here = shipped_policies(), None if scenario is None else scenario.name
+    if kind == "policy":
+        ends = (f"{here}-total", here) if harm_count == "total" else (here,)
+        return next((name for end in ends for name in names if name.partition("-")[2] == end), "universal")
+    for stem in [kind] if here is None or kind == "universal" else [f"{kind}-{here}", kind]:
+        for name in (f"{stem}-total", stem) if harm_count == "total" else (stem,):
+            if name in names and (
+                stem != kind
+                or kind == "universal"
+                or scenario is None
+                or load_shipped(name).manifest.scenario.get("name") == here
+            ):
+                return name
+    wanted = kind if scenario is None or kind == "universal" else f"{kind} for scenario {here!r}"
+    every = ", ".join(names) or "none"
+    raise InvalidInput(
+        f"shipped policy {wanted}: there is none; shipped are: {every}; each is driven as {kind}@{SHIPPED}/NAME,"
+        " and universal@shipped in every scenario"
+    )
+
+
+def load_shipped(name: str) -> Policy:
+    """The shipped policy called ``name``; raises ``UnknownName`` with a suggestion."""
+    folders = shipped_policies()
+    if name not in folders:
+        raise unknown_name("shipped policy", name, folders)
+    return load_policy(folders[name])
+
+
+def load_named_policy(
+    path: str, kind: str = "ppo", scenario: Scenario | None = None, harm_count: HarmCount = "first"
+) -> Policy:
+    """The policy of a run or bundle at ``path``; ``shipped``: the one of this kind for ``scenario``; ``shipped/NAME``.
+
+    A folder that is called so is ``./shipped``. Raises what ``load_policy`` and the functions above raise.
+    """
+    head, slash, name = path.partition("/")
+    if head != SHIPPED:
+        return load_policy(path)
+    if slash:
+        return load_shipped(name)
+    return load_shipped(shipped_name(kind, scenario, harm_count))

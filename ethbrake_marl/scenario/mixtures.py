@@ -1,0 +1,106 @@
+"""Mixtures of scenarios: each world is drawn from one member, by weight, and is then that member's own world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.yaml import Document, flow_text
+from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.sampling import ScenarioFields
+from ethbrake_marl.scenario.vehicle_types import Member
+
+WORDS = ("title", "description", "source")
+
+_OWN = {"name", *WORDS, "mixture"}  # of the mixture itself; every other key beside it holds for all members
+
+_ONE_FOR_ALL = ("vehicles", "time_step_s", "horizon_s", "roles", "objective", "observation")
+
+_SHARED = (*_ONE_FOR_ALL, "v2x", "early_impacts")  # told of the mixture where all members agree
+
+AnyScenario = TypeVar("AnyScenario", bound=ScenarioFields)
+
+
+def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """What a scenario says, with other values under some keys; a new way to declare gaps takes the old one's place."""
+    old = {key for pair in QUANTITY.alternatives.items() for key in pair if changes.keys() & set(pair)}
+    if "speeds_mps" in changes:
+        old.add("speed_deviations_mps")
+    return {**{key: value for key, value in content.items() if key not in old}, **changes}
+
+
+def build_members(
+    document: Document, build: Callable[[Document], AnyScenario]
+) -> tuple[Document, tuple[AnyScenario, ...]]:
+    """The members that a document's ``mixture`` lists, and the document with what follows from them.
+
+    What stands beside ``mixture`` replaces what every member says. A list that is none stays for the schema to refuse.
+    Raises ``InvalidInput`` naming the member that is wrong, or the key in which two of them differ.
+    """
+    listed, content = document.content["mixture"], document.content
+    if not (isinstance(listed, list | tuple) and listed and all(_is_whole(entry) for entry in listed)):
+        return document, ()
+    fields = set(ScenarioFields.model_fields) - _OWN - {"vehicles"}
+    beside = {key: value for key, value in content.items() if key in fields}
+    members = tuple(build(_member_document(document, i, entry, beside)) for i, entry in enumerate(listed))
+    _check_members(document, members)
+    mixture = [{**entry, "scenario": member_content(member)} for entry, member in zip(listed, members, strict=True)]
+    own = {key: value for key, value in content.items() if key not in beside}
+    told = [member.model_dump(mode="json", include=set(_SHARED), exclude_none=True) for member in members]
+    shared = {key: value for key, value in told[0].items() if all(each.get(key) == value for each in told)}
+    return Document(document.file, {**own, **shared, "mixture": mixture}, document.lines), members
+
+
+def _is_whole(entry: Any) -> bool:
+    known = Member.model_fields.keys()  # else the schema names the key that is not
+    return isinstance(entry, dict) and isinstance(entry.get("scenario"), dict) and entry.keys() <= known
+
+
+def member_content(member: ScenarioFields) -> dict[str, Any]:
+    """What shapes a member's worlds, as plain data: what it says but its texts, and all that a batch has in common."""
+    declared = member.model_dump(mode="json", exclude_unset=True, exclude_none=True, exclude=set(WORDS))
+    return {**declared, **member.model_dump(mode="json", include=set(_SHARED), exclude_none=True)}
+
+
+def _member_document(document: Document, i: int, entry: Mapping[str, Any], beside: Mapping[str, Any]) -> Document:
+    """What one member says but its texts, with what stands beside the mixture, each on its line."""
+    own = {key: value for key, value in entry["scenario"].items() if key not in WORDS}
+    inside = {path[3:]: line for path, line in document.lines.items() if path[:3] == ("mixture", i, "scenario")}
+    own = {**{key: document.content[key] for key in ("vehicles",) if key in document.content}, **own}
+    above = {path: line for path, line in document.lines.items() if path and path[0] in beside}
+    where = f"{document.file}: mixture[{i}] ({own.get('name', 'without a name')})"
+    return Document(where, changed_content(own, beside), {**inside, **above})
+
+
+def _check_members(document: Document, members: Sequence[ScenarioFields]) -> None:
+    """Refuse mixtures in mixtures, a name given twice, and members that cannot be one batch."""
+    where = f"{document.where(('mixture',))}: mixture"
+    first = members[0]
+    if (given := document.content.get("vehicles", first.vehicles)) != first.vehicles:
+        raise InvalidInput(
+            f"{where}: vehicles = {given}: its scenarios have {first.vehicles}, which nothing beside them can change"
+        )
+    for k, member in enumerate(members):
+        if member.members:
+            raise InvalidInput(f"{where}[{k}]: {member.name} is a mixture itself; list its scenarios here")
+        if member.name in [other.name for other in members[:k]]:
+            raise InvalidInput(f"{where}[{k}]: {member.name} is given twice; give it once, with the sum of the weights")
+        for key in _ONE_FOR_ALL:
+            one, other = (_told(each, key) for each in (first, member))
+            if one != other:
+                way = "" if key == "vehicles" else f"; give {key} beside mixture, and it holds for all"
+                raise InvalidInput(
+                    f"{where}: {key} must be the same in all: {first.name} has {one}, {member.name} has {other}{way}"
+                )
+        samples = [each.v2x.channel.samples(each.time_step_s) for each in (first, member)]
+        if samples[0] != samples[1]:
+            raise InvalidInput(
+                f"{where}: v2x.persistence must be the same in all, and so must the delay of periodic messages:"
+                f" {first.name} and {member.name} differ; give v2x beside mixture, and it holds for all"
+            )
+
+
+def _told(scenario: ScenarioFields, key: str) -> str:
+    value = getattr(scenario, key)
+    return "nothing" if value is None else flow_text(dict(value) if key == "roles" else value, 120)

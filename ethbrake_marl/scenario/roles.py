@@ -1,0 +1,204 @@
+"""Roles: who learns, names of scripts (``name[:argument]``), and the commands of the scripts that need no state."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from functools import lru_cache
+from itertools import pairwise
+from typing import Annotated, Any, NamedTuple, NoReturn
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import BeforeValidator, PlainSerializer, WithJsonSchema
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.yaml import parse_numeral, refuse
+from ethbrake_marl.physics.state import Floats
+
+LEARNER = "learner"
+
+_PROFILE = "profile"  # a constant command in pieces
+
+MOST_PIECES = 64
+
+_SPEC = re.compile(r"(?P<name>[a-z][a-z0-9_@.-]*)(:(?P<argument>\S+))?")
+
+
+class ScriptSpec(NamedTuple):
+    """``name[:argument]``, for instance ``constant:3.5``: how a scenario, or a command, names an agent."""
+
+    name: str
+    argument: str | None
+
+    def __str__(self) -> str:
+        return self.name if self.argument is None else f"{self.name}:{self.argument}"
+
+    @staticmethod
+    @lru_cache(maxsize=256)
+    def parse(spec: str) -> ScriptSpec:
+        """Split it.
+
+        Raises ``InvalidInput`` unless the name matches ``[a-z][a-z0-9_@.-]*`` and the argument has no blanks, and for a
+        Python file: a scenario that somebody else wrote must not run code.
+        """
+        match = _SPEC.fullmatch(spec) if isinstance(spec, str) else None
+        if match is None:
+            raise InvalidInput(
+                f"agent {spec!r}: must be name or name:argument, the name in lower case letters, digits and _ @ . -,"
+                " for instance full_brake or constant:3.5"
+            )
+        if match["name"].endswith(".py") or ".py:" in spec:
+            raise InvalidInput(
+                f"agent {spec!r}: is a function of a Python file, and those are loaded only where a person names them"
+                " (--agents); no scenario does. A package that you install can give it a name"
+            )
+        return ScriptSpec(match["name"], match["argument"])
+
+    @property
+    def deceleration_mps2(self) -> float | None:
+        """The deceleration a (negative = drive) of ``constant:a``; None for any other script.
+
+        Raises ``InvalidInput`` when a is missing or not a finite number.
+        """
+        if self.name != "constant":
+            return None
+        deceleration = parse_numeral(self.argument or "")
+        if deceleration is None or not math.isfinite(deceleration):
+            raise InvalidInput(
+                f"agent {str(self)!r}: constant needs a finite deceleration in m/s2 after the colon, for instance"
+                " constant:3.5"
+            )
+        return deceleration
+
+    @property
+    def pieces(self) -> tuple[tuple[float, float], ...]:
+        """The pieces of a ``profile``: s after the latency, m/s2 of braking; none of any other script.
+
+        Raises ``InvalidInput`` unless times begin with 0 and rise, and no braking is negative.
+        """
+        if self.name != _PROFILE:
+            return ()
+        given = [part.split("=") for part in (self.argument or "").split(",")]
+        return checked_pieces([[parse_numeral(number) for number in piece] for piece in given])
+
+    @property
+    def hardest_mps2(self) -> float | None:
+        """The largest deceleration (m/s2) that ``constant:a`` or a ``profile`` asks for; None for any other script."""
+        return max(braking for _, braking in self.pieces) if self.name == _PROFILE else self.deceleration_mps2
+
+    def is_state_free(self) -> bool:
+        """Whether the script's command never depends on the state: ``full_brake``, ``coast`` or ``constant:a``.
+
+        Raises ``InvalidInput`` when such a script has an argument it does not take, or lacks the one it needs.
+        """
+        if self.name == _PROFILE:
+            return len(self.pieces) > 0
+        if self.name in ("full_brake", "coast"):
+            if self.argument is not None:
+                raise InvalidInput(f"agent {str(self)!r}: {self.name} takes no argument")
+            return True
+        return self.deceleration_mps2 is not None
+
+    def command(
+        self, braking_capacity_mps2: ArrayLike, driving_capacity_mps2: ArrayLike | None = None
+    ) -> Floats | None:
+        """Signed command (m/s2) of a state-free script, in the shape of the capacity; None for any other script.
+
+        ``full_brake`` -> -capacity, ``coast`` -> 0, ``constant:a`` -> -a, a ``profile`` that of its first piece.
+        Raises ``InvalidInput`` when a, or a piece, is above the braking capacity of any vehicle, or -a above its
+        driving capacity where that is given.
+        """
+        capacity = np.asarray(braking_capacity_mps2, dtype=np.float64)
+        if not self.is_state_free():
+            return None
+        deceleration = self.hardest_mps2
+        if deceleration is None:
+            return -capacity if self.name == "full_brake" else np.zeros(capacity.shape)
+        if not np.all(deceleration <= capacity):
+            raise InvalidInput(f"agent {str(self)!r}: above the braking capacity {np.min(capacity):g} m/s2")
+        if driving_capacity_mps2 is not None and not np.all(-deceleration <= np.asarray(driving_capacity_mps2)):
+            raise InvalidInput(
+                f"agent {str(self)!r}: above the driving capacity {np.min(driving_capacity_mps2):g} m/s2"
+            )
+        return np.full(capacity.shape, 0.0 - (self.pieces[0][1] if self.pieces else deceleration))
+
+
+def checked_pieces(given: object) -> tuple[tuple[float, float], ...]:
+    """The pieces of a ``profile``, [[s, m/s2], ...], as they are written in roles; raises ``InvalidInput``."""
+    right = f"a profile is 1 to {MOST_PIECES} pieces [s after the latency, m/s2 of braking], such as [[0, 3], [1, 7]]"
+    if not isinstance(given, list | tuple) or not 1 <= len(given) <= MOST_PIECES:
+        raise InvalidInput(right)
+    for piece in given:
+        numbers = isinstance(piece, list | tuple) and len(piece) == 2
+        if not numbers or not all(type(each) in (int, float) and 0.0 <= each <= 3600.0 for each in piece):
+            raise InvalidInput(f"{right}; both in [0, 3600], which {piece!r:.60} is not")
+    if given[0][0] != 0.0 or not all(one[0] < other[0] for one, other in pairwise(given)):
+        raise InvalidInput(f"{right}; times begin with 0 and rise")
+    return tuple((float(begins), float(braking)) for begins, braking in given)
+
+
+def _role_text(role: object) -> object:
+    """A role as a script is named: ``{profile: [[0, 3], [1, 7]]}`` is ``profile:0=3,1=7``."""
+    if not isinstance(role, dict):
+        return role
+    try:
+        if set(role) != {_PROFILE}:
+            raise InvalidInput("must be learner, a script, or {profile: [[0, 3], [1, 7]]} and nothing beside it")
+        pieces = checked_pieces(role[_PROFILE])
+    except InvalidInput as error:
+        refuse((), role, str(error))
+    numbers = (tuple(repr(number).removesuffix(".0") for number in piece) for piece in pieces)
+    return f"{_PROFILE}:" + ",".join(f"{begins}={braking}" for begins, braking in numbers)
+
+
+def _role_content(role: str) -> str | dict[str, list[list[float]]]:
+    """A role as a file says it."""
+    pieces = ScriptSpec.parse(role).pieces
+    return {_PROFILE: [list(piece) for piece in pieces]} if pieces else role
+
+
+_ROLE_SCHEMA = {
+    "anyOf": [
+        {"type": "string"},
+        {
+            "type": "object",
+            "required": [_PROFILE],
+            "additionalProperties": False,
+            "properties": {
+                _PROFILE: {
+                    "type": "array",
+                    "minItems": 1,
+                    "maxItems": MOST_PIECES,
+                    "items": {"type": "array", "minItems": 2, "maxItems": 2, "items": {"type": "number", "minimum": 0}},
+                }
+            },
+        },
+    ]
+}
+
+Role = Annotated[
+    str, BeforeValidator(_role_text), PlainSerializer(_role_content, return_type=Any), WithJsonSchema(_ROLE_SCHEMA)
+]
+
+
+class Roles(dict[str, str]):
+    """Vehicle -> ``learner`` or a script; like the rest of a scenario it cannot be changed."""
+
+    def _refuse(self, *args: object, **kwargs: object) -> NoReturn:
+        raise InvalidInput("roles of a scenario are frozen; use scenario.replace(roles=...) or scenario.with_learners")
+
+    __setitem__ = __delitem__ = __ior__ = _refuse
+    update = setdefault = pop = popitem = clear = _refuse
+
+    def __reduce__(self) -> tuple[type[Roles], tuple[dict[str, str]]]:
+        """Copy and pickle through the constructor."""
+        return Roles, (dict(self),)
+
+    @staticmethod
+    def complete(given: Mapping[str, str] | None, vehicles: int) -> Roles:
+        """A role for every vehicle in order: full braking where none is given; by default vehicle_2 learns."""
+        roles = {"vehicle_2": LEARNER} if given is None else given
+        names = [f"vehicle_{i + 1}" for i in range(vehicles)]
+        return Roles({name: roles.get(name, "full_brake") for name in names})

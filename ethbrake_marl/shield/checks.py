@@ -1,0 +1,27 @@
+"""Checks of what a shield is built with: amounts and scenario."""
+
+from __future__ import annotations
+
+from numbers import Real
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.scenario.schema import Scenario
+
+
+def is_amount(value: object, below: float = np.inf) -> bool:
+    """Whether this is a number, at least 0 and ``below`` that."""
+    return isinstance(value, Real) and not isinstance(value, bool) and 0.0 <= float(value) < below
+
+
+def check_amount(name: str, value: object, where: str, unit: str = "") -> None:
+    """Raise ``InvalidInput`` for what is not a finite number, at least 0."""
+    if not is_amount(value):
+        raise InvalidInput(f"{where}: {name} = {value!r}: must be a number, at least 0{unit}")
+
+
+def check_scenario(scenario: object, where: str) -> None:
+    """Raise ``InvalidInput`` for what is not a ``Scenario``, its name among that."""
+    if not isinstance(scenario, Scenario):
+        raise InvalidInput(f"{where}: scenario = {scenario!r}: must be a Scenario; eb.load_scenario(name) loads one")

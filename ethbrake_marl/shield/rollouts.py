@@ -1,0 +1,157 @@
+"""Rollouts of the policies that propose: their actions from the alert, and from any later decision, as plans.
+
+What a rollout does is written down as a plan and certified like any other (``plan_harm``): a policy that would drive
+differently the second time costs interventions, never the bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.driving import episode_engine, write_down
+from ethbrake_marl.agents.protocol import Agent, AgentAround, Team
+from ethbrake_marl.env.actions import action_to_command, command_to_action
+from ethbrake_marl.env.memory import Memory, ask_script, begin_script, take_memory
+from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.errors import renumbered
+from ethbrake_marl.physics.episode import CLOCK
+from ethbrake_marl.physics.motion import has_acted
+from ethbrake_marl.physics.state import Floats, Ints, Worlds
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.comparison import ends_under, worlds_at
+from ethbrake_marl.shield.members import (
+    NO_CERTIFICATE,
+    NOT_A_NUMBER,
+    Backup,
+    Decision,
+    Running,
+    ShieldReason,
+    certify,
+    from_now,
+    plan_harm,
+)
+
+
+class Proposer(NamedTuple):
+    """Who proposes, and what they see now: enough to try, on copies, what they would do later."""
+
+    policies: Mapping[int, Agent]  # by shielded vehicle, front to rear
+    memories: Mapping[int, Memory]  # theirs of the running episodes, this decision's action included
+    worlds: Worlds  # [n] now
+
+
+def rolled_out(
+    worlds: Worlds, policies: Mapping[int, Agent], scenario: Scenario, vehicle: int | tuple[int, ...], width: int
+) -> Floats:
+    """The actions [n, width] (several vehicles: [n, width, K]) of policies that drive unshielded from the alert.
+
+    Full braking beyond their episode's end.
+    """
+    team = Team({i: _Rounded(policy) for i, policy in policies.items()}, next(iter(policies.values())).name)
+    engine = episode_engine(worlds, team, scenario)
+    columns = write_down(engine, width, lambda: np.stack([engine.memories[i]["action"] for i in team.drivers], axis=1))
+    actions = np.where(np.isnan(columns), -1.0, columns)
+    return actions[:, :, 0] if isinstance(vehicle, int) else actions
+
+
+def certify_rollouts(
+    running: Running, proposed: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
+) -> Decision:
+    """Decide again in ``rows``, where the proposals found no certificate, with the policy itself as the later plan.
+
+    The plan that is tried is the proposal (clipped, a number), then what the policy does from the state after it. Where
+    it keeps the budget it becomes the backup, and the proposal is "what the plan says"; elsewhere the reason says that
+    something else must be applied. ``running``, ``proposed``, ``budget`` and the plans ``held`` are those of the
+    whole batch. Of several vehicles, who proposes no number keeps its planned action. Returns the decision of those
+    rows alone.
+    """
+    part, least, silent = running.take(rows), budget[rows], np.isnan(proposed[rows])
+    planned = held[rows, np.minimum(running.steps[rows], held.shape[1] - 1)]
+    first = np.where(silent, planned, np.clip(proposed[rows], -1.0, 1.0))
+    plan = _later_plan(running.nominal(), first, rows, budget, held, proposer)
+    with renumbered(rows):
+        harm = plan_harm(part, plan)
+        kept = harm <= least
+        if part.caps.size:
+            within = (ends_under(part, plan)[1] <= part.caps).all(axis=1)
+            kept &= within.reshape(part.n, -1).all(axis=1)
+        decision = certify(part, first, Backup(plan, harm, no_constants(plan)), np.maximum(least, harm))
+    each = kept.reshape(-1, *[1] * (first.ndim - 1))
+    told = np.where(silent, NOT_A_NUMBER, ShieldReason.POLICY_ROLLOUT)
+    margin = np.broadcast_to((least - harm).reshape(each.shape), first.shape)
+    return decision._replace(intervened=silent | ~each, margin=margin, reason=np.where(each, told, NO_CERTIFICATE))
+
+
+def _later_plan(
+    running: Running, first: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
+) -> Floats:
+    """The plans of ``rows``: what was applied, the ``first`` action ([m] or [m, K]), then the policies'.
+
+    Given up once above the budget.
+    """
+    policies, memories, worlds = proposer
+    memories, seen = take_memory(memories, rows), worlds.take(rows)
+    episodes, most, action = running.take(rows), budget[rows], first
+    plan, nothing = from_now(held[rows], -1.0, episodes.steps), np.zeros(len(rows))
+    while True:
+        going = np.flatnonzero(~episodes.ended)
+        plan[going, episodes.steps[going]] = action[going]
+        with renumbered(rows):
+            episodes = certify(episodes, action, Backup(plan, nothing, no_constants(plan)), nothing).after
+        N = episodes.problem.mass.shape[1]
+        harm = 4 * N - 3 if episodes.problem.clock[0, CLOCK.HARM_IS_TOTAL] == 1.0 else 3 * N - 2
+        so_far = episodes.states[:, harm : harm + N - 1].sum(axis=1)
+        episodes = episodes._replace(ended=episodes.ended | (so_far > most))
+        if episodes.ended.all():
+            return plan
+        # as a driver sees them at the next decisions, the last actions in force
+        commands = episodes.problem.command[:, -seen.N :].copy()  # without an obstacle ahead
+        for c, vehicle in enumerate(policies):
+            column = action if action.ndim == 1 else action[:, c]
+            commands[:, vehicle] = action_to_command(column, seen.vehicles, vehicle)
+        time, vehicles, force = episodes.time_s, seen.vehicles, episodes.states[:, -seen.N :]
+        commands = vehicles.piece_commands(commands, time)
+        acts = np.where(has_acted(vehicles.latency_s, time[:, np.newaxis]), commands, 0.0)
+        at_once = np.isinf(np.where(acts < force, vehicles.brake_rate_mps3, vehicles.release_rate_mps3))
+        in_force = np.where(at_once, acts, force)
+        seen = replace(worlds_at(seen, episodes.states), time_s=time, command_mps2=in_force)
+        with renumbered(rows):
+            proposed, memories = proposed_actions(policies, memories, seen)
+        action = proposed.reshape(first.shape)
+        action = np.where(np.isnan(action), -1.0, action)  # the shield would not apply what is no number either
+
+
+def no_constants(plan: Floats) -> Floats:
+    """No constant action to replace the rest of a plan."""
+    return np.zeros((0, *plan.shape[2:]))
+
+
+def proposed_actions(
+    policies: Mapping[int, Agent], memories: Mapping[int, Memory], worlds: Worlds
+) -> tuple[Floats, dict[int, Memory]]:
+    """What the policies propose, [n, K], and what they remember then."""
+    asked = {i: proposed_action(policy, worlds, memories[i], i) for i, policy in policies.items()}
+    after = {i: memory for i, (_, memory) in asked.items()}
+    return np.stack([action for action, _ in asked.values()], axis=1), after
+
+
+def proposed_action(policy: Agent, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+    """What a policy proposes, as actions [n] in [-1, 1]; a command that is no number stays none. And its memory."""
+    command, memory = ask_script(policy, worlds, memory, vehicle)
+    return np.where(np.isnan(command), np.nan, command_to_action(command, worlds.vehicles, vehicle)), memory
+
+
+class _Rounded(AgentAround):
+    """A policy whose commands are applied as its actions are written down; it remembers the last ``action``."""
+
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        return {"policy": begin_script(self.policy, alert, vehicle, scripts), "action": np.zeros(alert.n)}
+
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        action, policy = proposed_action(self.policy, worlds, memory["policy"], vehicle)
+        action = np.where(np.isnan(action), -1.0, action)
+        return action_to_command(action, worlds.vehicles, vehicle), {"policy": policy, "action": action}

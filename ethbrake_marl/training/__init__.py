@@ -1,0 +1,24 @@
+"""Training, and the policies that come out of it. torch is imported only by the modules that train."""
+
+from typing import TYPE_CHECKING
+
+from ethbrake_marl.doors import front_door
+
+if TYPE_CHECKING:
+    from ethbrake_marl.training.recipe import (
+        WORDS as WORDS,
+        TrainingRecipe as TrainingRecipe,
+        algorithm_names as algorithm_names,
+        load_recipe as load_recipe,
+        register_algorithm as register_algorithm,
+    )
+    from ethbrake_marl.training.run_folder import RunDirectory as RunDirectory, Training as Training
+    from ethbrake_marl.training.settings import Settings as Settings, read_settings as read_settings
+    from ethbrake_marl.training.train import (
+        StopAt as StopAt,
+        TrainResult as TrainResult,
+        resume as resume,
+        train as train,
+    )
+else:
+    __getattr__ = front_door(__name__, __file__)

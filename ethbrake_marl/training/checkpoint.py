@@ -1,0 +1,125 @@
+"""A training at rest between two updates: a folder with its arrays and its plain numbers, whole or not there."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from io import BufferedReader
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import safetensors.numpy
+from safetensors import SafetensorError
+
+from ethbrake_marl.env.memory import Arrays
+from ethbrake_marl.errors import CorruptBundle, InvalidInput
+from ethbrake_marl.files.store import (
+    new_file,
+    new_folder,
+    open_plain,
+    parse_strict_json,
+    read_plain,
+    remove_folder,
+    write_file,
+)
+
+ARRAYS, NUMBERS = "arrays.safetensors", "numbers.json"
+
+_KINDS = {
+    "training": str,
+    "versions": dict,
+    "steps": int,
+    "updates": int,
+    "ended": dict,
+    "course": dict,
+    "progress": str,
+}
+
+KEPT = 2  # checkpoints of a running training; a torn last one leaves the one before
+
+COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining", "_total_timesteps")
+
+
+class TrainingState(NamedTuple):
+    """What a training needs to go on."""
+
+    numbers: dict[str, Any]  # plain JSON
+    arrays: Arrays
+
+    @property
+    def steps(self) -> int:
+        """Decisions of all learners so far."""
+        return int(self.numbers["steps"])
+
+
+def write_checkpoint(folder: Path, state: TrainingState) -> None:
+    """Write ``folder``, completely or not at all, with every byte on the disk before it has its name; old ones go."""
+    arrays = {name: np.ascontiguousarray(array).reshape(array.shape) for name, array in state.arrays.items()}
+    with new_folder(folder) as partial:
+        with new_file(partial / ARRAYS) as file:
+            safetensors.numpy.save_file(arrays, file)
+        with (partial / ARRAYS).open("rb") as stream:
+            numbers = state.numbers | {"sha256": _digest(stream, state.numbers)}
+        write_file(partial / NUMBERS, json.dumps(numbers, allow_nan=False).encode())
+    for old in checkpoint_folders(folder.parent)[KEPT:]:
+        remove_folder(old)
+
+
+def read_checkpoint(folder: Path) -> TrainingState:
+    """Read ``folder``; raises ``CorruptBundle`` unless it is as it was written, ``InvalidInput`` of another form."""
+    if not os.path.lexists(folder / NUMBERS):
+        raise InvalidInput(
+            f"{folder}: has no {NUMBERS}, so another version of this package wrote it; go on with that version, or"
+            " delete the checkpoint to go on from the one before"
+        )
+    data = read_plain(folder / NUMBERS, 256 << 20, refusal=CorruptBundle, follow_links=False)
+    with open_plain(folder / ARRAYS, 1 << 36, refusal=CorruptBundle, follow_links=False) as stream:
+        try:
+            numbers = parse_strict_json(data)
+            whole = isinstance(numbers, dict) and numbers.pop("sha256", None) == _digest(stream, numbers)
+        except ValueError:
+            whole = False
+    if not whole:
+        raise CorruptBundle(f"{folder}: its files are not those that were written (the SHA-256 differs)")
+    try:
+        state = TrainingState(numbers, safetensors.numpy.load_file(folder / ARRAYS))
+    except SafetensorError as error:
+        raise InvalidInput(f"{folder / ARRAYS}: {error}; delete the checkpoint to go on from the one before") from None
+    for name, kind in _KINDS.items():
+        if type(numbers.get(name)) is not kind:
+            raise InvalidInput(
+                f"{folder / NUMBERS}: {name} = {numbers.get(name)!r:.60}: must be of type {kind.__name__}; delete the"
+                " checkpoint to go on from the one before"
+            )
+    return state
+
+
+def _digest(arrays: BufferedReader, numbers: Mapping[str, Any]) -> str:
+    """SHA-256 of both files of a checkpoint, in hexadecimal digits."""
+    digest = hashlib.file_digest(arrays, "sha256")
+    digest.update(json.dumps(numbers, sort_keys=True).encode())
+    return digest.hexdigest()
+
+
+def checkpoint_folders(folder: Path) -> list[Path]:
+    """Checkpoints in ``folder``, the newest first; whether they are whole is not known yet."""
+    found = (path for path in folder.glob("step_*") if path.is_dir() and not path.is_symlink())
+    return sorted(found, reverse=True)
+
+
+def newest_usable(folder: Path) -> tuple[TrainingState | None, list[str]]:
+    """The newest checkpoint in ``folder`` that is whole, and why each newer one is not; damaged ones are deleted.
+
+    Raises ``InvalidInput`` at one of another version, which stays.
+    """
+    reasons: list[str] = []
+    for path in checkpoint_folders(folder):
+        try:
+            return read_checkpoint(path), reasons
+        except CorruptBundle as error:
+            reasons.append(str(error))
+            remove_folder(path)
+    return None, reasons

@@ -1,0 +1,373 @@
+"""``TrainingRecipe``: a training set-up as one YAML file, whatever the algorithm."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from operator import not_
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import Field, field_validator, model_validator
+from pydantic.json_schema import models_json_schema
+from pydantic_core import ErrorDetails
+
+from ethbrake_marl.env.features import ListedFeatures, listed_features
+from ethbrake_marl.env.rewards import RewardParams, setting_names
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.files.yaml import (
+    NAME_PATTERN,
+    Document,
+    FileModel,
+    FileSchema,
+    Wording,
+    YamlPath,
+    flow_text,
+    read_model,
+    read_yaml,
+    refuse,
+    schema_lines,
+)
+from ethbrake_marl.policies.manifest import Activation, NetworkSpec
+from ethbrake_marl.registry import Registry
+from ethbrake_marl.scenario.catalogue import check_file_name, shipped_folder
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.training.recipe_text import MEANINGS
+
+WORDS = ("title", "description", "source")  # fields that tell about a recipe and change nothing
+
+Scheme = Literal["single", "shared", "independent", "centralised"]
+
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+
+Averaging = Annotated[float, Field(ge=0.0, lt=1.0)]  # 1 would keep the first weights for ever
+
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+
+Rate = Annotated[float, Field(gt=0.0, le=1.0)]
+
+Layers = Annotated[tuple[Annotated[int, Field(ge=1, le=4096)], ...], Field(strict=False, min_length=1, max_length=8)]
+
+
+class LearningRate(FileModel):
+    """A learning rate that falls from ``start`` to ``end`` over the training."""
+
+    start: Rate
+    end: Rate
+    schedule: Literal["cosine"] = "cosine"
+
+    def at(self, remaining: float) -> float:
+        """``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``, the share of steps done."""
+        done = min(max(1.0 - remaining, 0.0), 1.0)
+        return self.end + (self.start - self.end) * 0.5 * (1.0 + math.cos(math.pi * done))
+
+
+class Shape(FileModel):
+    def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
+        """What a bundle holds for one action in [-1, 1]: the actor, and what ``more`` says."""
+        shape: Any = self  # its fields stand in an order of their own
+        fields = {"policy_hidden": shape.policy, "value_hidden": (), "activation": shape.activation, "output": "clip"}
+        return NetworkSpec(observation_size=observation_size, action_size=1, **(fields | more))
+
+
+class NetworkShape(Shape):
+    """Hidden layers of actor and critic, and the exploration noise they start with."""
+
+    policy: Layers
+    value: Layers
+    activation: Activation = "relu"
+    initial_log_std: Annotated[float, Field(ge=-10.0, le=2.0)] = 0.0
+
+    def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
+        """Actor and critic."""
+        return super().spec(observation_size, value_hidden=self.value, **more)
+
+
+class SquashedShape(Shape):
+    """Hidden layers of the actor and of each of the two critics; the actor's noise depends on what it sees."""
+
+    policy: Layers
+    value: Layers
+    activation: Activation = "relu"
+
+    def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
+        """The actor, whose squashed mean is the action. Critics stay in the checkpoints."""
+        return super().spec(observation_size, output="tanh", **more)
+
+
+class EvaluationPlan(FileModel):
+    """The fixed list on which the policy is measured while it learns."""
+
+    every_updates: Annotated[int, Field(ge=1)]
+    worlds: Annotated[int, Field(ge=1, le=1_000_000)]
+    seed: Annotated[int, Field(ge=0)]
+
+
+class TrainingRecipe(FileModel):
+    """How to train, whatever the algorithm: its name, reward, seed, and what is saved and measured on the way.
+
+    An update is one round of collecting and learning. The recipes of an algorithm are a class made from this one.
+
+    >>> import ethbrake_marl as eb
+    >>> recipe = eb.load_recipe("ppo").replace(seed=3, total_steps=100_000)
+    >>> recipe.algorithm, recipe.seed, recipe.total_steps
+    ('ppo', 3, 100000)
+
+    """
+
+    schemes: ClassVar[tuple[Scheme, ...]] = ("single", "shared")  # under which the algorithm can learn
+    most_decisions: ClassVar[float] = math.inf  # held in memory between two updates
+
+    name: str = Field(pattern=NAME_PATTERN)  # equal to the file's without .yaml
+    title: str = ""  # one line for lists
+    description: str = ""  # what it is for
+    source: str = ""  # where the values come from
+    algorithm: str  # a registered name
+    scheme: Scheme | None = None  # None: single for one learner, shared for several
+    total_steps: Annotated[int, Field(ge=1)]  # decisions of all learners
+    n_envs: Annotated[int, Field(ge=1)]  # worlds that are advanced together
+    learning_rate: LearningRate  # from its start to its end
+    gamma: Fraction  # discount of one time step
+    reward: RewardParams  # what is learned for
+    observation: Annotated[ListedFeatures | None, Field(exclude_if=not_)] = None  # of learners; None: the scenario's
+    horizon_is_end: bool = True  # nothing is expected beyond the horizon
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # of worlds, networks and exploration
+    evaluation: EvaluationPlan  # the fixed list, and how often
+    checkpoint_every_updates: Annotated[int, Field(ge=1)]  # updates
+
+    @field_validator("reward")
+    @classmethod
+    def _some_reward(cls, value: RewardParams) -> RewardParams:
+        if not any(weight for name, weight in value.weights.items() if name != "shaping"):
+            raise ValueError("every weight is 0; nothing could be learned")
+        return value
+
+    @field_validator("observation", mode="before")
+    @classmethod
+    def _known_features(cls, value: Any) -> Any:
+        if value is not None:
+            try:
+                listed_features(value)
+            except InvalidInput as error:
+                raise ValueError(str(error).removeprefix("observation: ")) from None
+        return value
+
+    @model_validator(mode="after")
+    def _room_for_an_update(self) -> Self:
+        if self.most_decisions < math.inf and not (rollout := self.n_envs * self.rounds) <= self.most_decisions:
+            right = f"n_envs x n_steps = {rollout} decisions per update; at most {self.most_decisions}"
+            refuse(("n_envs",), self.n_envs, right)
+        return self
+
+    def network_spec(self, observation_size: int) -> NetworkSpec:
+        """The network of the policy's bundle: that of the recipe's ``network``."""
+        shape: Shape = vars(self)["network"]
+        return shape.spec(observation_size)
+
+    @property
+    def rounds(self) -> int:
+        """Decisions of each learner between two updates: the recipe's ``n_steps``."""
+        return int(vars(self)["n_steps"])
+
+    def check_learners(self, learners: int) -> None:
+        """Raise ``InvalidInput`` where the recipe does not fit a line with that many learners."""
+
+    def scheme_for(self, scenario: Scenario) -> Scheme:
+        """The recipe's scheme; where it names none, ``single`` for one learner and ``shared`` for several.
+
+        Raises ``InvalidInput`` where nobody learns, or where the scheme or else the recipe does not fit the learners.
+        """
+        learners, where = len(scenario.learners), f"scenario {scenario.name!r}"
+        if not learners:
+            raise InvalidInput(f"{where}: no vehicle learns; give at least one the role learner")
+        scheme = self.scheme or ("single" if learners == 1 else "shared")
+        if scheme == "single" and learners > 1:
+            raise InvalidInput(
+                f"scheme single: {where} has {learners} learners; use shared, independent or centralised, or let one"
+                " learn"
+            )
+        if scheme == "independent" and learners == 1:
+            raise InvalidInput(f"scheme independent: {where} has one learner; use single")
+        if scheme not in self.schemes:
+            raise InvalidInput(
+                f"scheme {scheme}: recipe {self.name!r} is for {self.algorithm.upper()}; it needs one for PPO"
+            )
+        self.check_learners(learners)
+        return scheme
+
+    def make_algorithm(self) -> Any:
+        """Its algorithm, new."""
+        algorithm = ALGORITHMS[self.algorithm][1]
+        return (resolve_name(algorithm) if isinstance(algorithm, str) else algorithm)()
+
+    @staticmethod
+    def shipped() -> dict[str, Path]:
+        """Name -> file of every recipe that comes with the package: of the checkout's ``train/``, or installed."""
+        return {file.stem: file for file in sorted(shipped_folder("train").glob("*.yaml"))}
+
+    @staticmethod
+    def file(name_or_path: str | Path) -> Path:
+        """Where a recipe stands, a shipped name or any path; it need not exist. Raises ``UnknownName``."""
+        text = str(name_or_path)
+        if Path(text).suffix in (".yaml", ".yml") or "/" in text or "\\" in text:
+            return Path(text)
+        shipped = TrainingRecipe.shipped()
+        if text not in shipped:
+            raise unknown_name("recipe", text, shipped)
+        return shipped[text]
+
+    @staticmethod
+    def of(content: Any) -> TrainingRecipe:
+        """The recipe, of its algorithm's class, that ``model_dump(mode="json")`` wrote; raises ``InvalidInput``."""
+        return _checked(Document("recipe", content, {}))
+
+    def new_text(self, name: str) -> str:
+        """Text of a commented YAML file for a new recipe ``name`` with the values of this one, all keys written out.
+
+        A key that this one leaves out stands in a comment. Save it as ``<name>.yaml``. Raises ``InvalidInput`` for a
+        name that cannot be one.
+        """
+        check_file_name("recipe", name)
+        words = {
+            "title": "One line for lists",
+            "description": "What this recipe is for.",
+            "source": f"Values of {self.name}, to be changed.",
+        }
+        head = f"# Recipe {name}, started from {self.name}. Train with it: ethbrake train --recipe {name}.yaml\n"
+        return self.replace(name=name, **words).text(head)
+
+    def text(self, head: str) -> str:
+        """A commented YAML file below ``head``: all keys written out, one that the recipe leaves out in a comment."""
+        lines = [head, schema_lines("recipe", "train --schema")]
+        values = self.model_dump(mode="json")
+        for key in type(self).model_fields:
+            value = values.get(key)
+            lines.append(f"\n# {MEANINGS[key]}\n" if key in MEANINGS else "\n")
+            if value is None:
+                lines.append(f"# {key}:\n")
+            elif isinstance(value, Mapping):
+                inside = (f"  {name}: {flow_text(entry)}\n" for name, entry in value.items() if entry is not None)
+                lines += [f"{key}:\n", *inside]
+            else:
+                lines.append(f"{key}: {flow_text(value)}\n")
+        return "".join(lines)
+
+    def replace(self, **changes: Any) -> Self:
+        """The same recipe with other values in some fields, checked again; raises ``InvalidInput``."""
+        content = {**self.model_dump(mode="json"), **changes}
+        changed = _checked(Document(f"recipe {self.name!r}", content, {}))
+        assert isinstance(changed, type(self)) or "algorithm" in changes
+        return changed  # type: ignore[return-value]  # of another class only if another algorithm was asked for
+
+    @staticmethod
+    def json_schema() -> dict[str, Any]:
+        """JSON Schema of a recipe file, for editors that complete and check YAML.
+
+        Which keys there are depends on ``algorithm``. Registered algorithms and reward terms are known, too.
+        """
+        classes = {name: recipe for name, (recipe, _) in ALGORITHMS.usable().items()}
+        places, whole = models_json_schema(
+            [(each, "validation") for each in classes.values()], schema_generator=FileSchema
+        )
+        parts = whole["$defs"]
+        for name, recipe in classes.items():
+            keys = parts[str(places[recipe, "validation"]["$ref"]).rpartition("/")[2]]["properties"]
+            for key in keys.keys() & MEANINGS.keys():
+                keys[key] = {"description": MEANINGS[key], **keys[key]}
+            keys["algorithm"]["const"] = name
+        weight = {"type": "number", "minimum": 0, "description": "weight of a registered term"}
+        properties = parts["RewardParams"]["properties"]
+        properties |= {name: weight for name in setting_names() if name not in properties}
+        ways = [
+            {
+                "if": {"properties": {"algorithm": {"const": name}}, "required": ["algorithm"]},
+                "then": places[recipe, "validation"],
+            }
+            for name, recipe in classes.items()
+        ]
+        return FileSchema.publish(
+            {
+                "title": "Recipe",
+                "description": "A training set-up: everything that shapes a policy.",
+                "type": "object",
+                "required": ["algorithm"],
+                "properties": {
+                    "algorithm": {"enum": [*classes], "description": "how it learns; decides which keys there are"}
+                },
+                "allOf": ways,
+                "$defs": parts,
+            }
+        )
+
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
+
+
+def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[Any] | str) -> None:
+    """Make ``algorithm: name`` a recipe that can be read, trained, stopped and resumed.
+
+    An installed package does the same with an entry point of the group ``ethbrake_marl.algorithms``: a ``Part`` of
+    both.
+
+    Args:
+        name: 1 to 64 of ``a-z``, digits, ``-`` and ``_``.
+        recipe: the class of its recipes, made from ``learning.training.TrainingRecipe``; it checks the YAML file.
+        algorithm: the class of the algorithm, made from ``learning.training.Algorithm``; or ``"module:class"``, so
+            that recipes are read without importing it, since torch takes seconds.
+
+    Raises ``InvalidInput`` for a name that is taken or is no such name, or a class that lacks what is needed.
+
+    """
+    if not isinstance(name, str) or _NAME.fullmatch(name) is None:
+        raise InvalidInput(f"algorithm {name!r:.80}: must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _")
+    if not (isinstance(recipe, type) and hasattr(recipe, "network_spec")):
+        raise InvalidInput(f"algorithm {name!r}: recipe = {recipe!r:.80}: must be a class with network_spec")
+    is_place = isinstance(algorithm, str) and ":" in algorithm
+    if not (is_place or (isinstance(algorithm, type) and hasattr(algorithm, "build"))):
+        raise InvalidInput(f"algorithm {name!r}: algorithm = {algorithm!r:.80}: must be a class with build")
+    ALGORITHMS.add(name, (recipe, algorithm), lambda entry: entry == (recipe, algorithm))
+
+
+ALGORITHMS: Registry[tuple[type[TrainingRecipe], type[Any] | str]] = Registry(
+    "algorithm", "algorithms", register_algorithm
+)
+
+
+def algorithm_names() -> tuple[str, ...]:
+    """Every name, the package's own first."""
+    return tuple(ALGORITHMS)
+
+
+def load_recipe(name_or_path: str | Path) -> TrainingRecipe:
+    """Read a shipped recipe by name (``ppo``) or a file by path (anything with a separator or ``.yaml``).
+
+    Raises ``UnknownName`` with a suggestion, or ``InvalidInput`` with file, line, key, value and what would be right.
+    """
+    return _checked(TrainingRecipe.file(name_or_path))
+
+
+def _checked(source: Path | Document) -> TrainingRecipe:
+    document = source if isinstance(source, Document) else read_yaml(source)
+    name = document.content.get("algorithm", "ppo") if isinstance(document.content, dict) else "ppo"
+    if not isinstance(name, str) or name not in ALGORITHMS:
+        where, right = document.where(("algorithm",)), f"one of {', '.join(ALGORITHMS)}"
+        raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: must be {right}")
+    shipped = f"; every key is in the shipped recipe {name}" if name in TrainingRecipe.shipped() else ""
+    model = ALGORITHMS[name][0]
+    wording = _RecipeWording(model, f"it is needed{shipped}")
+    return read_model(document, model, wording, "of keys to values, for instance algorithm: ppo")
+
+
+class _RecipeWording(Wording):
+    def right(self, detail: ErrorDetails) -> str:
+        """A policy to start from, in words."""
+        right = "must be ppo@, counterfactual@ or universal@ and a policy, for instance ppo@shipped or ppo@runs/my-run"
+        return right if (detail["type"], detail["loc"][-1:]) == ("string_pattern_mismatch", ("start",)) else ""
+
+    def known(self, path: YamlPath) -> list[str]:
+        """Registered terms have their weights beside the others."""
+        return setting_names() if path[:-1] == ("reward",) else super().known(path)

@@ -1,0 +1,80 @@
+"""Settings ``key=value``: which are the scenario's and which the recipe's, and what belongs together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from ethbrake_marl.agents.registry import split_names
+from ethbrake_marl.env.harm import HarmCount, check_harm_count
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.files.yaml import Override
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.training.recipe import WORDS, TrainingRecipe
+
+_NO_SETTING = {"name", *WORDS}  # they tell about a file, and change nothing
+
+
+class Settings(NamedTuple):
+    """What is asked for."""
+
+    texts: tuple[str, ...]  # as they were given
+    scenario: tuple[Override, ...]
+    recipe: tuple[Override, ...]
+    harm_count: HarmCount = "first"  # that agents minimise
+    measures: tuple[str, ...] = ()  # that an evaluation tells beside the usual ones
+
+    def change(self, recipe: TrainingRecipe, tell: Callable[[str], None] | None = None) -> TrainingRecipe:
+        """The recipe with those of its settings that it has; ``tell`` hears what else may have to be changed."""
+        own = [override for override in self.recipe if override.top in type(recipe).model_fields]
+        if not own:
+            return recipe
+        changed = recipe.replace(**Override.put(recipe.model_dump(mode="json"), own))
+        together = {"gamma": changed.gamma, "reward.shaping_discount": changed.reward.shaping_discount}
+        given = [key for key in together if key in {override.key for override in own}]
+        if tell is not None and len(given) == 1 and len({*together.values()}) > 1:
+            (key,), (other,) = given, together.keys() - set(given)
+            tell(
+                f"note: {key} = {together[key]:g}, but {other} stays {together[other]:g}: shaping leaves the best"
+                f" policy as it is only where both are equal (--set {other}={together[key]:g})"
+            )
+        return changed
+
+
+def read_settings(
+    texts: Sequence[str] | None, recipes: Sequence[TrainingRecipe] = (), *, of_agents: Sequence[str] = ()
+) -> Settings:
+    """Tell the settings apart: ``mass_t=40`` and ``scenario.mass_t=40`` are the scenario's, ``gamma=0.9`` a recipe's.
+
+    ``of_agents``: which of ``harm_count=total`` and ``measures=A,B`` may stand among them. Raises ``UnknownName`` with
+    a suggestion for a key that nobody has, ``InvalidInput`` for an unknown count.
+    """
+    known = {
+        "scenario": {*Scenario.model_fields} - _NO_SETTING,
+        "recipe": {key for recipe in recipes for key in type(recipe).model_fields} - _NO_SETTING,
+        "agents": {*of_agents},
+    }
+    found: dict[str, list[Override]] = {owner: [] for owner in known}
+    for override in Override.parse(texts or ()):
+        if override.top == "recipe" and len(override.path) > 1 and not recipes:
+            raise InvalidInput(f"--set {override.key}: this command takes no recipe, so nothing of one can be set")
+        whose = [override.top] if override.top in known and len(override.path) > 1 else [*known]
+        inside = override.inside() if whose == [override.top] else override
+        owners = [each for each in whose if inside.top in known[each]]
+        if not owners:
+            raise unknown_name("setting", inside.top, {key for each in whose for key in known[each]})
+        if len(owners) > 1:
+            raise InvalidInput(f"--set {override.key}: write scenario.{override.key} or recipe.{override.key}")
+        found[owners[0]].append(inside)
+    asked = {each.top: each.value for each in found["agents"]}
+    check_harm_count(count := asked.get("harm_count", "first"))
+    measures = asked.get("measures", "")
+    if not isinstance(measures, str) or ("measures" in asked and not measures):
+        raise InvalidInput("--set measures: must be names with commas between them, for instance measures=injury")
+    return Settings(
+        tuple(texts or ()),
+        tuple(found["scenario"]),
+        tuple(found["recipe"]),
+        count,
+        tuple(split_names(measures)) if measures else (),
+    )
