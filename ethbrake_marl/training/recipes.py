@@ -103,6 +103,5 @@ class SacRecipe(TrainingRecipe):
         return self.gradient_steps / (self.n_envs * self.steps_per_update)
 
 
-PLACE = "ethbrake_marl.learning.algorithms:"
-
-PPO, SAC = Part(PpoRecipe, f"{PLACE}Ppo"), Part(SacRecipe, f"{PLACE}Sac")
+PPO = Part(PpoRecipe, "ethbrake_marl.training.ppo:Ppo")
+SAC = Part(SacRecipe, "ethbrake_marl.training.sac:Sac")

@@ -13,6 +13,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.cli import scenario as module
 from ethbrake_marl.evaluation.named_worlds import load_runnable
+from ethbrake_marl.extensions.search import best_harm, planner
 from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.files.yaml import flow_text, parse_yaml
 from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
@@ -29,7 +30,7 @@ ADD, OWN_DATA = ((ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in (
 @pytest.mark.parametrize("script", ["planner", "planner:1000000", "best_harm", "best_harm:1000000"])
 def test_validate__trying_a_search_has_a_budget(ethbrake: Command, scenario_file, monkeypatch, script: str) -> None:
     searched = Mock(side_effect=search_profiles)
-    for searching in (planner, limits):
+    for searching in (planner, best_harm):
         monkeypatch.setattr(searching, "search_profiles", searched)
     monkeypatch.setattr(module, "TRIED_WORLDS", 5)
     path = scenario_file("\n  vehicle_3: full_brake\n", f"\n  vehicle_3: {script}\n")

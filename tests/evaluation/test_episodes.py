@@ -432,7 +432,7 @@ def test_work__leaves_a_failed_world_out_and_names_it(tmp_path: Path, monkeypatc
 
     recorded, seen = Mock(), Mock()
     for name, planted in (("need", Mock()), ("record_episodes", failing), ("BATCH", 3)):
-        monkeypatch.setattr(episodes, name, planted)
+        monkeypatch.setattr(minari_module, name, planted)
     monkeypatch.setattr(minari_module, "parquet_dataset", lambda path, told: nullcontext(recorded))
     work = eb.write_dataset(tmp_path / "some.parquet", BRAKING, scenario=PAPER, episodes=7, on_progress=seen)
     assert [call.args[0].index.tolist() for call in recorded.call_args_list] == [[0, 1, 2], [3, 5], [6]]

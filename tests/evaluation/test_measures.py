@@ -648,13 +648,13 @@ def test_limits__of_the_first_500_worlds_of_the_papers_random_test(name: str, un
 STUDY = load("../studies/best_harm")
 
 
-def shipped(name: str, **header: Any) -> BestHarmTable:
+def shipped_table(name: str, **header: Any) -> BestHarmTable:
     (table,) = (table for table in shipped_tables() if table.header["scenario"] == name)
     return replace(table, header={**table.header, **header})
 
 
 def test_shipped__stress_wide_has_a_loose_proof_and_says_so() -> None:
-    (found,), sheet = STUDY.shipped_bounds([shipped("stress-wide")])
+    (found,), sheet = STUDY.shipped_bounds([shipped_table("stress-wide")])
     proven, inside = found["proven"], found["proven"]["between"]
     assert (found["worlds"], found["list_seed"]) == (5000, 7)
     assert (found["gap_first"], found["gap_total"]) == pytest.approx((0.057, 0.122), abs=5e-4)
@@ -662,7 +662,7 @@ def test_shipped__stress_wide_has_a_loose_proof_and_says_so() -> None:
     assert inside["mean_first"] > 0.9 and inside["harmless_rate"] < 0.55  # nobody leans there
     (_, _, line) = sheet.markdown().splitlines()
     assert "| 5.7 % |" in line and "| 12.2 % |" in line
-    (leaning,), _ = STUDY.shipped_bounds([shipped("paper-delay-low", episodes=1000)])
+    (leaning,), _ = STUDY.shipped_bounds([shipped_table("paper-delay-low", episodes=1000)])
     assert leaning["proven"]["between"]["mean_first"] < 0.03  # in the paper's lists leaning explains what is between
 
 
@@ -676,7 +676,7 @@ def test_shipped__every_table_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_shipped__where_nothing_is_proven_the_reason_stands_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(STUDY, "unproven_because", lambda *_: "an obstacle stands ahead of vehicle_1")
-    (found,), sheet = STUDY.shipped_bounds([shipped("paper-delay-low", episodes=5)])
+    (found,), sheet = STUDY.shipped_bounds([shipped_table("paper-delay-low", episodes=5)])
     assert found["proven"] is None and found["gap_first"] is None
     assert "an obstacle stands ahead" in sheet.markdown().splitlines()[2]
 

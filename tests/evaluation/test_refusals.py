@@ -19,6 +19,7 @@ from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.seeds import interquartile_mean, mean_over_seeds, share_over_seeds
 from ethbrake_marl.evaluation.statistics import exact_sum, mean, paired_difference, rate
 from ethbrake_marl.evaluation.summary import summarise
+from ethbrake_marl.extensions.datasets import minari
 from ethbrake_marl.extensions.report.deceleration_curve import deceleration_curve
 from ethbrake_marl.extensions.report.film import film_bytes, film_scenes
 from ethbrake_marl.extensions.report.harm_figures import harm_by_agent
@@ -357,7 +358,7 @@ def test_figure__needs_something_to_draw(message: str) -> None:
 def dataset(path: str = "a.parquet", agents: Any = None, **given: Any) -> None:
     """Writes a dataset of two episodes, as if the extra were installed."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(episodes, "need", lambda package: None)
+        patch.setattr(minari, "need", lambda package: None)
         eb.write_dataset(path, BRAKE if agents is None else agents, **{"scenario": PAPER, "episodes": 2, **given})
 
 

@@ -19,11 +19,12 @@ from ethbrake_marl.cli.evaluate import GROUP_EPISODES
 from ethbrake_marl.env.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.env.profiles import Profiles, profile_problem
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
-from ethbrake_marl.evaluation import chunks, measures
+from ethbrake_marl.evaluation import chunks, evaluation
 from ethbrake_marl.evaluation.named_worlds import make_lineup
 from ethbrake_marl.evaluation.per_world import write_per_world
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import summarise
+from ethbrake_marl.extensions.proofs import lower_bound as bounding
 from ethbrake_marl.extensions.proofs.extreme_profiles import KEPT, extreme_profiles
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.extensions.proofs.ramped_meetings import onset_states
@@ -31,6 +32,7 @@ from ethbrake_marl.extensions.proofs.team_bound import team_bound
 from ethbrake_marl.extensions.report.harm_figures import harm_in_parts
 from ethbrake_marl.extensions.report.report import avoidable_section, worst_section
 from ethbrake_marl.extensions.reproduction.tests import TESTS
+from ethbrake_marl.extensions.search import shipped
 from ethbrake_marl.extensions.search.best_harm import best_harm, fold_episodes, search_list, task_problem
 from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.extensions.search.recall import BestHarm
@@ -407,8 +409,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, Mock]:
     """What computes each part of the limits, and evaluates, and counts how often it did."""
     found: dict[str, Mock] = {}
     for place, name in (
-        (limits, "avoidability"), (bounding, "avoidability"), (limits, "lower_bound"), (limits, "best_known"),
-        (measures, "known_limits"), (chunks, "drive_chunk"),
+        (shipped, "avoidability"), (bounding, "avoidability"), (shipped, "lower_bound"), (shipped, "best_known"),
+        (evaluation, "known_limits"), (chunks, "drive_chunk"),
     ):  # fmt: skip
         monkeypatch.setattr(place, name, found.setdefault(name, Mock(wraps=getattr(place, name))))
     return found

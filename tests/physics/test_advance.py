@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import PhysicsError
-from ethbrake_marl.physics import jit, motion
+from ethbrake_marl.physics import jit, motion, segment
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.forecast import forecast
 from ethbrake_marl.physics.jit import by_parts
@@ -298,7 +298,7 @@ def test_bounces__of_three_pressing_vehicles_end_in_contact() -> None:
 def test_bounces__more_than_any_segment_holds_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     # e = 1 and a push of 10 m/s2 against a heavy wall: a bounce of 0.2 m/s every 0.04 s for 50,000 s
     if numba.config.DISABLE_JIT:  # a million events would take long
-        monkeypatch.setattr(kernel, "BOUND", motion.BOUND._replace(MOST_EVENTS=50))
+        monkeypatch.setattr(segment, "BOUND", motion.BOUND._replace(MOST_EVENTS=50))
     wall = line([0.0], [0.0, 0.2], mass_t=[2.0**60, 1.0], restitution=1.0)
     most = motion.BOUND.MOST_EVENTS
     with pytest.raises(PhysicsError, match=f"world 0: more than {most} events between 0 s and 50000 s"):
@@ -306,7 +306,7 @@ def test_bounces__more_than_any_segment_holds_are_reported(monkeypatch: pytest.M
 
 
 def test_impacts__are_listed_on_demand_in_a_list_that_grows(monkeypatch: pytest.MonkeyPatch) -> None:
-    module, runs = importlib.import_module("ethbrake_marl.physics.batch"), []
+    module, runs = importlib.import_module("ethbrake_marl.physics.advance"), []
     monkeypatch.setattr(module, "by_parts", lambda *given: runs.append(given) or by_parts(*given))
     wall = line([0.0], [0.0, 8.0], mass_t=[2.0**50, 1.0], restitution=1.0)  # a bounce each second
     for until, needed in ((10.5, 1), (129.5, 2)):

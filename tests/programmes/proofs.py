@@ -25,7 +25,7 @@ from unittest import mock
 import numpy as np
 import z3
 
-from ethbrake_marl.physics import impact, motion, rows, segment
+from ethbrake_marl.physics import impact, motion, rows
 from ethbrake_marl.shield import members
 from tests.programmes import Cases, Given, Told
 
@@ -209,7 +209,7 @@ def prove(end: Ended, statement: Any, what: str, *assumed: Any) -> None:
 def contact() -> int:
     """``events.contact`` against ``events.drift``, the gap as a function of time."""
     gap, closing, pressing, when = symbols("gap closing pressing when")
-    found = list(_run(kernel, lambda: motion.contact(gap, closing, pressing), [exact(gap) >= 0]))
+    found = list(_run(motion, lambda: motion.contact(gap, closing, pressing), [exact(gap) >= 0]))
     after = exact(motion.drift(gap, closing, pressing, when))
     for end in found:
         time, speed = end.result
@@ -230,7 +230,7 @@ def stopping() -> int:
     """``events.solo_motion`` against ``events.stopping_distance``."""
     speed, capacity, latency, limit, time = symbols("speed capacity latency limit time")
     known = [exact(speed) >= 0, exact(capacity) > 0, exact(latency) >= 0, exact(time) >= 0, exact(limit) >= 0]
-    found = list(_run(kernel, lambda: motion.solo_motion(speed, -capacity, latency, limit, time), known))
+    found = list(_run(motion, lambda: motion.solo_motion(speed, -capacity, latency, limit, time), known))
     whole = exact(speed * latency + speed * speed / (2.0 * capacity))
     for end in found:
         after, way, _ = end.result
@@ -258,7 +258,7 @@ def _cluster(vehicles: int, closing: float) -> tuple[list[Symbol], list[Symbol],
         impact.resolve_cluster(table, restitution, 0, vehicles - 1)
         return list(table[rows.ROW.SPEED])
 
-    return mass, speed, restitution, list(_run(kernel, resolve, known))
+    return mass, speed, restitution, list(_run(impact, resolve, known))
 
 
 def _sum(*columns: list[Symbol]) -> Any:
@@ -316,7 +316,7 @@ def plastic() -> int:
 def settling() -> int:
     """``events.settle`` on any range of forces."""
     low, high, other = symbols("low high other")
-    found = list(_run(kernel, lambda: motion.settle(low, high), [exact(low) <= exact(high)]))
+    found = list(_run(motion, lambda: motion.settle(low, high), [exact(low) <= exact(high)]))
     for end in found:
         value = exact(end.result)
         prove(end, z3.And(value >= exact(low), value <= exact(high)), "within the range")
@@ -438,7 +438,7 @@ def _decided(line: _Line, usable: tuple[bool, ...]) -> int:
         )  # fmt: skip
         return good, plan, out
 
-    found = list(_run(step_shield, decide, line.known(), line))
+    found = list(_run(members, decide, line.known(), line))
     for end in found:
         good, plan, out = end.result
         assert good
@@ -478,21 +478,21 @@ class Bug(NamedTuple):
 
 BUGS = {
     "the earlier root of a contact": Bug(
-        kernel, "contact", "return (speed - closing) / pressing, speed", "return -closing / pressing, speed",
+        motion, "contact", "return (speed - closing) / pressing, speed", "return -closing / pressing, speed",
         contact,
     ),
     "a contact missed where the gap opens first": Bug(
-        kernel, "contact", "if pressing > 0.0:", "if pressing > 0.0 and gap < 1.0:", contact
+        motion, "contact", "if pressing > 0.0:", "if pressing > 0.0 and gap < 1.0:", contact
     ),
     "the way while nothing is in force is forgotten": Bug(
-        segment, "solo_motion", "way = speed * onset", "way = 0.0", stopping
+        motion, "solo_motion", "way = speed * onset", "way = 0.0", stopping
     ),
     "restitution of what moves, not of what is left over": Bug(
         impact, "resolve_cluster", "pooled + bounce * (pooled - table[ROW.SPEED, i])",
         "pooled + bounce * (pooled + table[ROW.SPEED, i])", two,
     ),
     "blocks pooled without their masses": Bug(
-        kernel, "pool", "table[ROW.BLOCK_LOW, count] / mass", "table[ROW.BLOCK_LOW, count] / 2.0", energy
+        impact, "pool", "table[ROW.BLOCK_LOW, count] / mass", "table[ROW.BLOCK_LOW, count] / 2.0", energy
     ),
     "a plastic impact is not put in order": Bug(
         impact, "resolve_cluster", "bounce = restitution if largest >= BOUND.PLASTIC_SPEED_MPS else 0.0",
@@ -520,12 +520,12 @@ BUGS = {
         decision,
     ),
     "a vehicle that never moves": Bug(
-        segment, "solo_motion", "    way = 0.0\n    steady",
+        motion, "solo_motion", "    way = 0.0\n    steady",
         "    return speed, 0.0, math.nan\n    way = 0.0\n    steady",
         stopping,
     ),
     "half the time": Bug(
-        segment, "solo_motion", "    way = 0.0\n    steady", "    duration = duration / 2.0\n    way = 0.0\n    steady",
+        motion, "solo_motion", "    way = 0.0\n    steady", "    duration = duration / 2.0\n    way = 0.0\n    steady",
         stopping,
     ),
     "the plan that was certified with a proposal is not kept": Bug(

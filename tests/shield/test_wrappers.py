@@ -171,9 +171,9 @@ def test_shield__chooses_the_wrapper_of_the_interface(make, kind):
 
 
 def test_shield__is_the_folder_and_the_function_whichever_is_asked_for_first():
-    import ethbrake_marl.shield.guard as guard
+    import ethbrake_marl.shield.options as options
 
-    assert eb.shield.guard is guard and callable(eb.shield)
+    assert eb.shield.options is options and callable(eb.shield)
 
 
 @pytest.mark.parametrize(

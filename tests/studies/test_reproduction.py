@@ -310,7 +310,7 @@ def test_full__trains_draws_and_keeps_what_is_trained(settings: Reproduction, mo
     trained = {"ppo": (TrainedRecipe("ppo", TINY.total_steps, 1, 1000), TINY)}
     groups = {delay: Group(delay, f"paper-delay-{delay}", trained, 1) for delay in ("low", "high")}
     monkeypatch.setattr(folder_module, "groups", lambda: groups)
-    monkeypatch.setattr(reproduction, "CURVES", {"low": ("low",), "high": ("high",)})
+    monkeypatch.setattr(delay_curves, "CURVES", {"low": ("low",), "high": ("high",)})
     full = replace(settings, mode="full", episodes=5)
     (item,) = choose_items(["learning-low"])
     small = replace(item, trained=("low", "high"))

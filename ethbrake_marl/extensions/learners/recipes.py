@@ -28,7 +28,6 @@ from ethbrake_marl.training.recipe import (
     Shape,
     TrainingRecipe,
 )
-from ethbrake_marl.training.recipes import PLACE
 
 
 class ActorShape(Shape):
@@ -236,9 +235,9 @@ class OptionsRecipe(TrainingRecipe):
         return tuple(found)
 
 
-COUNTERFACTUAL = Part(CounterfactualRecipe, f"{PLACE}Counterfactual")
+COUNTERFACTUAL = Part(CounterfactualRecipe, "ethbrake_marl.extensions.learners.vine:Counterfactual")
 
-OPTIONS = Part(OptionsRecipe, f"{PLACE}Options")
+OPTIONS = Part(OptionsRecipe, "ethbrake_marl.extensions.learners.rollout_classification:Options")
 
 COUNTERFACTUAL_AGENT = Part(
     make_policy_agent,

@@ -1,4 +1,4 @@
-"""The folder: ``reproduction.json`` says what was asked for, ``index.html`` shows everything, each item has a folder."""
+"""The folder of a reproduction: what was asked for, a page of everything, and a folder for each item."""
 
 from __future__ import annotations
 
