@@ -220,7 +220,8 @@ import os, time
 import numpy as np
 from pathlib import Path
 from numba.core import event
-from ethbrake_marl.physics.kernel import ROW, pool
+from ethbrake_marl.physics.impact import pool
+from ethbrake_marl.physics.rows import ROW
 
 class Count(event.Listener):
     names = []
@@ -320,7 +321,7 @@ def test_kernels__without_a_folder_to_write_to_are_compiled_in_each_process(monk
 
 INNER = """
 import sys
-from ethbrake_marl.physics.compiling import compiled
+from ethbrake_marl.physics.jit import compiled
 
 @compiled(apart=True)
 def checked(x):

@@ -17,7 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from ethbrake_marl.figures import Figure
+from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 import ethbrake_marl as eb

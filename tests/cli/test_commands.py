@@ -193,7 +193,7 @@ def test_program__prints_a_table_on_a_narrow_stdout_and_needs_no_torch(encoding:
         "try:\n    main()\n"
         "except SystemExit as end:\n    assert not end.code\n"
         "print('loaded:', *{'torch', 'stable_baselines3', 'matplotlib'} & set(sys.modules))\n"
-        "import ethbrake_marl.studies.reproduction\n"
+        "import ethbrake_marl.extensions.reproduction.items\n"
         "print('with the items of the paper:', *{'torch'} & set(sys.modules))",
         PYTHONIOENCODING=encoding,
     )

@@ -24,8 +24,8 @@ from tests.contract.interfaces import FIVE, LEVELS, PAPER, REST, SCENARIOS, line
 pytestmark = pytest.mark.filterwarnings(
     "error",
     # PettingZoo's checkers pass {"options": 1} on purpose; asking for a warning here is our own rule.
-    "ignore:reset. unknown option options, ignored:ethbrake_marl.envs.interfaces.UnknownResetOption",
-    "ignore::ethbrake_marl.envs.interfaces.IgnoredAction",  # they act for all agents
+    "ignore:reset. unknown option options, ignored:ethbrake_marl.env.making.UnknownResetOption",
+    "ignore::ethbrake_marl.env.making.IgnoredAction",  # they act for all agents
     "ignore:.*is different from the unwrapped version",  # a shield is: that is its use
 )
 ANY_START = PAPER.replace(early_impacts="keep")

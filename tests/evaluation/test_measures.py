@@ -42,7 +42,7 @@ from ethbrake_marl.scenario.task import Task
 from tests.contract.interfaces import CRASH
 from tests.docs.site import load
 
-SILENT = pytest.mark.filterwarnings("ignore::ethbrake_marl.evaluation.measures.IncompleteTable")
+SILENT = pytest.mark.filterwarnings("ignore::ethbrake_marl.evaluation.outcome.IncompleteTable")
 BRAKE = {"full_brake": eb.make_agent("full_brake")}
 
 # ---------------------------------------------------------------- the summary

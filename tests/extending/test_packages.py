@@ -59,7 +59,7 @@ import numpy as np
 import typer
 
 import ethbrake_marl as eb
-from ethbrake_marl.learning.training import PpoRecipe
+from ethbrake_marl.training.recipes import PpoRecipe
 
 
 class Gentle:
@@ -106,7 +106,7 @@ class PatientRecipe(PpoRecipe):
 
 WORST = eb.Part(worst, unit="m/s")
 URGENCY = eb.Part(urgency, unit="m/s", scale=10.0, low=0.0, high=4.0)
-PATIENT = eb.Part(PatientRecipe, "ethbrake_marl.learning.algorithms:Ppo")
+PATIENT = eb.Part(PatientRecipe, "ethbrake_marl.training.ppo:Ppo")
 
 
 def hello(name: str, loud: bool = False) -> None:

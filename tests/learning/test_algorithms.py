@@ -78,9 +78,9 @@ A2C = '''
 from stable_baselines3 import A2C
 
 from ethbrake_marl import TrainingRecipe, register_algorithm
-from ethbrake_marl.learning.algorithms import ppo_arguments
-from ethbrake_marl.learning.training import Algorithm
-from ethbrake_marl.learning.training import NetworkShape
+from ethbrake_marl.training.networks import ppo_arguments
+from ethbrake_marl.training.run_folder import Algorithm
+from ethbrake_marl.training.recipe import NetworkShape
 
 
 class A2cRecipe(TrainingRecipe):

@@ -537,8 +537,8 @@ def test_resume__after_a_failure_and_another_stop_it_ends_as_if_nothing_had_happ
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
-from ethbrake_marl.learning.runs import train
+from ethbrake_marl.env.sb3 import EthBrakeVecEnv
+from ethbrake_marl.training.train import train
 from tests.learning.test_runs import TRAININGS, measure
 folder, step, left = Path(sys.argv[2]), EthBrakeVecEnv.step_wait, [5]
 

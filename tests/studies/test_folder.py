@@ -82,7 +82,7 @@ def test_folder__what_a_killed_writer_left_goes(tmp_path: Path) -> None:
 TRAINING = """
 import sys
 from tests.studies.test_folder import tiny_trainings
-from ethbrake_marl.studies.trainings import train_all
+from ethbrake_marl.extensions.studies.trainings import train_all
 
 if __name__ == "__main__":
     train_all(tiny_trainings(sys.argv[1], sys.argv[2]), 2)

@@ -20,7 +20,7 @@ from ethbrake_marl.extensions.cooperation.levels import FIGURES, HARM, Json, Pla
 from ethbrake_marl.extensions.report.page import Page, Part, Section
 from ethbrake_marl.extensions.report.player import Played
 from ethbrake_marl.extensions.report.style import write_picture
-from ethbrake_marl.figures import Figure
+from matplotlib.figure import Figure
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.training.run_folder import RunDirectory

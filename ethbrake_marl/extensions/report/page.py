@@ -27,7 +27,7 @@ from ethbrake_marl.extensions.report.player import DATA, PLAYER_SCRIPTS, Played
 from ethbrake_marl.files.sheet import Sheet
 
 if TYPE_CHECKING:
-    from ethbrake_marl.figures import Figure
+    from matplotlib.figure import Figure
 
 _STAY = "\u00a0"  # a blank at which no line is broken
 
@@ -225,7 +225,7 @@ class Page:
         lead: what the page is about, in a sentence or two below its title.
         opening: parts between these and the table of contents.
 
-    >>> from ethbrake_marl.pages.page import Page, Part, Section
+    >>> from ethbrake_marl.extensions.report.page import Page, Part, Section
     >>> section = Section("Results", ["Text with <b> stays text.", Part.paragraph("small print")])
     >>> "Text with &lt;b&gt; stays text." in Page("A page", [section]).html
     True
@@ -301,7 +301,7 @@ def read_file(name: str) -> str:
 @cache
 def _environment() -> Environment:
     return Environment(
-        loader=PackageLoader("ethbrake_marl.pages", "."),
+        loader=PackageLoader("ethbrake_marl.extensions.report", "."),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -23,7 +23,7 @@ from ethbrake_marl.extensions.reproduction.verdicts import (
     Verdict,
     summarise_verdicts,
 )
-from ethbrake_marl.figures import Figure
+from matplotlib.figure import Figure
 from ethbrake_marl.files.sheet import Estimate, Sheet, Shown, csv_text as csv_of
 from ethbrake_marl.files.store import check_target
 from ethbrake_marl.scenario.catalogue import load_scenario
