@@ -22,7 +22,7 @@ from ethbrake_marl.errors import naming_extras
 
 if TYPE_CHECKING:
     # Environments
-    from ethbrake_marl.env.engine import Engine as Engine
+    from ethbrake_marl.engine.engine import Engine as Engine
     from ethbrake_marl.env.making import make_engine as make_engine
     from ethbrake_marl.env.pettingzoo import (
         EthBrakeParallelEnv as EthBrakeParallelEnv,
@@ -42,12 +42,12 @@ if TYPE_CHECKING:
     from ethbrake_marl.physics.state import Worlds as Worlds, make_worlds as make_worlds
 
     # Observations and rewards
-    from ethbrake_marl.env.observations import (
+    from ethbrake_marl.game.observations import (
         ObservationSpec as ObservationSpec,
         choose_observation as choose_observation,
     )
     from ethbrake_marl.scenario.observed import observation_for as observation_for
-    from ethbrake_marl.env.rewards import RewardParams as RewardParams
+    from ethbrake_marl.game.rewards import RewardParams as RewardParams
 
     # Agents, teams and policies
     from ethbrake_marl.agents.foreign import policy_agent as policy_agent
@@ -113,9 +113,9 @@ if TYPE_CHECKING:
     from ethbrake_marl.agents.registry import register_agent as register_agent
     from ethbrake_marl.evaluation.own_measures import register_measure as register_measure
     from ethbrake_marl.training.recipe import register_algorithm as register_algorithm
-    from ethbrake_marl.env.objectives import register_objective as register_objective
-    from ethbrake_marl.env.features import register_feature as register_feature
-    from ethbrake_marl.env.rewards import register_term as register_term
+    from ethbrake_marl.game.objectives import register_objective as register_objective
+    from ethbrake_marl.game.features import register_feature as register_feature
+    from ethbrake_marl.game.rewards import register_term as register_term
     from ethbrake_marl.scenario.catalogue import register_scenarios as register_scenarios
     from ethbrake_marl.scenario.channel import register_preset as register_preset
     from ethbrake_marl.registry import Part as Part

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import ethbrake_marl as eb
-from ethbrake_marl.env.actions import action_to_command, checked_action, command_to_action
-from ethbrake_marl.env.harm import Ledger, empty_ledger, split
 from ethbrake_marl.env.making import make_engine
-from ethbrake_marl.env.objectives import STANDARD, objective_harm, objectives_of, scored
-from ethbrake_marl.env.rewards import REWARDS, RewardParams, StepOutcome, WithoutEffect, reward_params
+from ethbrake_marl.game.actions import action_to_command, checked_action, command_to_action
+from ethbrake_marl.game.harm import Ledger, empty_ledger, split
+from ethbrake_marl.game.objectives import STANDARD, objective_harm, objectives_of, scored
+from ethbrake_marl.game.rewards import REWARDS, RewardParams, StepOutcome, WithoutEffect, reward_params
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.forecast import forecast
 from ethbrake_marl.physics.left_out import Impacts

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.env import observations
-from ethbrake_marl.env.contact_features import FORECAST_S
-from ethbrake_marl.env.features import GROUPS
-from ethbrake_marl.env.observations import ObservationSpec, choose_observation, observe
 from ethbrake_marl.errors import PhysicsError
+from ethbrake_marl.game import observations
+from ethbrake_marl.game.contact_features import FORECAST_S
+from ethbrake_marl.game.features import GROUPS
+from ethbrake_marl.game.observations import ObservationSpec, choose_observation, observe
 from tests.fixtures.policies import make_policy
 from tests.physics.random_worlds import line
 

@@ -11,12 +11,12 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.env.harm import empty_ledger
-from ethbrake_marl.env.profiles import profile_problem
+from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.evaluation.per_world import write_per_world
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.extensions.search.best_harm import best_harm, task_problem
+from ethbrake_marl.game.harm import empty_ledger
 from ethbrake_marl.policies.manifest import ObservationSchema
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario

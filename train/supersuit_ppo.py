@@ -22,9 +22,9 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 
 import ethbrake_marl as eb
-from ethbrake_marl.env.rewards import reward_params
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.files.store import new_folder
+from ethbrake_marl.game.rewards import reward_params
 from ethbrake_marl.policies.manifest import NetworkSpec
 from ethbrake_marl.policies.network import Policy
 from ethbrake_marl.training.networks import tensors_of

@@ -9,10 +9,10 @@ import numpy as np
 from markupsafe import Markup
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.env.harm import HarmCount
 from ethbrake_marl.evaluation.motion import EpisodeMotion
 from ethbrake_marl.extensions.report.page import Part, read_file
 from ethbrake_marl.extensions.report.player import Played
+from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.scenario.catalogue import load_scenario
 
 SEED = 7

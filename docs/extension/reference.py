@@ -12,11 +12,11 @@ from ethbrake_marl import ethbrake_v0
 from ethbrake_marl.agents.protocol import Source
 from ethbrake_marl.agents.registry import agent_entries
 from ethbrake_marl.cli.app import whole_command
-from ethbrake_marl.env.features import Feature
-from ethbrake_marl.env.objectives import OBJECTIVES
-from ethbrake_marl.env.observations import ObservationSpec, choose_observation
-from ethbrake_marl.env.rewards import REWARDS, TERMS, RewardParams
 from ethbrake_marl.evaluation.measures import measures
+from ethbrake_marl.game.features import Feature
+from ethbrake_marl.game.objectives import OBJECTIVES
+from ethbrake_marl.game.observations import ObservationSpec, choose_observation
+from ethbrake_marl.game.rewards import REWARDS, TERMS, RewardParams
 from ethbrake_marl.policies.shipped import load_shipped, shipped_policies
 from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 from ethbrake_marl.scenario.channel import CHANNELS, V2X

@@ -20,16 +20,17 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.agents.registry import split_specs
-from ethbrake_marl.env.harm import HARM_COUNTS
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.identity import result_identity
 from ethbrake_marl.evaluation.named_worlds import load_runnable, make_agents
 from ethbrake_marl.extensions.search.best_harm import fold_episodes, search_list, task_problem
+from ethbrake_marl.extensions.search.limits import Unproven, prove, unproven_because
 from ethbrake_marl.extensions.search.regret import Between
-from ethbrake_marl.extensions.search.shipped import Unproven, prove, shipped_tables, unproven_because
+from ethbrake_marl.extensions.search.shipped import shipped_tables
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.files.store import check_target
+from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.physics.left_out import leaving_out_failed
 from ethbrake_marl.physics.state import Ints, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario

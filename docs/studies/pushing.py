@@ -15,7 +15,7 @@ import torch
 from stable_baselines3 import PPO
 
 import ethbrake_marl as eb
-from ethbrake_marl.env.rewards import StepOutcome
+from ethbrake_marl.game.rewards import StepOutcome
 from ethbrake_marl.physics.state import Floats
 
 SHAPED = {"harm": 0.05, "shaping": 0.05, "shaping_discount": 0.99}

@@ -16,10 +16,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.env.harm import empty_ledger
-from ethbrake_marl.env.memory import ask_script, begin_script
+from ethbrake_marl.engine.memory import ask_script, begin_script
 from ethbrake_marl.evaluation.identity import result_versions, scenario_sha256, worlds_sha256
 from ethbrake_marl.extensions.report.style import GREY, add_caption, new_figure, series_style, style_axes, write_picture
+from ethbrake_marl.game.harm import empty_ledger
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.left_out import ImpactRows, Impacts
 from ethbrake_marl.physics.paper_map import advance_sampled

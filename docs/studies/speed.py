@@ -24,11 +24,11 @@ import numpy as np
 import ethbrake_marl as eb
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
-from ethbrake_marl.env.harm import empty_ledger
 from ethbrake_marl.env.making import make_engine
 from ethbrake_marl.env.pettingzoo import parallel_env
 from ethbrake_marl.extensions.studies.machine import this_machine
 from ethbrake_marl.files.sheet import Column, Sheet
+from ethbrake_marl.game.harm import empty_ledger
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.forecast import forecast
 from ethbrake_marl.physics.jit import compiled

@@ -10,10 +10,10 @@ import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent, Driver, Team
 from ethbrake_marl.agents.registry import make_role
-from ethbrake_marl.env.engine import Engine
-from ethbrake_marl.env.harm import Ledger
-from ethbrake_marl.env.memory import Memory
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine.memory import Memory
 from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.game.harm import Ledger
 from ethbrake_marl.physics.state import Bools, Floats, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.agents.foreign_wrappers import normalisation, training_environment
 from ethbrake_marl.agents.protocol import Source
-from ethbrake_marl.env.actions import LARGEST, action_to_command
-from ethbrake_marl.env.memory import Memory, checked_memory, map_memory, take_memory
-from ethbrake_marl.env.observations import Observation, Observations, ObservationSpec, choose_observation, observe
-from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.engine.memory import Memory, checked_memory, map_memory, take_memory
+from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import AgentFailed, InvalidInput, describe_error, naming_extras
+from ethbrake_marl.game.actions import LARGEST, action_to_command
+from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec, choose_observation, observe
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.observed import Appended, full_state, observation_for, row_features

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.env.engine import Engine
+from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 
 # By library, the classes whose methods hand on observations and actions as they are. ``VecNormalize`` is applied.

@@ -7,9 +7,9 @@ from typing import Protocol
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Source
-from ethbrake_marl.env.actions import action_to_command
-from ethbrake_marl.env.observations import Observations, ObservationSpec, observe
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.game.actions import action_to_command
+from ethbrake_marl.game.observations import Observations, ObservationSpec, observe
 from ethbrake_marl.physics.state import Floats, Worlds
 
 

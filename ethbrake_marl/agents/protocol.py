@@ -12,9 +12,9 @@ from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
-from ethbrake_marl.env.engine import Engine, Guard
-from ethbrake_marl.env.memory import Memory, ask_script, begin_script, is_state_free
-from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.engine.engine import Engine, Guard
+from ethbrake_marl.engine.memory import Memory, ask_script, begin_script, is_state_free
+from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.state import Floats, Worlds
 

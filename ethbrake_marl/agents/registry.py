@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent, Driver, Source, Team, check_agent
-from ethbrake_marl.env.harm import HarmCount, check_harm_count
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, describe_error, unknown_name
 from ethbrake_marl.files.python_file import load_from_file
+from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.roles import ScriptSpec

@@ -29,7 +29,7 @@ from ethbrake_marl.files.store import check_folder, write_output
 
 if TYPE_CHECKING:
     from ethbrake_marl.agents.protocol import Driver
-    from ethbrake_marl.env.harm import HarmCount
+    from ethbrake_marl.game.harm import HarmCount
     from ethbrake_marl.physics.left_out import LeftOutRows
     from ethbrake_marl.scenario.sample import Sample
     from ethbrake_marl.scenario.task import Task

@@ -159,7 +159,7 @@ def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> Non
 def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
     """What is declared, piece by piece; empty where there is nothing to say."""
     from ethbrake_marl.agents.registry import find_entry
-    from ethbrake_marl.env.objectives import OBJECTIVES
+    from ethbrake_marl.game.objectives import OBJECTIVES
 
     yield f"{scenario.name}: {scenario.title or 'no title'}. {scenario.description}".rstrip()
     learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners) or "nobody"
@@ -263,9 +263,9 @@ def scenario_parts(as_json: JsonOption = False) -> None:
 
     Reward terms, features of observations, V2X presets, objectives, training algorithms, recipes and measures.
     """
-    from ethbrake_marl.env.features import FEATURES
-    from ethbrake_marl.env.objectives import OBJECTIVES
-    from ethbrake_marl.env.rewards import TERMS
+    from ethbrake_marl.game.features import FEATURES
+    from ethbrake_marl.game.objectives import OBJECTIVES
+    from ethbrake_marl.game.rewards import TERMS
 
     features = FEATURES.usable().items()
     own = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in features]

@@ -1,1 +1,1 @@
-"""The game: engine, actions, observations, rewards, and the interfaces around them."""
+"""The interfaces: PettingZoo (parallel, AEC), Gymnasium, Gymnasium vector, SB3 ``VecEnv``; ``render()``."""

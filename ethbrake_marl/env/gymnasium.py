@@ -13,13 +13,13 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from ethbrake_marl.env.engine import Engine
+from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.env.infos import OneWorld, Report
 from ethbrake_marl.env.making import AnyScenario, action_box, feature_box, learner_actions, make_engine, only_learner
 from ethbrake_marl.env.motion import Viewer
-from ethbrake_marl.env.observations import Observation, Observations, ObservationSpec
-from ethbrake_marl.env.rewards import Reward, RewardParams
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec
+from ethbrake_marl.game.rewards import Reward, RewardParams
 from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.scenario.schema import Scenario
 

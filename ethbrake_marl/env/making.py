@@ -11,12 +11,12 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from ethbrake_marl.agents.driving import script_agents
-from ethbrake_marl.env.actions import checked_action
-from ethbrake_marl.env.engine import Engine
-from ethbrake_marl.env.features import Feature
-from ethbrake_marl.env.observations import Observation, ObservationSpec
-from ethbrake_marl.env.rewards import Reward
+from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput, check_one_learner, check_whole_number
+from ethbrake_marl.game.actions import checked_action
+from ethbrake_marl.game.features import Feature
+from ethbrake_marl.game.observations import Observation, ObservationSpec
+from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.state import Floats, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ethbrake_marl.env.engine import Engine
+from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.env.rendering import (
     AHEAD_M,
     BEHIND_M,

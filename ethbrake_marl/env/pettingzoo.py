@@ -14,14 +14,14 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
-from ethbrake_marl.env.actions import checked_action
-from ethbrake_marl.env.engine import Engine
+from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.env.infos import OneWorld, Report
 from ethbrake_marl.env.making import AnyScenario, IgnoredAction, action_box, feature_box, learner_actions, make_engine
 from ethbrake_marl.env.motion import Viewer
-from ethbrake_marl.env.observations import Observation, Observations
-from ethbrake_marl.env.rewards import Reward
 from ethbrake_marl.errors import InvalidInput, check_whole_number, unknown_name
+from ethbrake_marl.game.actions import checked_action
+from ethbrake_marl.game.observations import Observation, Observations
+from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.state import Ints
 from ethbrake_marl.scenario.observed import full_state, state_features
 

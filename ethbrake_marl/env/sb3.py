@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from ethbrake_marl.env.actions import own_actions
-from ethbrake_marl.env.compiled_step import Step
+from ethbrake_marl.engine.compiled_step import Step
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine.memory import Arrays, renew_memory
 from ethbrake_marl.env.draws import Columns
-from ethbrake_marl.env.engine import Engine
 from ethbrake_marl.env.infos import Begun, Report, plain_rows, shield_columns
 from ethbrake_marl.env.making import (
     INITIAL_STATE,
@@ -24,11 +24,11 @@ from ethbrake_marl.env.making import (
     make_engine,
     warn_of_unknown,
 )
-from ethbrake_marl.env.memory import Arrays, renew_memory
 from ethbrake_marl.env.motion import Viewer
-from ethbrake_marl.env.observations import Observation, Observations
-from ethbrake_marl.env.rewards import Reward
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.game.actions import own_actions
+from ethbrake_marl.game.observations import Observation, Observations
+from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.state import Bools, Ints, Worlds
 from ethbrake_marl.scenario.observed import Appended, full_state, row_features

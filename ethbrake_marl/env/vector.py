@@ -11,8 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from ethbrake_marl.env.actions import own_actions
-from ethbrake_marl.env.compiled_step import Step
+from ethbrake_marl.engine.compiled_step import Step
 from ethbrake_marl.env.gymnasium import EthBrakeEnv, Specified
 from ethbrake_marl.env.infos import Begun, Report
 from ethbrake_marl.env.making import (
@@ -27,9 +26,10 @@ from ethbrake_marl.env.making import (
     warn_of_unknown,
 )
 from ethbrake_marl.env.motion import Viewer
-from ethbrake_marl.env.observations import Observation, Observations
-from ethbrake_marl.env.rewards import Reward
 from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.game.actions import own_actions
+from ethbrake_marl.game.observations import Observation, Observations
+from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.state import Bools, Floats
 
 

@@ -77,7 +77,7 @@ if TYPE_CHECKING:
         deceleration_curve as deceleration_curve,
     )
     from ethbrake_marl.extensions.report.film import check_film as check_film, film as film
-    from ethbrake_marl.extensions.reproduction.tests import (
+    from ethbrake_marl.extensions.report.tests import (
         PAPER_ROWS as PAPER_ROWS,
         TESTS as TESTS,
         PaperRow as PaperRow,

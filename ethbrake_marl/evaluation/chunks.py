@@ -16,7 +16,6 @@ from typing import Any
 
 from ethbrake_marl.agents.protocol import Driver, Knowledge, Team
 from ethbrake_marl.agents.registry import parse_spec
-from ethbrake_marl.env.harm import HarmCount
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
@@ -28,6 +27,7 @@ from ethbrake_marl.evaluation.summary import SummaryTable
 from ethbrake_marl.evaluation.tally import Tally
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.files.python_file import file_sha256
+from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.parallel import Call, run_each
 from ethbrake_marl.registry import versions_used
 from ethbrake_marl.scenario.sample import Sample

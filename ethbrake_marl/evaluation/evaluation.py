@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.env.harm import HARM_COUNTS
-from ethbrake_marl.env.objectives import Declared, scored
 from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, unknown_name
 from ethbrake_marl.evaluation.agent_tally import AgentTally
 from ethbrake_marl.evaluation.conditions import Conditions
@@ -23,9 +21,11 @@ from ethbrake_marl.evaluation.measures import BASELINE, COUNTED, measures
 from ethbrake_marl.evaluation.outcome import IncompleteTable, LeftOut, Outcome, none_for_nan
 from ethbrake_marl.evaluation.rescores import Rescored, Rescores
 from ethbrake_marl.evaluation.statistics import Moments, exact_sum, mean, rate
+from ethbrake_marl.extensions.search.limits import Limits, Unproven, known_limits
 from ethbrake_marl.extensions.search.regret import KNOWN_OF_WORLDS, Regrets
-from ethbrake_marl.extensions.search.shipped import Limits, Unproven, known_limits
 from ethbrake_marl.files.sheet import Column, Sheet
+from ethbrake_marl.game.harm import HARM_COUNTS
+from ethbrake_marl.game.objectives import Declared, scored
 from ethbrake_marl.physics.messages import Messages
 from ethbrake_marl.physics.state import Bools, Ints, Worlds
 from ethbrake_marl.scenario.fields import QUANTITY

@@ -17,14 +17,14 @@ from pydantic import Field
 from ethbrake_marl.agents.driving import Episodes, episode_engine, script_agents
 from ethbrake_marl.agents.protocol import Agent, Driver, Team
 from ethbrake_marl.agents.registry import find_entry, make_agent, make_role, parse_spec, shield_forms, split_specs
-from ethbrake_marl.env.engine import Engine
-from ethbrake_marl.env.harm import HarmCount
-from ethbrake_marl.env.memory import ask_script, begin_script
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine.memory import ask_script, begin_script
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar, check_one_learner
 from ethbrake_marl.evaluation.identity import LIST_SEED, MOST_NAMED_WORLDS, driving_policy, scenario_sha256
 from ethbrake_marl.extensions.certified.uncertainty import UNCERTAINTY_EXAMPLE, Uncertainty
 from ethbrake_marl.extensions.search.best_harm import task_problem
 from ethbrake_marl.files.yaml import FileModel, Override, Wording, flow_text, read_model, read_yaml
+from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.policies.network import Policy
 from ethbrake_marl.scenario.catalogue import load_scenario, scenario_path

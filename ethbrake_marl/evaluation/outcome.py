@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.agents.protocol import Knowledge, Source
-from ethbrake_marl.env.harm import HARM_COUNTS, HarmCount, Ledger
-from ethbrake_marl.env.objectives import Declared, scored
 from ethbrake_marl.errors import count_of
+from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount, Ledger
+from ethbrake_marl.game.objectives import Declared, scored
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
 _NAMED = 10  # worlds left out that are named one by one; all stand in the JSON

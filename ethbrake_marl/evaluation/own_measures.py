@@ -9,10 +9,10 @@ from typing import Literal
 
 import numpy as np
 
-from ethbrake_marl.env.harm import INJURY_CURVES, injury_probability
 from ethbrake_marl.errors import InvalidInput, describe_error
 from ethbrake_marl.evaluation.outcome import Values
 from ethbrake_marl.files.python_file import load_from_file
+from ethbrake_marl.game.harm import INJURY_CURVES, injury_probability
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.left_out import ImpactRows
 from ethbrake_marl.physics.state import Floats, Worlds, make_worlds

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
-from ethbrake_marl.env.objectives import Declared
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras, unknown_name
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import Kind
@@ -18,6 +17,7 @@ from ethbrake_marl.evaluation.rescores import Rescored
 from ethbrake_marl.evaluation.summary import SummaryRow
 from ethbrake_marl.files.sheet import Estimate, parquet_file
 from ethbrake_marl.files.store import check_target, parse_strict_json, read_plain, write_output
+from ethbrake_marl.game.objectives import Declared
 
 CSV, PARQUET = ".csv", ".parquet"
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from ethbrake_marl.env.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, terminal_text
+from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 
 
 @dataclass(frozen=True, slots=True)

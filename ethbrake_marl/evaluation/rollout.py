@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.agents.driving import Episodes, drive, script_agents
 from ethbrake_marl.agents.protocol import Driver, Knowledge, Team, check_agent
-from ethbrake_marl.env.memory import is_state_free
-from ethbrake_marl.env.stream import check_alert
+from ethbrake_marl.engine.memory import is_state_free
+from ethbrake_marl.engine.stream import check_alert
 from ethbrake_marl.errors import (
     AgentFailed,
     InvalidInput,

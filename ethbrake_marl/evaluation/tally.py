@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ethbrake_marl.env.harm import HARM_COUNTS
 from ethbrake_marl.evaluation.agent_tally import AgentTally
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import HASHES, hash_of_chunks
 from ethbrake_marl.evaluation.outcome import LeftOut
 from ethbrake_marl.evaluation.rescores import Rescored, Rescores
+from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.scenario.fields import QUANTITY
 
 Range = tuple[float, float]

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, JsonValue, model_validator
 
-from ethbrake_marl.env.features import Of, registered_in
-from ethbrake_marl.env.observations import ObservationSpec, choose_observation
 from ethbrake_marl.files.yaml import NAME_PATTERN, FileModel
+from ethbrake_marl.game.features import Of, registered_in
+from ethbrake_marl.game.observations import ObservationSpec, choose_observation
 from ethbrake_marl.registry import versions_used
 
 _PACKAGES = ("ethbrake-marl", "gymnasium", "numba", "numpy", "safetensors", "stable-baselines3", "torch")

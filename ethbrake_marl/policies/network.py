@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from safetensors import SafetensorError
 
-from ethbrake_marl.env.features import FEATURES
-from ethbrake_marl.env.observations import ObservationSpec
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, naming_extras
 from ethbrake_marl.files.arrays import ArrayRow, check_arrays, safetensors_headers
 from ethbrake_marl.files.store import new_folder, read_plain, write_file
 from ethbrake_marl.files.yaml import first_mistake, read_json_model
+from ethbrake_marl.game.features import FEATURES
+from ethbrake_marl.game.observations import ObservationSpec
 from ethbrake_marl.physics.elementary import PER_LN2, exp_rest
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.policies.manifest import (

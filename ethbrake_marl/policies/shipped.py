@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ethbrake_marl.env.harm import HarmCount
 from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.policies.network import Policy, load_policy
 from ethbrake_marl.scenario.schema import Scenario
 

@@ -8,9 +8,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from ethbrake_marl.env.features import GROUPS, Feature
-from ethbrake_marl.env.observations import Observation, Observations, ObservationSpec, choose_observation, observe
 from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.game.features import GROUPS, Feature
+from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec, choose_observation, observe
 from ethbrake_marl.physics.state import Vehicles, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 

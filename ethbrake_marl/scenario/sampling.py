@@ -17,8 +17,6 @@ from numpy.typing import ArrayLike
 from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from ethbrake_marl.env.features import ListedFeatures, listed_features
-from ethbrake_marl.env.objectives import objectives_of
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.files.store import read_plain
 from ethbrake_marl.files.yaml import (
@@ -31,6 +29,8 @@ from ethbrake_marl.files.yaml import (
     require,
     suggestion,
 )
+from ethbrake_marl.game.features import ListedFeatures, listed_features
+from ethbrake_marl.game.objectives import objectives_of
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.motion import stopping_distances
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds, as_road_allows, make_worlds, real_numbers

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ethbrake_marl.env.harm import HarmCount, check_harm_count
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.scenario.schema import Scenario
 
 

@@ -25,9 +25,9 @@ from pydantic import (
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from ethbrake_marl.env.features import ListedFeatures
-from ethbrake_marl.env.objectives import OBJECTIVES
 from ethbrake_marl.files.yaml import NAME_PATTERN, UNSHOWN, FileModel, require
+from ethbrake_marl.game.features import ListedFeatures
+from ethbrake_marl.game.objectives import OBJECTIVES
 from ethbrake_marl.physics.state import Floats, Ints
 from ethbrake_marl.scenario.channel import Equipage
 from ethbrake_marl.scenario.distributions import LEAVE_OUT, Numbers, Quantity, TableColumn, Uniform, WithLoad, support

@@ -9,7 +9,7 @@ import numpy as np
 
 from ethbrake_marl.agents.driving import Episodes, drive
 from ethbrake_marl.agents.protocol import Agent, Driver, Knowledge, Source, Team, check_agent
-from ethbrake_marl.env.engine import Engine, Guard
+from ethbrake_marl.engine.engine import Engine, Guard
 from ethbrake_marl.errors import InvalidInput, renumbered
 from ethbrake_marl.extensions.certified.enclosure import CORNERS
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.protocol import Agent, AgentAround, Driver, Team
-from ethbrake_marl.env.actions import action_to_command
-from ethbrake_marl.env.memory import Memory
-from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.engine.memory import Memory
+from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, count_of, renumbered
+from ethbrake_marl.game.actions import action_to_command
 from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.shield.rollouts import proposed_action

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.env.actions import command_of
-from ethbrake_marl.env.harm import front_share
-from ethbrake_marl.env.profiles import ProfileProblem
+from ethbrake_marl.engine.profiles import ProfileProblem
 from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.game.actions import command_of
+from ethbrake_marl.game.harm import front_share
 from ethbrake_marl.physics.episode import (
     CLOCK,
     GOES_ON,

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.agents.learned import LearnedAgent, LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent, Team
-from ethbrake_marl.env.engine import Engine, Ruling
-from ethbrake_marl.env.harm import HarmCount
-from ethbrake_marl.env.memory import Memory, begin_script, renew_memory, take_memory
-from ethbrake_marl.env.observations import ObservationSpec
-from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.engine.engine import Engine, Ruling
+from ethbrake_marl.engine.memory import Memory, begin_script, renew_memory, take_memory
+from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep, count_of, unknown_name
 from ethbrake_marl.extensions.certified.enclosure import CORNERS, INTERIOR, checked_robust
 from ethbrake_marl.extensions.certified.estimated_shield import BelievedShield
 from ethbrake_marl.extensions.certified.uncertainty import UNCERTAINTY_EXAMPLE, Uncertainty, parse_uncertainty
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.game.observations import ObservationSpec
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.checks import check_amount

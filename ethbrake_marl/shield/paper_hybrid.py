@@ -17,12 +17,12 @@ import numpy as np
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.e_v2x_bm.coupled import EV2XBM
 from ethbrake_marl.agents.protocol import Agent, AgentAround, Source, check_agent
-from ethbrake_marl.env.actions import command_to_action
-from ethbrake_marl.env.engine import Engine, Ruling
-from ethbrake_marl.env.harm import HarmCount
-from ethbrake_marl.env.memory import Memory, ask_script, begin_script, renew_memory
-from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.engine.engine import Engine, Ruling
+from ethbrake_marl.engine.memory import Memory, ask_script, begin_script, renew_memory
+from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, check_one_learner
+from ethbrake_marl.game.actions import command_to_action
+from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.checks import check_scenario

@@ -14,10 +14,10 @@ import numpy as np
 
 from ethbrake_marl.agents.driving import episode_engine, write_down
 from ethbrake_marl.agents.protocol import Agent, AgentAround, Team
-from ethbrake_marl.env.actions import action_to_command, command_to_action
-from ethbrake_marl.env.memory import Memory, ask_script, begin_script, take_memory
-from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.engine.memory import Memory, ask_script, begin_script, take_memory
+from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import renumbered
+from ethbrake_marl.game.actions import action_to_command, command_to_action
 from ethbrake_marl.physics.episode import CLOCK
 from ethbrake_marl.physics.motion import has_acted
 from ethbrake_marl.physics.state import Floats, Ints, Worlds

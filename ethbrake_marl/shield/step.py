@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from ethbrake_marl.agents.driving import script_agents
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.protocol import Agent, fixed_commands
-from ethbrake_marl.env.actions import command_to_action
-from ethbrake_marl.env.harm import HarmCount, check_harm_count
-from ethbrake_marl.env.profiles import profile_problem
-from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.engine.profiles import profile_problem
+from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, renumbered, unknown_name
 from ethbrake_marl.extensions.certified.enclosure import CORNERS, INTERIOR, Boxes, checked_robust
 from ethbrake_marl.extensions.certified.uncertainty import Uncertainty
+from ethbrake_marl.game.actions import command_to_action
+from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario

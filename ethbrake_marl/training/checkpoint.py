@@ -14,7 +14,7 @@ import numpy as np
 import safetensors.numpy
 from safetensors import SafetensorError
 
-from ethbrake_marl.env.memory import Arrays
+from ethbrake_marl.engine.memory import Arrays
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.files.store import (
     new_file,

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ethbrake_marl.env.harm import HarmCount
+from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.policies.teams import Trained
 from ethbrake_marl.training.run_folder import RunDirectory, Training
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ethbrake_marl.env.memory import Arrays
+from ethbrake_marl.engine.memory import Arrays
 from ethbrake_marl.training.checkpoint import COUNTERS, TrainingState
 from ethbrake_marl.training.models import Model
 from ethbrake_marl.training.run_folder import Algorithm

@@ -14,8 +14,6 @@ from pydantic import Field, field_validator, model_validator
 from pydantic.json_schema import models_json_schema
 from pydantic_core import ErrorDetails
 
-from ethbrake_marl.env.features import ListedFeatures, listed_features
-from ethbrake_marl.env.rewards import RewardParams, setting_names
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import (
     NAME_PATTERN,
@@ -30,6 +28,8 @@ from ethbrake_marl.files.yaml import (
     refuse,
     schema_lines,
 )
+from ethbrake_marl.game.features import ListedFeatures, listed_features
+from ethbrake_marl.game.rewards import RewardParams, setting_names
 from ethbrake_marl.policies.manifest import Activation, NetworkSpec
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.scenario.catalogue import check_file_name, shipped_folder

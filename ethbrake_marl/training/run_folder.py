@@ -19,11 +19,11 @@ from pydantic import Field, model_validator
 
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.env.harm import HarmCount
-from ethbrake_marl.env.observations import ObservationSpec, choose_observation
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput
 from ethbrake_marl.files.store import new_folder, parse_strict_json, read_object, read_plain, write_file
 from ethbrake_marl.files.yaml import Document, FileModel, Wording, read_model, refuse
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.game.observations import ObservationSpec, choose_observation
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.network import load_policy
 from ethbrake_marl.policies.shipped import SHIPPED, shipped_name

@@ -12,13 +12,13 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive, script_agents
 from ethbrake_marl.agents.protocol import Knowledge, Source
 from ethbrake_marl.agents.registry import agent_entries, find_entry, make_agent, parse_spec
-from ethbrake_marl.env.actions import action_to_command, command_to_action
-from ethbrake_marl.env.memory import Memory, ask_script, begin_script
-from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.engine.memory import Memory, ask_script, begin_script
+from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.evaluation.named_worlds import make_lineup
 from ethbrake_marl.extensions.certified.estimated import Ranges, Told
 from ethbrake_marl.extensions.certified.estimating_agents import Odometer
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
+from ethbrake_marl.game.actions import action_to_command, command_to_action
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.messages import CHANNEL, LINK, Messages, link_at, place_at, ring_at
 from ethbrake_marl.physics.state import Bools, Floats

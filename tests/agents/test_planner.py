@@ -7,13 +7,13 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive, script_agents
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.env.harm import HARM_COUNTS
-from ethbrake_marl.env.profiles import profile_problem
+from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.extensions.search import refine as refine_module
 from ethbrake_marl.extensions.search.around import Searched
 from ethbrake_marl.extensions.search.planner import Planner
 from ethbrake_marl.extensions.search.refine import refine
+from ethbrake_marl.game.harm import HARM_COUNTS
 from tests.fixtures.asked import Asked
 
 SCENARIO = eb.load_scenario("paper-random")

@@ -16,12 +16,12 @@ from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_h
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Knowledge, Team
 from ethbrake_marl.agents.registry import make_agent, register_agent
-from ethbrake_marl.env.observations import observe
-from ethbrake_marl.env.profiles import ProfileProblem, profile_problem
+from ethbrake_marl.engine.profiles import ProfileProblem, profile_problem
 from ethbrake_marl.errors import AgentFailed, AlreadyExists, UnknownName
 from ethbrake_marl.extensions.search.around import Searched
 from ethbrake_marl.extensions.search.refine import refine
 from ethbrake_marl.extensions.search.templates import best_templates
+from ethbrake_marl.game.observations import observe
 from tests.fixtures.asked import Asked
 from tests.refused import refused
 

@@ -16,17 +16,17 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.env.objectives import OBJECTIVES, scored
 from ethbrake_marl.evaluation.named_worlds import make_lineup
 from ethbrake_marl.extensions.report.style import picture_bytes
+from ethbrake_marl.extensions.report.tests import PAPER_NOTE, PAPER_ROWS
 from ethbrake_marl.extensions.reproduction import pages, strategies, tables as tables_module, verdicts
 from ethbrake_marl.extensions.reproduction.folder import Reproduction, Result, checked_result
 from ethbrake_marl.extensions.reproduction.items import ITEMS
 from ethbrake_marl.extensions.reproduction.making import choose_items
 from ethbrake_marl.extensions.reproduction.open_quantities import GAPS
 from ethbrake_marl.extensions.reproduction.strategies import FULL_BRAKE, NAMES
-from ethbrake_marl.extensions.reproduction.tests import PAPER_NOTE, PAPER_ROWS
 from ethbrake_marl.extensions.search.shipped import best_known
+from ethbrake_marl.game.objectives import OBJECTIVES, scored
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.training.recipe import Scheme

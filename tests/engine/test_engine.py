@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.env.engine import Engine, Moment
-from ethbrake_marl.env.harm import HARM_COUNTS
+from ethbrake_marl.engine.engine import Engine, Moment
 from ethbrake_marl.env.making import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.learners import branches
 from ethbrake_marl.extensions.learners.branches import Offsets, play_to_the_end
+from ethbrake_marl.game.harm import HARM_COUNTS
 from tests.physics.random_worlds import line
 
 PAPER = eb.load_scenario("paper-random").replace(early_impacts="keep")

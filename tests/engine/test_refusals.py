@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.env.actions import checked_action
-from ethbrake_marl.env.engine import Engine
-from ethbrake_marl.env.harm import empty_ledger, injury_probability
+from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.env.making import make_engine
-from ethbrake_marl.env.objectives import declared_objectives, scored
-from ethbrake_marl.env.observations import ObservationSpec, choose_observation, observe
 from ethbrake_marl.env.pettingzoo import parallel_env
-from ethbrake_marl.env.rewards import reward_params
 from ethbrake_marl.errors import UnknownName
+from ethbrake_marl.game.actions import checked_action
+from ethbrake_marl.game.harm import empty_ledger, injury_probability
+from ethbrake_marl.game.objectives import declared_objectives, scored
+from ethbrake_marl.game.observations import ObservationSpec, choose_observation, observe
+from ethbrake_marl.game.rewards import reward_params
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.scenario.catalogue import load_scenario
 from tests.fixtures.policies import make_policy

@@ -20,7 +20,6 @@ from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.env.rewards import reward_params
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.motion import EpisodeMotion, follow_episodes, state_at
@@ -31,6 +30,7 @@ from ethbrake_marl.extensions.datasets.minari import env_spec
 from ethbrake_marl.extensions.datasets.parquet import KEY, decision_columns
 from ethbrake_marl.extensions.datasets.recording import Recording, Task, record_episodes
 from ethbrake_marl.extensions.report.film import film_bytes, film_scenes
+from ethbrake_marl.game.rewards import reward_params
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.shield.drivers import ShieldedDriver
 from tests.contract.interfaces import CRASH, FIVE, PAPER

@@ -16,8 +16,6 @@ import pytest
 from rich.console import Console
 
 import ethbrake_marl as eb
-from ethbrake_marl.env.harm import HARM_COUNTS, Ledger, injury_probability
-from ethbrake_marl.env.objectives import STANDARD, declared_objectives, parse_objective, scored
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.exploits import Exploits
@@ -29,12 +27,15 @@ from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
 from ethbrake_marl.extensions.report.experiment import results_csv
 from ethbrake_marl.extensions.report.report import Report
-from ethbrake_marl.extensions.reproduction.tests import PAPER_ROWS, is_papers_test
-from ethbrake_marl.extensions.search import shipped
+from ethbrake_marl.extensions.report.tests import PAPER_ROWS, is_papers_test
+from ethbrake_marl.extensions.search import limits, shipped
+from ethbrake_marl.extensions.search.limits import Unproven, known_limits, unproven_because
 from ethbrake_marl.extensions.search.regret import KNOWN_OF_WORLDS, Between
-from ethbrake_marl.extensions.search.shipped import Unproven, known_limits, shipped_tables, unproven_because
+from ethbrake_marl.extensions.search.shipped import shipped_tables
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.game.harm import HARM_COUNTS, Ledger, injury_probability
+from ethbrake_marl.game.objectives import STANDARD, declared_objectives, parse_objective, scored
 from ethbrake_marl.physics.left_out import Impacts
 from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 from ethbrake_marl.scenario.schema import Scenario
@@ -484,8 +485,8 @@ def four(evaluation: Evaluation, monkeypatch: pytest.MonkeyPatch) -> Evaluation:
     def best(worlds: eb.Worlds, task: Task) -> dict[str, np.ndarray]:
         return {count: harm[: worlds.n] for count, harm in TABLE.items()}
 
-    monkeypatch.setattr(shipped, "lower_bound", bound)
-    monkeypatch.setattr(shipped, "best_known", best)
+    monkeypatch.setattr(limits, "lower_bound", bound)
+    monkeypatch.setattr(limits, "best_known", best)
     return first_worlds(evaluation, 4, full_brake=FULL, a=AGENT)
 
 

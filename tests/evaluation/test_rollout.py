@@ -19,10 +19,7 @@ import ethbrake_marl as eb
 from ethbrake_marl import registry
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput, PhysicsError, Unfamiliar
-from ethbrake_marl.evaluation import (
-    chunks,
-    identity,  # fmt: skip
-)
+from ethbrake_marl.evaluation import chunks, identity
 from ethbrake_marl.evaluation.chunks import Lineup, evaluate_held, summarise_tally, tally_list
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.exploits import FAR_M
@@ -37,7 +34,7 @@ from ethbrake_marl.evaluation.rollout import ShovedFront, chunks_of, drive_chunk
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.evaluation.tally import Tally
 from ethbrake_marl.extensions.report.report import Report
-from ethbrake_marl.extensions.search.shipped import Limits
+from ethbrake_marl.extensions.search.limits import Limits
 from ethbrake_marl.files import python_file
 from ethbrake_marl.physics.paper_map import advance_sampled
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds

@@ -14,13 +14,13 @@ import yaml
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import app, run_command
-from ethbrake_marl.env.objectives import declared_objectives
-from ethbrake_marl.env.observations import observe
-from ethbrake_marl.env.rewards import TERMS, StepOutcome
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.own_measures import REGISTERED
 from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.extensions.report.report import Report
+from ethbrake_marl.game.objectives import declared_objectives
+from ethbrake_marl.game.observations import observe
+from ethbrake_marl.game.rewards import TERMS, StepOutcome
 from ethbrake_marl.scenario.catalogue import new_scenario_text
 from ethbrake_marl.scenario.channel import CHANNELS
 from ethbrake_marl.scenario.schema import scenario_json_schema

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.env.features import FEATURES
-from ethbrake_marl.env.rewards import reward_params
 from ethbrake_marl.errors import AlreadyExists, UnknownName
+from ethbrake_marl.game.features import FEATURES
+from ethbrake_marl.game.rewards import reward_params
 from ethbrake_marl.scenario.catalogue import new_scenario_text
 from tests.fixtures.policies import make_policy
 from tests.refused import refused

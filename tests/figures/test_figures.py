@@ -24,7 +24,7 @@ from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
 from ethbrake_marl.extensions.report.style import ShownFigure, label_text, new_figure, picture_bytes, series_style
 from ethbrake_marl.extensions.report.trajectories import trajectories
 from ethbrake_marl.extensions.reproduction.figures import harm_against_total_gap, learning_curve
-from ethbrake_marl.extensions.search.shipped import Limits, Proof
+from ethbrake_marl.extensions.search.limits import Limits, Proof
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task

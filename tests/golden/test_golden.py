@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.env.harm import empty_ledger
 from ethbrake_marl.evaluation.identity import worlds_sha256
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
+from ethbrake_marl.game.harm import empty_ledger
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario

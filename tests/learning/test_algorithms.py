@@ -21,8 +21,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.sac.policies import SACPolicy
 
 import ethbrake_marl as eb
-from ethbrake_marl.env.objectives import scored
-from ethbrake_marl.env.profiles import profile_problem
+from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.learners.actors import (
     Adam,
@@ -46,6 +45,7 @@ from ethbrake_marl.extensions.learners.scout import Scout, choose_rows, draw_row
 from ethbrake_marl.extensions.learners.stages import stages_of
 from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
 from ethbrake_marl.extensions.search.templates import best_templates
+from ethbrake_marl.game.objectives import scored
 from ethbrake_marl.policies.network import Actor, load_policy
 from ethbrake_marl.training.models import TrainingDiverged, make_environment, make_model
 from ethbrake_marl.training.networks import ppo_arguments, tensors_of

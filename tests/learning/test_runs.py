@@ -23,22 +23,22 @@ from stable_baselines3.common.logger import Logger
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.train import run_folder
-from ethbrake_marl.env.objectives import objective_harm, objectives_of
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, Progress
 from ethbrake_marl.evaluation import evaluation as evaluation_module
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import summarise
-from ethbrake_marl.extensions.search import shipped
+from ethbrake_marl.extensions.search import limits
 from ethbrake_marl.files.store import new_folder, write_file
+from ethbrake_marl.game.objectives import objective_harm, objectives_of
 from ethbrake_marl.policies.network import Policy, dense, load_policy
 from ethbrake_marl.policies.teams import Trained, read_trained
-from ethbrake_marl.training import models, progress as progress_module, random_state, train as train_module
+from ethbrake_marl.training import models, progress as progress_module, random_state
 from ethbrake_marl.training.checkpoint import ARRAYS, NUMBERS, TrainingState, read_checkpoint, write_checkpoint
 from ethbrake_marl.training.models import TrainingDiverged, open_logs
 from ethbrake_marl.training.progress import Course
 from ethbrake_marl.training.recipe import LearningRate, TrainingRecipe, load_recipe
 from ethbrake_marl.training.run_folder import RunDirectory, Training
-from ethbrake_marl.training.train import TrainResult, resume
+from ethbrake_marl.training.train import TrainResult, resume, train as train_module
 from tests.docs.site import load
 from tests.learning.tiny import (
     MODES,
@@ -153,7 +153,7 @@ def test_train__stops_where_it_should_and_goes_on_to_the_same_bits(tmp_path: Pat
 def test_train__measures_what_an_evaluation_of_the_kept_policy_tells_and_proves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    prove = Mock(side_effect=shipped.known_limits)
+    prove = Mock(side_effect=limits.known_limits)
     monkeypatch.setattr(evaluation_module, "known_limits", prove)
     result = train_module.train(TINY, SCENARIO, tmp_path / "run", steps=UPDATE, on_progress=None)
     prove.assert_not_called()

@@ -16,8 +16,7 @@ from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.cli.evaluate import GROUP_EPISODES
-from ethbrake_marl.env.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.env.profiles import Profiles, profile_problem
+from ethbrake_marl.engine.profiles import Profiles, profile_problem
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
 from ethbrake_marl.evaluation import chunks, evaluation
 from ethbrake_marl.evaluation.named_worlds import make_lineup
@@ -25,27 +24,21 @@ from ethbrake_marl.evaluation.per_world import write_per_world
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.extensions.proofs import lower_bound as bounding
-from ethbrake_marl.extensions.proofs.extreme_profiles import KEPT, extreme_profiles
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.extensions.proofs.ramped_meetings import onset_states
 from ethbrake_marl.extensions.proofs.team_bound import team_bound
 from ethbrake_marl.extensions.report.harm_figures import harm_in_parts
 from ethbrake_marl.extensions.report.report import avoidable_section, worst_section
-from ethbrake_marl.extensions.reproduction.tests import TESTS
+from ethbrake_marl.extensions.report.tests import TESTS
 from ethbrake_marl.extensions.search import shipped
 from ethbrake_marl.extensions.search.best_harm import best_harm, fold_episodes, search_list, task_problem
+from ethbrake_marl.extensions.search.extreme_profiles import KEPT, extreme_profiles
+from ethbrake_marl.extensions.search.limits import Unproven, known_limits, prove
 from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.extensions.search.recall import BestHarm
-from ethbrake_marl.extensions.search.shipped import (
-    TABLES,
-    Unproven,
-    best_known,
-    known_limits,
-    prove,
-    shipped_profiles,
-    shipped_tables,
-)
+from ethbrake_marl.extensions.search.shipped import TABLES, best_known, shipped_profiles, shipped_tables
 from ethbrake_marl.extensions.search.tables import LEFT_OUT, BestHarmTable
+from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.state import Floats, Worlds
 from ethbrake_marl.policies.shipped import load_shipped, shipped_policies

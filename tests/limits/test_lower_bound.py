@@ -7,8 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from ethbrake_marl.env.harm import empty_ledger
-from ethbrake_marl.env.profiles import Profiles, profile_problem
+from ethbrake_marl.engine.profiles import Profiles, profile_problem
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from ethbrake_marl.extensions.proofs.branch_and_bound import CELLS, HEAP_WIDTH, lacking
 from ethbrake_marl.extensions.proofs.flights import lead, widest_flight
@@ -23,6 +22,7 @@ from ethbrake_marl.extensions.proofs.ramped_meetings import onset_states, roundi
 from ethbrake_marl.extensions.proofs.team_bound import team_bound
 from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.extensions.search.shipped import best_known
+from ethbrake_marl.game.harm import empty_ledger
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.motion import solo_motion
 from ethbrake_marl.physics.state import Vehicles, Worlds, make_worlds

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ethbrake_marl.env.profiles import ProfileProblem, Profiles, profile_problem
+from ethbrake_marl.engine.profiles import ProfileProblem, Profiles, profile_problem
 from ethbrake_marl.errors import CorruptBundle
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound

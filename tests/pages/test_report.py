@@ -10,7 +10,6 @@ import pytest
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.env.harm import HarmCount
 from ethbrake_marl.env.rendering import COLOURS
 from ethbrake_marl.errors import AlreadyExists, plain_text
 from ethbrake_marl.evaluation.named_worlds import make_lineup
@@ -21,6 +20,7 @@ from ethbrake_marl.extensions.report.shown_worlds import choose_shown, worst_row
 from ethbrake_marl.extensions.report.style import add_caption, new_figure
 from ethbrake_marl.extensions.report.svg import inline_svg
 from ethbrake_marl.files.sheet import Column, Sheet, Shown
+from ethbrake_marl.game.harm import HarmCount
 from tests.fixtures.pictures import draw_nothing
 from tests.pages.hostile import HOSTILE, UNSEEN, Page
 

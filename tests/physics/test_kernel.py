@@ -10,7 +10,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive, script_agents
 from ethbrake_marl.agents.protocol import fixed_commands
-from ethbrake_marl.env.profiles import Profiles, profile_problem
+from ethbrake_marl.engine.profiles import Profiles, profile_problem
 from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.physics.motion import contact, drift, force_range, settle, solo_motion, speed_event
 from tests.fixtures.asked import Acts

@@ -13,10 +13,10 @@ import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.scripts import StateFree
-from ethbrake_marl.env.actions import action_to_command
-from ethbrake_marl.env.engine import Engine
-from ethbrake_marl.env.harm import HarmCount, Ledger, empty_ledger
-from ethbrake_marl.env.profiles import ProfileProblem, Profiles, profile_problem
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine.profiles import ProfileProblem, Profiles, profile_problem
+from ethbrake_marl.game.actions import action_to_command
+from ethbrake_marl.game.harm import HarmCount, Ledger, empty_ledger
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.episode import CLOCK
 from ethbrake_marl.physics.state import Floats, Ints, Worlds, make_worlds

@@ -6,7 +6,7 @@ import numpy as np
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.env.profiles import profile_problem
+from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.evaluation import named_worlds
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.state import make_worlds

@@ -7,8 +7,8 @@ from math import inf, nan
 import numpy as np
 import pytest
 
-from ethbrake_marl.env.harm import empty_ledger
 from ethbrake_marl.errors import PhysicsError
+from ethbrake_marl.game.harm import empty_ledger
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.forecast import forecast
 from ethbrake_marl.physics.paper_map import advance_sampled

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.env.harm import split
 from ethbrake_marl.errors import PhysicsError
+from ethbrake_marl.game.harm import split
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.left_out import Impacts
 from ethbrake_marl.physics.state import Floats, Ints, Worlds, make_worlds

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.env.profiles import profile_problem
+from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.shield.members import begin_running, plan_harm

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ethbrake_marl.env.harm import Ledger, empty_ledger
+from ethbrake_marl.game.harm import Ledger, empty_ledger
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.state import Floats, Worlds
 

@@ -18,11 +18,11 @@ from jsonschema import Draft202012Validator
 from pydantic import ValidationError
 
 import ethbrake_marl as eb
-from ethbrake_marl.env.harm import HARM_COUNTS, empty_ledger
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.identity import scenario_sha256
 from ethbrake_marl.evaluation.named_worlds import load_runnable
 from ethbrake_marl.files.yaml import flow_text, parse_yaml, read_yaml
+from ethbrake_marl.game.harm import HARM_COUNTS, empty_ledger
 from ethbrake_marl.scenario import catalogue
 from ethbrake_marl.scenario.catalogue import new_scenario_text, shipped_folder
 from ethbrake_marl.scenario.channel import PRESETS

@@ -8,7 +8,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive, script_agents
 from ethbrake_marl.agents.protocol import fixed_commands
-from ethbrake_marl.env.profiles import profile_problem
+from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.extensions.certified import affine, enclosure
 from ethbrake_marl.extensions.certified.affine import (
     CLOSING,

@@ -13,8 +13,8 @@ from gymnasium.wrappers import Autoreset
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive, episode_engine
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.env.compiled_step import STEP
-from ethbrake_marl.env.engine import Engine
+from ethbrake_marl.engine.compiled_step import STEP
+from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.shield.drivers import ShieldedDriver

@@ -7,7 +7,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.env.profiles import profile_problem
+from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.extensions.search.around import Searched
 from ethbrake_marl.scenario.task import Task

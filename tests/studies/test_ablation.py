@@ -13,7 +13,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.env.harm import HarmCount
 from ethbrake_marl.extensions.cooperation.comparison import compare
 from ethbrake_marl.extensions.cooperation.figures import ablation_figures
 from ethbrake_marl.extensions.cooperation.joint_optimum import (
@@ -39,12 +38,13 @@ from ethbrake_marl.extensions.cooperation.page import ablation_page, interval_wo
 from ethbrake_marl.extensions.report.style import ALARM
 from ethbrake_marl.extensions.search.best_harm import best_harm, chunks_left
 from ethbrake_marl.extensions.studies.trainings import TrainingJob
+from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.scenario.catalogue import load_scenario, scenario_path
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.shield.drivers import Shielded
-from ethbrake_marl.training import train
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.training.run_folder import Training
+from ethbrake_marl.training.train import train
 from tests.learning.tiny import TINY_PPO
 from tests.pages.hostile import Page
 from tests.studies.conftest import ABLATE, LEVELS, check_snapshot, study

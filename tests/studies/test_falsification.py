@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.env.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.extensions.studies.falsification import APART, Scored, far_apart, search
 from ethbrake_marl.extensions.studies.weakness import Measure, MeasureName
+from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.physics.state import Bools, Floats, Worlds
 
 SCENARIO = eb.load_scenario("paper-random")

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation.statistics import rate
 from ethbrake_marl.extensions.report.seed_curves import SeedCurve
+from ethbrake_marl.extensions.report.tests import PAPER_ROWS, PaperRow
 from ethbrake_marl.extensions.reproduction import delay_curves, folder as folder_module, hybrid, trainings
 from ethbrake_marl.extensions.reproduction.delay_curves import Course
 from ethbrake_marl.extensions.reproduction.figures import estimates_figure
@@ -30,7 +31,6 @@ from ethbrake_marl.extensions.reproduction.tables import (
     rows_table,
     selection_verdict,
 )
-from ethbrake_marl.extensions.reproduction.tests import PAPER_ROWS, PaperRow
 from ethbrake_marl.extensions.reproduction.trainings import Group, TrainedRecipe
 from ethbrake_marl.extensions.reproduction.verdicts import (
     HARM,

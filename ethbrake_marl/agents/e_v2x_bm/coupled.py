@@ -20,11 +20,11 @@ from ethbrake_marl.agents.e_v2x_bm.pairwise import CANDIDATES, closed_form, find
 from ethbrake_marl.agents.e_v2x_bm.search import make_room, search_line
 from ethbrake_marl.agents.protocol import Agent, Source, fixed_commands
 from ethbrake_marl.agents.registry import AgentSettings
-from ethbrake_marl.env.harm import HarmCount, check_harm_count
-from ethbrake_marl.env.memory import Memory, is_state_free
-from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.engine.memory import Memory, is_state_free
+from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, renumbered
 from ethbrake_marl.extensions.certified.estimating_agents import Believing
+from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.jit import by_parts, compiled
 from ethbrake_marl.physics.rows import FLAG

@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.env.harm import HarmCount
-from ethbrake_marl.env.profiles import ProfileProblem
-from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.engine.profiles import ProfileProblem
+from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.extensions.certified.affine import (
     TOUCH_WIDTH,
@@ -36,6 +35,7 @@ from ethbrake_marl.extensions.certified.affine import (
 )
 from ethbrake_marl.extensions.certified.paths import Stack, most_harm, new_stack
 from ethbrake_marl.extensions.certified.rough import rough_harm
+from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario

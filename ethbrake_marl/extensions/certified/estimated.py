@@ -18,7 +18,7 @@ import numpy as np
 
 from ethbrake_marl.agents.driving import script_agents
 from ethbrake_marl.agents.protocol import fixed_commands
-from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.estimates import move_on
 from ethbrake_marl.physics.messages import Messages

@@ -17,14 +17,14 @@ from itertools import product
 import numpy as np
 
 from ethbrake_marl.agents.driving import script_agents
-from ethbrake_marl.env.harm import HarmCount
-from ethbrake_marl.env.memory import renew_memory, take_memory
-from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.engine.memory import renew_memory, take_memory
+from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.extensions.certified.enclosure import CORNERS, INTERIOR, checked_robust
 from ethbrake_marl.extensions.certified.estimated import Ranges, Told
 from ethbrake_marl.extensions.certified.estimating_agents import Odometer
 from ethbrake_marl.extensions.certified.uncertainty import MOST_CORNERS, Uncertainty
+from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent, AgentAround, Knowledge, Source
-from ethbrake_marl.env.memory import Memory, ask_script, begin_script, renew_memory
-from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.engine.memory import Memory, ask_script, begin_script, renew_memory
+from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.extensions.certified.estimated import Ranges, Told
 from ethbrake_marl.physics.state import Floats, Worlds
 from ethbrake_marl.scenario.schema import Scenario

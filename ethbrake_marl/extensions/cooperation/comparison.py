@@ -10,10 +10,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from ethbrake_marl.env.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.evaluation.seeds import interquartile_mean, mean_over_seeds, share_over_seeds
 from ethbrake_marl.extensions.cooperation.joint_optimum import Goal, Harms, Measured
 from ethbrake_marl.extensions.cooperation.levels import TOLERANCE, Json
+from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.shield.drivers import Shielded
 

@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.ticker import FuncFormatter, NullLocator
 
-from ethbrake_marl.env.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.env.rendering import COLOURS
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.extensions.report.style import (
@@ -28,6 +27,7 @@ from ethbrake_marl.extensions.report.style import (
     series_style,
 )
 from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 
 LINEAR = 0.1  # m2/s2; axes are linear up to there and logarithmic beyond: harm falls to a hundredth
 

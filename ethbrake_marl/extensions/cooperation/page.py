@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.env.harm import HARM_COUNTS
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.extensions.cooperation.comparison import compare
 from ethbrake_marl.extensions.cooperation.figures import ablation_figures
@@ -20,9 +20,9 @@ from ethbrake_marl.extensions.cooperation.levels import FIGURES, HARM, Json, Pla
 from ethbrake_marl.extensions.report.page import Page, Part, Section
 from ethbrake_marl.extensions.report.player import Played
 from ethbrake_marl.extensions.report.style import write_picture
-from matplotlib.figure import Figure
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
 from ethbrake_marl.files.store import write_output
+from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.training.run_folder import RunDirectory
 
 _MOST, _USUAL, _LEAST = 3, 2, 2  # worlds in which most, as usual and least is saved

@@ -22,10 +22,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from ethbrake_marl.agents.protocol import Driver, Team
-from ethbrake_marl.env.harm import HARM_COUNTS
 from ethbrake_marl.env.making import action_box, feature_box
-from ethbrake_marl.env.observations import Observation, choose_observation
-from ethbrake_marl.env.rewards import Reward, reward_params
 from ethbrake_marl.errors import (
     AlreadyExists,
     InvalidInput,
@@ -42,6 +39,9 @@ from ethbrake_marl.evaluation.outcome import LeftOut
 from ethbrake_marl.extensions.datasets.parquet import KEY, OF_STEPS, parquet_dataset
 from ethbrake_marl.extensions.datasets.recording import Recording, Task, record_episodes
 from ethbrake_marl.files.store import check_target, check_writable, new_folder
+from ethbrake_marl.game.harm import HARM_COUNTS
+from ethbrake_marl.game.observations import Observation, choose_observation
+from ethbrake_marl.game.rewards import Reward, reward_params
 from ethbrake_marl.physics.left_out import leaving_out_failed
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.observed import observation_for

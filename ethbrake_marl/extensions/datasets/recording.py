@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.agents.driving import episode_engine, script_agents
 from ethbrake_marl.agents.protocol import Driver, Team
-from ethbrake_marl.env.actions import command_to_action
-from ethbrake_marl.env.compiled_step import Step
-from ethbrake_marl.env.engine import Engine
-from ethbrake_marl.env.harm import HARM_COUNTS, Ledger
+from ethbrake_marl.engine.compiled_step import Step
+from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.env.infos import Report
-from ethbrake_marl.env.observations import ObservationSpec
-from ethbrake_marl.env.rewards import RewardParams
 from ethbrake_marl.errors import PhysicsError, renumbered
 from ethbrake_marl.evaluation.record import line_positions
 from ethbrake_marl.evaluation.rollout import ShovedFront
+from ethbrake_marl.game.actions import command_to_action
+from ethbrake_marl.game.harm import HARM_COUNTS, Ledger
+from ethbrake_marl.game.observations import ObservationSpec
+from ethbrake_marl.game.rewards import RewardParams
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario

@@ -23,14 +23,21 @@ from numpy.typing import ArrayLike
 
 from ethbrake_marl.agents.driving import Episodes, episode_engine
 from ethbrake_marl.agents.protocol import Driver, Team, check_agent
-from ethbrake_marl.env.actions import action_to_command
-from ethbrake_marl.env.engine import ROUNDING
-from ethbrake_marl.env.harm import Ledger, empty_ledger
-from ethbrake_marl.env.memory import ask_script, begin_script, is_state_free, renew_memory, take_memory, within_capacity
-from ethbrake_marl.env.stream import check_alert
+from ethbrake_marl.engine.engine import ROUNDING
+from ethbrake_marl.engine.memory import (
+    ask_script,
+    begin_script,
+    is_state_free,
+    renew_memory,
+    take_memory,
+    within_capacity,
+)
+from ethbrake_marl.engine.stream import check_alert
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.rollout import outcome_of
+from ethbrake_marl.game.actions import action_to_command
+from ethbrake_marl.game.harm import Ledger, empty_ledger
 from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.physics.left_out import Impacts
 from ethbrake_marl.physics.motion import BOUND, has_acted

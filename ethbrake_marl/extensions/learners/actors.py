@@ -16,11 +16,11 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from ethbrake_marl.env.engine import Moment
-from ethbrake_marl.env.harm import HarmCount
+from ethbrake_marl.engine.engine import Moment
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.learners.recipes import CounterfactualRecipe
 from ethbrake_marl.extensions.learners.scout import Scout
+from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.elementary import exp, log
 from ethbrake_marl.physics.state import Bools, Floats

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.env.engine import Engine, Moment
-from ethbrake_marl.env.observations import Observations
+from ethbrake_marl.engine.engine import Engine, Moment
+from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.columns import columns
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Bools, Floats, Ints

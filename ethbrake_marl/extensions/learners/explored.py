@@ -7,15 +7,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.env.actions import command_to_action
-from ethbrake_marl.env.engine import Engine, Moment
-from ethbrake_marl.env.harm import HarmCount
-from ethbrake_marl.env.observations import Observations
-from ethbrake_marl.env.profiles import profile_problem
+from ethbrake_marl.engine.engine import Engine, Moment
+from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.extensions.learners.branches import Act, Offsets, play_on, play_to_the_end
 from ethbrake_marl.extensions.learners.recipes import ModesPlan
 from ethbrake_marl.extensions.search.templates import best_templates
+from ethbrake_marl.game.actions import command_to_action
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.policies.manifest import Float32s
 

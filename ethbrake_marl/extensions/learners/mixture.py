@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import update_learning_rate
 from torch.nn.functional import mse_loss, softplus
 
-from ethbrake_marl.env.engine import Moment
+from ethbrake_marl.engine.engine import Moment
 from ethbrake_marl.env.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.actors import (
     AveragedActor,

@@ -15,8 +15,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from ethbrake_marl.env.engine import Moment
-from ethbrake_marl.env.observations import Observations
+from ethbrake_marl.engine.engine import Moment
 from ethbrake_marl.env.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.actors import (
     Deterministic,
@@ -31,6 +30,7 @@ from ethbrake_marl.extensions.learners.branches import play_on
 from ethbrake_marl.extensions.learners.recipes import OptionsRecipe
 from ethbrake_marl.extensions.learners.scout import draw_rows
 from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
+from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.state import Floats, Ints
 from ethbrake_marl.policies.manifest import Float32s
 from ethbrake_marl.policies.network import Actor, Layers

@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from torch import Tensor
 
-from ethbrake_marl.env.engine import Moment
+from ethbrake_marl.engine.engine import Moment
 from ethbrake_marl.env.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.actors import (
     CUT,

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.env.harm import HarmCount
 from ethbrake_marl.extensions.proofs.avoidability import avoidability, check_covered, largest_behind, spare_gap
 from ethbrake_marl.extensions.proofs.branch_and_bound import CELLS, NEAR, least_harm
 from ethbrake_marl.extensions.proofs.followers import obstacle_harm
@@ -46,6 +45,7 @@ from ethbrake_marl.extensions.proofs.ramped_meetings import (
     onset_states,
     rounding,
 )
+from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.jit import by_parts, compiled
 from ethbrake_marl.physics.motion import solo_motion
 from ethbrake_marl.physics.state import Bools, Floats, Worlds

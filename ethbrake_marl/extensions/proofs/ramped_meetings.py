@@ -12,7 +12,6 @@ from numbers import Real
 
 import numpy as np
 
-from ethbrake_marl.env.harm import HarmCount, check_harm_count, empty_ledger
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.proofs.avoidability import Avoidability
 from ethbrake_marl.extensions.proofs.line import AHEAD_M, FORCE_HALVINGS, HALVINGS, LINE, RAMPED_FRONT, ROUGHLY
@@ -25,6 +24,7 @@ from ethbrake_marl.extensions.proofs.ramps import (
     meeting,
     travel,
 )
+from ethbrake_marl.game.harm import HarmCount, check_harm_count, empty_ledger
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ethbrake_marl.env.harm import HarmCount
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from ethbrake_marl.extensions.proofs.closing import (
@@ -29,6 +28,7 @@ from ethbrake_marl.extensions.proofs.closing import (
 )
 from ethbrake_marl.extensions.proofs.front_three import bound_threes
 from ethbrake_marl.extensions.proofs.ramped_meetings import at_onset_of, check_asked, onset_states, rounding
+from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.motion import stopping_distances
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Vehicles, Worlds
 

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
-from ethbrake_marl.env.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.search.best_harm import scripted_commands
-from ethbrake_marl.extensions.search.shipped import Limits, Unproven, known_limits
+from ethbrake_marl.extensions.search.limits import Limits, Unproven, known_limits
+from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.forecast import forecast
 from ethbrake_marl.physics.state import Floats, Worlds, make_worlds

@@ -8,12 +8,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from ethbrake_marl.env.harm import HarmCount
 from ethbrake_marl.env.rendering import COLOURS
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.extensions.report.deceleration_curve import DecelerationCurve
 from ethbrake_marl.extensions.report.style import GREY, finish, name_axes, new_figure, style_axes
-from ethbrake_marl.extensions.search.shipped import Unproven
+from ethbrake_marl.extensions.search.limits import Unproven
+from ethbrake_marl.game.harm import HarmCount
 
 _PREDICTED = COLOURS[2]
 

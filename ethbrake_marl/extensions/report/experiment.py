@@ -17,8 +17,6 @@ import numpy as np
 
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.env.harm import HarmCount
-from ethbrake_marl.env.rewards import RewardParams
 from ethbrake_marl.errors import OnProgress, Progress, Unfamiliar, check_one_learner
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import EPISODES, LIST_SEED
@@ -31,11 +29,13 @@ from ethbrake_marl.extensions.report.page import Part
 from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.extensions.report.shown_worlds import TRAINED_POLICY
 from ethbrake_marl.extensions.report.style import write_picture
+from ethbrake_marl.extensions.report.tests import TESTS, is_papers_test, other_tests
 from ethbrake_marl.extensions.report.trajectories import trajectories
 from ethbrake_marl.extensions.reproduction.figures import harm_against_total_gap, learning_curve
-from ethbrake_marl.extensions.reproduction.tests import TESTS, is_papers_test, other_tests
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import read_object, write_output
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.game.rewards import RewardParams
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.network import Policy
 from ethbrake_marl.scenario.schema import Scenario

@@ -9,13 +9,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 
-from ethbrake_marl.env.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.env.rendering import COLOURS
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.summary import SummaryRow
 from ethbrake_marl.extensions.report.style import TITLES, finish, label_text, name_axes, new_panels, plain, series_style
 from ethbrake_marl.extensions.report.svg import SLIM_IN
+from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 
 _POINTS = 250  # of a curve; more cannot be told apart
 

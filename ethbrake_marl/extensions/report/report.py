@@ -12,7 +12,6 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from ethbrake_marl.agents.protocol import Driver
-from ethbrake_marl.env.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
@@ -31,9 +30,10 @@ from ethbrake_marl.extensions.report.shown_worlds import (
     choose_shown,
     worst_rows,
 )
-from ethbrake_marl.extensions.search.shipped import Unproven
+from ethbrake_marl.extensions.search.limits import Unproven
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown
 from ethbrake_marl.files.store import write_output
+from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.scenario.task import Task
 
 SHIELD_WORLDS = 200  # in which what a shield replaced is simulated again

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ethbrake_marl.env.harm import HarmCount
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.extensions.report.player import Played
+from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 MOST_WORLDS = 50

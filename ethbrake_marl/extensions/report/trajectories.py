@@ -10,12 +10,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ethbrake_marl.env.harm import HARM_COUNTS
 from ethbrake_marl.env.rendering import vehicle_colour
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.record import EpisodeRecord
 from ethbrake_marl.extensions.report.style import DASHES, GREY, finish, label_text, name_axes, new_panels
+from ethbrake_marl.game.harm import HARM_COUNTS
 
 
 def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> Figure:

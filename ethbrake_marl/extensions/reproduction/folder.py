@@ -9,6 +9,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
+from matplotlib.figure import Figure
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass as model
 
@@ -23,7 +24,6 @@ from ethbrake_marl.extensions.reproduction.verdicts import (
     Verdict,
     summarise_verdicts,
 )
-from matplotlib.figure import Figure
 from ethbrake_marl.files.sheet import Estimate, Sheet, Shown, csv_text as csv_of
 from ethbrake_marl.files.store import check_target
 from ethbrake_marl.scenario.catalogue import load_scenario

@@ -10,6 +10,7 @@ from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.statistics import mean
+from ethbrake_marl.extensions.report.tests import PAPER_ROWS
 from ethbrake_marl.extensions.reproduction.folder import (
     FIRST_IMPACTS,
     H_STAR,
@@ -35,7 +36,6 @@ from ethbrake_marl.extensions.reproduction.strategies import (
     unconverged_policy,
 )
 from ethbrake_marl.extensions.reproduction.tables import Beside, beside_printed, decrease_verdict, selection_verdict
-from ethbrake_marl.extensions.reproduction.tests import PAPER_ROWS
 from ethbrake_marl.extensions.reproduction.verdicts import PREDICTED, Verdict, judge_statement
 from ethbrake_marl.policies.shipped import load_shipped
 from ethbrake_marl.scenario.catalogue import load_scenario

@@ -13,7 +13,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.registry import split_names
-from ethbrake_marl.env.harm import HARM_COUNTS
 from ethbrake_marl.errors import InvalidInput, OnProgress, count_of
 from ethbrake_marl.evaluation.identity import result_identity, worlds_sha256
 from ethbrake_marl.evaluation.seeds import interquartile_mean
@@ -23,6 +22,7 @@ from ethbrake_marl.extensions.studies.folder import StudyFolder
 from ethbrake_marl.extensions.studies.trainings import TrainingJob, train_all
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import write_output
+from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.policies.network import load_policy
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe

@@ -14,6 +14,7 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import Progress
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import mean, paired_difference
+from ethbrake_marl.extensions.report.tests import PAPER_ROWS
 from ethbrake_marl.extensions.reproduction.figures import changes_figure
 from ethbrake_marl.extensions.reproduction.folder import (
     POLICIES,
@@ -28,7 +29,6 @@ from ethbrake_marl.extensions.reproduction.folder import (
 from ethbrake_marl.extensions.reproduction.hybrid import RANDOM
 from ethbrake_marl.extensions.reproduction.strategies import COUPLED, FULL_BRAKE, NAMES, PAIRWISE, PPO, hybrid, lineup
 from ethbrake_marl.extensions.reproduction.tables import collision_rate
-from ethbrake_marl.extensions.reproduction.tests import PAPER_ROWS
 from ethbrake_marl.extensions.reproduction.trainings import HARM_COLUMN, OPEN, PPO_PAPER
 from ethbrake_marl.extensions.reproduction.verdicts import HARM, LIST_SEED, PERCENT, Less, Verdict, compare_number
 from ethbrake_marl.files.sheet import Estimate, Sheet

@@ -15,7 +15,7 @@ from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.extensions.reproduction.folder import Reproduction
 from ethbrake_marl.extensions.reproduction.trainings import EARLY, STOPPED
 from ethbrake_marl.extensions.reproduction.verdicts import LIST_SEED, PREDICTED, PROVEN
-from ethbrake_marl.extensions.search.shipped import Unproven
+from ethbrake_marl.extensions.search.limits import Unproven
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.policies.network import Policy, load_policy
 from ethbrake_marl.policies.shipped import load_shipped

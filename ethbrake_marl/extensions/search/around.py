@@ -9,12 +9,12 @@ import numpy as np
 from ethbrake_marl.agents.driving import record_commands
 from ethbrake_marl.agents.protocol import Agent, AgentAround, Source, check_agent, fixed_commands
 from ethbrake_marl.agents.registry import AgentSettings
-from ethbrake_marl.env.harm import HarmCount, check_harm_count
-from ethbrake_marl.env.memory import Memory
-from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.engine.memory import Memory
+from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import check_whole_number
 from ethbrake_marl.extensions.search.planner import MOST_CANDIDATES, Outlook
 from ethbrake_marl.extensions.search.refine import refine
+from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics.episode import CLOCK
 from ethbrake_marl.physics.state import Floats, Worlds
 from ethbrake_marl.registry import Part

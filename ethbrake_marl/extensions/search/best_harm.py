@@ -15,13 +15,13 @@ import numpy as np
 from ethbrake_marl.agents.driving import record_commands, script_agents
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.protocol import Agent, Driver, fixed_commands
-from ethbrake_marl.env.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.env.profiles import MOST_PHASES, ProfileProblem, Profiles, profile_problem
+from ethbrake_marl.engine.profiles import MOST_PHASES, ProfileProblem, Profiles, profile_problem
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError, check_one_learner
-from ethbrake_marl.extensions.proofs.extreme_profiles import extreme_profiles
 from ethbrake_marl.extensions.proofs.ramped_meetings import onset_states
+from ethbrake_marl.extensions.search.extreme_profiles import extreme_profiles
 from ethbrake_marl.extensions.search.problem import Found, search_profiles
 from ethbrake_marl.extensions.search.tables import COUNTS, LEFT_OUT, LOWERED, BestHarmTable, BestKnown
+from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.episode import CLOCK
 from ethbrake_marl.physics.left_out import leaving_out_failed

@@ -11,13 +11,13 @@ import numpy as np
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
 from ethbrake_marl.agents.protocol import Agent, Source, fixed_commands
 from ethbrake_marl.agents.registry import AgentSettings
-from ethbrake_marl.env.harm import HarmCount, check_harm_count
-from ethbrake_marl.env.memory import Memory, renew_memory, take_memory
-from ethbrake_marl.env.profiles import TIME_STEP_S, ProfileProblem, Profiles, profile_problem
-from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.engine.memory import Memory, renew_memory, take_memory
+from ethbrake_marl.engine.profiles import TIME_STEP_S, ProfileProblem, Profiles, profile_problem
+from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.estimating_agents import Believing
 from ethbrake_marl.extensions.search.problem import search_profiles
+from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.registry import Part

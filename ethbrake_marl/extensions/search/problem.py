@@ -6,10 +6,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from ethbrake_marl.env.harm import HarmCount
-from ethbrake_marl.env.profiles import MOST_PHASES, ProfileProblem, Profiles, make_search_world
+from ethbrake_marl.engine.profiles import MOST_PHASES, ProfileProblem, Profiles, make_search_world
 from ethbrake_marl.errors import PhysicsError, check_whole_number
 from ethbrake_marl.extensions.search.profiles import search_world
+from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.state import Floats, UInt64s
 
 _MIX = 0xD1342543DE82EF95  # an odd number: spreads seeds over 64 bits

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.env.profiles import SearchWorld, copy_rows
+from ethbrake_marl.engine.profiles import SearchWorld, copy_rows
 from ethbrake_marl.physics.elementary import exp
 from ethbrake_marl.physics.episode import CLOCK, follow, follow_whole
 from ethbrake_marl.physics.jit import compiled

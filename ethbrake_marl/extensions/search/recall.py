@@ -10,14 +10,14 @@ from ethbrake_marl.agents.driving import record_commands
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.protocol import Source, fixed_commands
 from ethbrake_marl.agents.registry import AgentSettings, make_agent
-from ethbrake_marl.env.harm import HarmCount, check_harm_count
-from ethbrake_marl.env.memory import Memory
-from ethbrake_marl.env.profiles import TIME_STEP_S, ProfileProblem, Profiles
-from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.engine.memory import Memory
+from ethbrake_marl.engine.profiles import TIME_STEP_S, ProfileProblem, Profiles
+from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, renumbered
 from ethbrake_marl.extensions.search.planner import MOST_CANDIDATES, Outlook, budget_of
 from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.extensions.search.refine import refine
+from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics.episode import CLOCK
 from ethbrake_marl.physics.state import Bools, Floats, Worlds
 from ethbrake_marl.scenario.schema import Scenario

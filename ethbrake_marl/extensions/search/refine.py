@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.env.profiles import ProfileProblem, SearchWorld, copy_rows, make_search_world
+from ethbrake_marl.engine.profiles import ProfileProblem, SearchWorld, copy_rows, make_search_world
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.extensions.search.problem import seeded
 from ethbrake_marl.extensions.search.profiles import allowed, draw, draw_below, draw_command

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.env.harm import HarmCount
 from ethbrake_marl.evaluation.outcome import Outcome, Values
-from ethbrake_marl.extensions.search.shipped import Limits
+from ethbrake_marl.extensions.search.limits import Limits
+from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.state import Bools, Floats
 
 NO_HARM = 1e-3  # m2/s2: nobody is hurt by 0.03 m/s

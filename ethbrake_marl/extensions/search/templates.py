@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.env.profiles import ProfileProblem, copy_rows, make_search_world
+from ethbrake_marl.engine.profiles import ProfileProblem, copy_rows, make_search_world
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.extensions.search.problem import seeded
 from ethbrake_marl.extensions.search.refine import Plan, copy_steps, draw_templates

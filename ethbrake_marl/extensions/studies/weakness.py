@@ -9,11 +9,11 @@ from typing import Literal, get_args
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Driver
-from ethbrake_marl.env.harm import HarmCount
 from ethbrake_marl.errors import InvalidInput, PhysicsError, unknown_name
 from ethbrake_marl.evaluation.named_worlds import NamedWorld, make_lineup, states_of
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.extensions.studies.falsification import Falsified, Watcher, far_apart, search
+from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.env.scripts import Script
+from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import AgentFailed, EthBrakeError, InvalidInput, count_of, describe_error
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.env.actions import checked_action
-from ethbrake_marl.env.compiled_step import (
+from ethbrake_marl.engine.compiled_step import (
     BAD_ACTION,
     ENDED,
     FAILED,
@@ -24,8 +23,7 @@ from ethbrake_marl.env.compiled_step import (
     Step,
     step_worlds,
 )
-from ethbrake_marl.env.harm import Ledger, empty_ledger
-from ethbrake_marl.env.memory import (
+from ethbrake_marl.engine.memory import (
     Arrays,
     Memory,
     ask_script,
@@ -39,12 +37,14 @@ from ethbrake_marl.env.memory import (
     unflat,
     within_capacity,
 )
-from ethbrake_marl.env.objectives import objective_harm
-from ethbrake_marl.env.observations import Observation, Observations, ObservationSpec, Plan
-from ethbrake_marl.env.rewards import Reward, StepOutcome, reward_params
-from ethbrake_marl.env.scripts import Script
-from ethbrake_marl.env.stream import NO_ROWS, RUNNING, Roster, Start, Stream, check_alert, packed_with
+from ethbrake_marl.engine.scripts import Script
+from ethbrake_marl.engine.stream import NO_ROWS, RUNNING, Roster, Start, Stream, check_alert, packed_with
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep, renumbered
+from ethbrake_marl.game.actions import checked_action
+from ethbrake_marl.game.harm import Ledger, empty_ledger
+from ethbrake_marl.game.objectives import objective_harm
+from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec, Plan
+from ethbrake_marl.game.rewards import Reward, StepOutcome, reward_params
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.physics.messages import hear_rows

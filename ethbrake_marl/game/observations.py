@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.env.contact_features import FORECAST_S, Contacts, observe_contacts
-from ethbrake_marl.env.features import (
+from ethbrake_marl.errors import InvalidInput, PhysicsError, unknown_name
+from ethbrake_marl.game.contact_features import FORECAST_S, Contacts, observe_contacts
+from ethbrake_marl.game.features import (
     CONTACT_COMMANDS,
     GROUPS,
     MOST_NEIGHBOURS,
@@ -24,7 +25,6 @@ from ethbrake_marl.env.features import (
     registered_in,
     side_of,
 )
-from ethbrake_marl.errors import InvalidInput, PhysicsError, unknown_name
 from ethbrake_marl.physics.columns import Packed, columns
 from ethbrake_marl.physics.estimates import estimate_rows
 from ethbrake_marl.physics.jit import compiled

@@ -26,9 +26,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.env.harm import INJURY_CURVES, HarmCount, Ledger, injury_probability
 from ethbrake_marl.errors import InvalidInput, describe_error, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
+from ethbrake_marl.game.harm import INJURY_CURVES, HarmCount, Ledger, injury_probability
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.registry import Registry
 

@@ -12,7 +12,14 @@ import math
 
 import numpy as np
 
-from ethbrake_marl.env.profiles import MOST_PHASES, ProfileProblem, Profiles, SearchWorld, copy_rows, make_search_world
+from ethbrake_marl.engine.profiles import (
+    MOST_PHASES,
+    ProfileProblem,
+    Profiles,
+    SearchWorld,
+    copy_rows,
+    make_search_world,
+)
 from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, REAR_FIRST
 from ethbrake_marl.extensions.proofs.meetings import meet_front, meet_rear
 from ethbrake_marl.extensions.proofs.plans import empty_plan

@@ -28,10 +28,10 @@ from typing import Annotated, Any, Self, TypeVar
 import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from ethbrake_marl.env.harm import HarmCount
-from ethbrake_marl.env.objectives import Declared, Objective, check_declared, objectives_of
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, describe_error, unknown_name
 from ethbrake_marl.files.yaml import UNSHOWN, FileModel, first_mistake, require
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.game.objectives import Declared, Objective, check_declared, objectives_of
 from ethbrake_marl.physics.elementary import logistic
 from ethbrake_marl.physics.forecast import forecast
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds

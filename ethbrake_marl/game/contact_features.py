@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.env.features import CONTACT_COMMANDS, CONTACT_SIDES
+from ethbrake_marl.game.features import CONTACT_COMMANDS, CONTACT_SIDES
 from ethbrake_marl.physics.columns import columns
 from ethbrake_marl.physics.contact_forecast import CONTACT, forecast_contacts
 from ethbrake_marl.physics.jit import compiled

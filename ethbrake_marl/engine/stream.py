@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.env.compiled_step import CLOCK_WIDTH, LAST_STEP, START
-from ethbrake_marl.env.harm import Ledger
-from ethbrake_marl.env.memory import ask_script, begin_script, is_state_free, within_capacity
-from ethbrake_marl.env.scripts import SAMPLED_AT_ONCE, Script
+from ethbrake_marl.engine.compiled_step import CLOCK_WIDTH, LAST_STEP, START
+from ethbrake_marl.engine.memory import ask_script, begin_script, is_state_free, within_capacity
+from ethbrake_marl.engine.scripts import SAMPLED_AT_ONCE, Script
 from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of
+from ethbrake_marl.game.harm import Ledger
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.episode import Decisions

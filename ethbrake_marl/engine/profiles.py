@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.env.harm import HarmCount, check_harm_count
 from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.episode import CLOCK, Decisions, Episode, follow_whole, harm_so_far

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.env.actions import command_of
-from ethbrake_marl.env.rewards import RewardParams
+from ethbrake_marl.game.actions import command_of
+from ethbrake_marl.game.rewards import RewardParams
 from ethbrake_marl.physics.columns import columns
 from ethbrake_marl.physics.episode import onset_s, stands, step_end_s
 from ethbrake_marl.physics.jit import compiled
