@@ -107,7 +107,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.extensions.report.deceleration_figure import deceleration_figure as deceleration_figure
     from ethbrake_marl.extensions.report.style import write_picture as write_picture
     from ethbrake_marl.extensions.report.trajectories import trajectories as trajectories
-    from ethbrake_marl.extensions.reproduction.figures import harm_against_total_gap as harm_against_total_gap
+    from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap as harm_against_total_gap
 
     # Your own parts
     from ethbrake_marl.agents.registry import register_agent as register_agent

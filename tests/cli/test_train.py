@@ -24,7 +24,7 @@ from ethbrake_marl.evaluation.identity import scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.named_worlds import make_lineup
 from ethbrake_marl.extensions.report import experiment
 from ethbrake_marl.extensions.report.experiment import telling_world, write_figures
-from ethbrake_marl.extensions.reproduction.figures import learning_curve
+from ethbrake_marl.extensions.report.run_figures import learning_curve
 from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
 from tests.cli.conftest import TINY_RECIPE, Command, check_refused, rows_of, told_json
 

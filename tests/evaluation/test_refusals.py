@@ -23,10 +23,10 @@ from ethbrake_marl.extensions.datasets import minari
 from ethbrake_marl.extensions.report.deceleration_curve import deceleration_curve
 from ethbrake_marl.extensions.report.film import film_bytes, film_scenes
 from ethbrake_marl.extensions.report.harm_figures import harm_by_agent
+from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap, learning_curve
 from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
 from ethbrake_marl.extensions.report.style import picture_ending
 from ethbrake_marl.extensions.report.trajectories import trajectories
-from ethbrake_marl.extensions.reproduction.figures import harm_against_total_gap, learning_curve
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.scenario.task import Task
 from tests.contract.interfaces import CRASH
