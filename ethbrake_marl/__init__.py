@@ -90,24 +90,7 @@ if TYPE_CHECKING:
     )
     from ethbrake_marl.evaluation.comparison import compare_results as compare_results
     from ethbrake_marl.evaluation.per_world import read_result as read_result
-    from ethbrake_marl.extensions.datasets.minari import write_dataset as write_dataset
     from ethbrake_marl.evaluation.groups import summarise_by as summarise_by
-
-    # Somebody else's simulator
-    from ethbrake_marl.extensions.hosts.protocol import (
-        Host as Host,
-        HostCommand as HostCommand,
-        HostFailed as HostFailed,
-        HostState as HostState,
-        drive_host as drive_host,
-    )
-
-    # Figures: matplotlib's, which a notebook shows
-    from ethbrake_marl.extensions.report.deceleration_curve import deceleration_curve as deceleration_curve
-    from ethbrake_marl.extensions.report.deceleration_figure import deceleration_figure as deceleration_figure
-    from ethbrake_marl.extensions.report.style import write_picture as write_picture
-    from ethbrake_marl.extensions.report.trajectories import trajectories as trajectories
-    from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap as harm_against_total_gap
 
     # Your own parts
     from ethbrake_marl.agents.registry import register_agent as register_agent

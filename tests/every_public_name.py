@@ -6,6 +6,15 @@ from typing import Any, assert_type
 import numpy as np
 
 import ethbrake_marl as eb
+from ethbrake_marl.extensions.datasets import write_dataset
+from ethbrake_marl.extensions.hosts import Host, HostCommand, HostFailed, HostState, drive_host
+from ethbrake_marl.extensions.report import (
+    deceleration_curve,
+    deceleration_figure,
+    harm_against_total_gap,
+    trajectories,
+    write_picture,
+)
 
 
 class Cautious:
@@ -88,18 +97,18 @@ def measure(folder: Path) -> list[eb.SummaryRow]:
     outcome: eb.Outcome = found.outcome("learned")
     record: eb.EpisodeRecord = eb.record_episode(found.worlds.take([0]), Cautious(), scenario=scenario)
     assert record.ledger.world_harm("first").shape == outcome.first_impact_harm[:1].shape
-    eb.write_dataset(folder / "brakes.parquet", agents, scenario=scenario, episodes=10, format="parquet")
+    write_dataset(folder / "brakes.parquet", agents, scenario=scenario, episodes=10, format="parquet")
     return eb.summarise(found)
 
 
 def show(found: eb.Evaluation, folder: Path) -> list[Any]:
     record = eb.record_episode(found.worlds.take([0]), Cautious(), scenario=found.scenario)
-    eb.write_picture(folder / "episode.svg", eb.trajectories({"world 0": record}))
+    write_picture(folder / "episode.svg", trajectories({"world 0": record}))
     eb.compare_results(eb.read_result(folder / "a.json"), eb.read_result(folder / "b.json"))
-    curve = eb.deceleration_curve(found.worlds.take([0]), found.task)
+    curve = deceleration_curve(found.worlds.take([0]), found.task)
     assert_type(eb.summarise(found), eb.SummaryTable)
     assert_type(eb.summarise_by(found, "scenario"), dict[str, eb.SummaryTable])
-    figures = [eb.deceleration_figure(curve), eb.harm_against_total_gap(found)]
+    figures = [deceleration_figure(curve), harm_against_total_gap(found)]
     return [found.to_frame(), *figures]
 
 
@@ -111,18 +120,18 @@ class Still:
     def __init__(self, worlds: eb.Worlds) -> None:
         self.worlds, self.time_s = worlds, 0.0
 
-    def state(self) -> eb.HostState:
-        return eb.HostState(self.time_s, self.worlds.gaps_m, self.worlds.speeds_mps)
+    def state(self) -> HostState:
+        return HostState(self.time_s, self.worlds.gaps_m, self.worlds.speeds_mps)
 
-    def apply(self, command: eb.HostCommand) -> None:
+    def apply(self, command: HostCommand) -> None:
         self.time_s += float(command.acceleration_mps2.max())
 
 
 def bench(worlds: eb.Worlds) -> eb.Outcome:
-    host: eb.Host = Still(worlds)
+    host: Host = Still(worlds)
     try:
-        return eb.drive_host(host, Cautious(), "paper-random", worlds).outcome
-    except eb.HostFailed as failed:
+        return drive_host(host, Cautious(), "paper-random", worlds).outcome
+    except HostFailed as failed:
         raise SystemExit(str(failed.ledger)) from None
 
 

@@ -15,6 +15,7 @@ from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.evaluation.per_world import write_per_world
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
+from ethbrake_marl.extensions.report import trajectories
 from ethbrake_marl.extensions.search.best_harm import best_harm, task_problem
 from ethbrake_marl.game.harm import empty_ledger
 from ethbrake_marl.policies.manifest import ObservationSchema
@@ -102,7 +103,7 @@ def test_record__positions_end_at_the_obstacle_and_the_figure_draws_it(near_one:
     assert record.positions_m[:, 0].max() == pytest.approx(gap, abs=1e-9) and (record.positions_m <= gap + 1e-9).all()
     struck = record.impacts.pair == -1
     assert struck.any() and record.impacts.closing_speed_mps[struck][0] ** 2 == record.ledger.obstacle_first_harm[0]
-    assert "obstacle" in eb.trajectories({"coast": record}).axes[0].get_legend_handles_labels()[1]
+    assert "obstacle" in trajectories({"coast": record}).axes[0].get_legend_handles_labels()[1]
 
 
 @pytest.mark.parametrize("vehicle", [0, 1])

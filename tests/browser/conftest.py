@@ -11,6 +11,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.extensions.report import harm_against_total_gap
 from ethbrake_marl.extensions.report.page import Part
 from ethbrake_marl.extensions.report.report import Report
 
@@ -76,7 +77,7 @@ def compared() -> eb.Evaluation:
 @pytest.fixture(scope="session")
 def report_file(compared: eb.Evaluation, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of ``compared``."""
-    figure = Part.drawing(eb.harm_against_total_gap(compared), "Harm against the gap", "Mean harm by gap.")
+    figure = Part.drawing(harm_against_total_gap(compared), "Harm against the gap", "Mean harm by gap.")
     report = Report(
         "paper-random: four agents", eb.summarise(compared), compared, figures=[figure],
         summary="A report for the tests.", settings={"Seed": 7}, versions={"numpy": "2"},

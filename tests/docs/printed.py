@@ -180,9 +180,9 @@ PICTURES: dict[str, How] = {
         NIGHTLY,
         'python -c "import ethbrake_marl as eb; from ethbrake_marl.scenario import Task;'
         " scenario = eb.load_scenario('paper-random');"
-        " curve = eb.deceleration_curve(scenario.sample(1, 7, first=5).worlds, Task(scenario, scenario.learners));"
-        " figure = eb.deceleration_figure(curve, title='paper-random, world 5 of the list of seed 7');"
-        " eb.write_picture('deceleration.png', figure)\"",
+        " curve = deceleration_curve(scenario.sample(1, 7, first=5).worlds, Task(scenario, scenario.learners));"
+        " figure = deceleration_figure(curve, title='paper-random, world 5 of the list of seed 7');"
+        " write_picture('deceleration.png', figure)\"",
     ),
     "sampled-convergence.png": _by(NIGHTLY, "python docs/studies/sampling.py sampled-convergence.png"),
     "price-of-not-knowing.png": _by(NIGHTLY, "python docs/studies/price.py price-of-not-knowing.png"),

@@ -25,7 +25,7 @@ from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.motion import EpisodeMotion, follow_episodes, state_at
 from ethbrake_marl.evaluation.named_worlds import make_lineup
 from ethbrake_marl.evaluation.record import record_episode
-from ethbrake_marl.extensions.datasets import minari as minari_module, recording
+from ethbrake_marl.extensions.datasets import minari as minari_module, recording, write_dataset
 from ethbrake_marl.extensions.datasets.minari import env_spec
 from ethbrake_marl.extensions.datasets.parquet import KEY, decision_columns
 from ethbrake_marl.extensions.datasets.recording import Recording, Task, record_episodes
@@ -344,7 +344,7 @@ def test_file__has_the_columns_in_row_groups_and_tells_what_they_are(
     path = tmp_path / "a.parquet"
     path.write_text("stale")
     agents = {**BRAKING, "coast": eb.make_agent("coast")}
-    summary = eb.write_dataset(path, agents, scenario=PAPER, episodes=5, force=True)
+    summary = write_dataset(path, agents, scenario=PAPER, episodes=5, force=True)
     file = parquet.ParquetFile(path)
     assert (file.metadata.num_row_groups, file.metadata.num_rows) == (4, summary.decisions)
     table = file.read()
@@ -365,7 +365,7 @@ def test_file__appears_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(minari_module, "BATCH", 3)
     stop = Mock(side_effect=KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):
-        eb.write_dataset(tmp_path / "a.parquet", BRAKING, scenario=PAPER, episodes=5, on_progress=stop)
+        write_dataset(tmp_path / "a.parquet", BRAKING, scenario=PAPER, episodes=5, on_progress=stop)
     assert stop.called and list(tmp_path.iterdir()) == []
 
 
@@ -389,7 +389,7 @@ def test_replay__gives_the_recorded_bits(
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     lineup = make_lineup(agents.split(","), scenario)
-    summary = eb.write_dataset("brakes-v0", lineup, scenario=scenario, episodes=4, seed=11, reward=reward)
+    summary = write_dataset("brakes-v0", lineup, scenario=scenario, episodes=4, seed=11, reward=reward)
     dataset = minari.load_dataset("brakes-v0")
     assert (dataset.total_episodes, dataset.total_steps) == (4 * len(lineup), summary.decisions)
     env = dataset.recover_environment()
@@ -414,7 +414,7 @@ def test_folder__is_replaced_when_asked_and_only_then(tmp_path: Path) -> None:
     pytest.importorskip("h5py")
     path = tmp_path / "brakes-v0"
     for number, force in ((2, False), (3, True)):
-        eb.write_dataset(path, BRAKING, scenario=PAPER, episodes=number, force=force)
+        write_dataset(path, BRAKING, scenario=PAPER, episodes=number, force=force)
         assert minari.MinariDataset(path / "data").total_episodes == number
     assert [entry.name for entry in tmp_path.iterdir()] == ["brakes-v0"]
 
@@ -434,7 +434,7 @@ def test_work__leaves_a_failed_world_out_and_names_it(tmp_path: Path, monkeypatc
     for name, planted in (("need", Mock()), ("record_episodes", failing), ("BATCH", 3)):
         monkeypatch.setattr(minari_module, name, planted)
     monkeypatch.setattr(minari_module, "parquet_dataset", lambda path, told: nullcontext(recorded))
-    work = eb.write_dataset(tmp_path / "some.parquet", BRAKING, scenario=PAPER, episodes=7, on_progress=seen)
+    work = write_dataset(tmp_path / "some.parquet", BRAKING, scenario=PAPER, episodes=7, on_progress=seen)
     assert [call.args[0].index.tolist() for call in recorded.call_args_list] == [[0, 1, 2], [3, 5], [6]]
     assert [call.args for call in seen.call_args_list] == [("full_brake", 3), ("full_brake", 6), ("full_brake", 7)]
     assert [tuple(left) for left in work.left_out] == [(4, 7, "full_brake", "planted")]

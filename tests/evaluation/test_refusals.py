@@ -19,7 +19,7 @@ from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.seeds import interquartile_mean, mean_over_seeds, share_over_seeds
 from ethbrake_marl.evaluation.statistics import exact_sum, mean, paired_difference, rate
 from ethbrake_marl.evaluation.summary import summarise
-from ethbrake_marl.extensions.datasets import minari
+from ethbrake_marl.extensions.datasets import minari, write_dataset
 from ethbrake_marl.extensions.report.deceleration_curve import deceleration_curve
 from ethbrake_marl.extensions.report.film import film_bytes, film_scenes
 from ethbrake_marl.extensions.report.harm_figures import harm_by_agent
@@ -359,7 +359,7 @@ def dataset(path: str = "a.parquet", agents: Any = None, **given: Any) -> None:
     """Writes a dataset of two episodes, as if the extra were installed."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(minari, "need", lambda package: None)
-        eb.write_dataset(path, BRAKE if agents is None else agents, **{"scenario": PAPER, "episodes": 2, **given})
+        write_dataset(path, BRAKE if agents is None else agents, **{"scenario": PAPER, "episodes": 2, **given})
 
 
 NOBODY = PAPER.with_learners([])
@@ -401,9 +401,9 @@ def test_dataset__replaces_no_folder_that_is_none(empty_folder: Path) -> None:
 def test_clone__is_of_one_learner_of_a_dataset_and_says_which_drives(empty_folder: Path) -> None:
     Path("no.parquet").write_text("no")
     clone = load("../../train/clone")
-    with refused("no.parquet: is no dataset of `eb.write_dataset`"):
+    with refused("no.parquet: is no dataset of `write_dataset`"):
         clone.train(Path("no.parquet"), 0, Path("clone"))
-    eb.write_dataset("two.parquet", BRAKE, scenario=PAIR, episodes=1)
+    write_dataset("two.parquet", BRAKE, scenario=PAIR, episodes=1)
     with refused("two.parquet: holds 2 learners, one is needed"):
         clone.train(Path("two.parquet"), 0, Path("clone"))
     Path("clone.py").write_text((DOCS.parent / "train" / "clone.py").read_text())

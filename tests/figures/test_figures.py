@@ -15,7 +15,7 @@ from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.extensions.cooperation.figures import signed_ticks
-from ethbrake_marl.extensions.report import deceleration_curve as module
+from ethbrake_marl.extensions.report import deceleration_curve, deceleration_curve as module
 from ethbrake_marl.extensions.report.deceleration_curve import deceleration_curve
 from ethbrake_marl.extensions.report.deceleration_figure import deceleration_figure
 from ethbrake_marl.extensions.report.harm_figures import harm_by_agent, harm_in_parts, regret_distribution
@@ -277,7 +277,7 @@ def test_curve_of_scenario_1__changes_its_regimes_at_the_known_decelerations() -
     # The curve of Scenario 1 changes its regimes at the known decelerations 4.71845 and 5.01031 m/s2 (0.004 apart),
     # and full braking does a harm of 28.98, by hand.
     scenario = eb.load_scenario("paper-scenario-1")
-    curve = eb.deceleration_curve(scenario.sample(1, 7).worlds, Task(scenario, (1,)))
+    curve = deceleration_curve(scenario.sample(1, 7).worlds, Task(scenario, (1,)))
     expected = {
         "front pair": [("B", [0.0, 4.151]), ("C", [4.1545, 4.718]), ("none", [4.7184, 7.0])],
         "rear pair": [("none", [0.0, 5.0103]), ("B", [5.012, 7.0])],

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.extensions.hosts import HostFailed, HostState, drive_host
 from ethbrake_marl.physics.left_out import Impacts
 from ethbrake_marl.physics.paper_map import advance_sampled
 from ethbrake_marl.shield.drivers import ShieldedDriver
@@ -26,7 +27,7 @@ class EngineHost:
         self.worlds, self.impacts = worlds, None
 
     def state(self):
-        return eb.HostState(self.worlds.time_s, self.worlds.gaps_m, self.worlds.speeds_mps, self.impacts)
+        return HostState(self.worlds.time_s, self.worlds.gaps_m, self.worlds.speeds_mps, self.impacts)
 
     def apply(self, command):
         self.worlds, self.impacts = eb.advance(self.worlds, command.wanted_mps2, until_s=command.until_s)
@@ -65,7 +66,7 @@ def test_host__that_is_the_engine_equals_evaluate_to_the_bit(agent, scenario):
     scenario = eb.load_scenario(scenario)
     worlds, driver = scenario.sample(40, 7).worlds, eb.make_agent(agent, scenario=scenario)
     ours = eb.evaluate(worlds, {agent: driver}, scenario=scenario, aftermath=False).outcome(agent)
-    found = eb.drive_host(EngineHost(worlds), driver, scenario, worlds)
+    found = drive_host(EngineHost(worlds), driver, scenario, worlds)
     compares = agent.endswith("+step")
     assert same(found.outcome.ledger, ours.ledger) and (found.distrusted is not None) == compares
     assert not compares or not found.distrusted.any()
@@ -94,7 +95,7 @@ def test_host__that_is_the_sampled_map_equals_the_papers_sum(agent):
     paper = eb.evaluate(worlds, {agent: driver}, scenario=PAPER).outcome(agent).sampled_harm
     assert paper is not None
     host = SampledHost(worlds)
-    found = eb.drive_host(host, driver, PAPER, worlds).outcome
+    found = drive_host(host, driver, PAPER, worlds).outcome
     assert np.array_equal(host.harm, paper) and paper.mean() > 10.0
     assert found.total_harm == pytest.approx(paper, abs=1e-9)
 
@@ -104,7 +105,7 @@ def test_impacts__of_a_host_without_any_are_ours_to_the_second_order_of_its_step
     ours = eb.evaluate(worlds, {"ours": driver}, scenario=PAPER, aftermath=False).outcome("ours").ledger
     alone = (ours.count > 0).sum(axis=1) == 1
     for dt, most in ((0.1, 0.1), (0.01, 0.001)):
-        found = eb.drive_host(Bench(worlds, dt), driver, PAPER, worlds).outcome.ledger
+        found = drive_host(Bench(worlds, dt), driver, PAPER, worlds).outcome.ledger
         off = np.abs(found.first_impact_harm - ours.first_impact_harm)
         assert off[alone].mean() < most and off.mean() < 5.0 * dt
 
@@ -121,7 +122,7 @@ def test_host__with_a_jittery_clock_gives_the_same_bits():
     worlds = PAPER.sample(100, 7).worlds
     for agent in ("ppo@shipped+step:believed", "r157_human"):
         driver = eb.make_agent(agent, scenario=PAPER)
-        one, other = (eb.drive_host(make(worlds), driver, PAPER, worlds).outcome for make in (Bench, Jittery))
+        one, other = (drive_host(make(worlds), driver, PAPER, worlds).outcome for make in (Bench, Jittery))
         assert same(one.ledger, other.ledger) and one.ledger.collided.any()
 
 
@@ -136,7 +137,7 @@ def test_latencies__are_rounded_up_to_whole_steps_and_everybody_is_told():
             told.append(seen)
             return -seen.vehicles.braking_capacity_mps2[:, vehicle]
 
-    found = eb.drive_host(Bench(worlds, 0.01), Asked(), scenario, worlds).outcome
+    found = drive_host(Bench(worlds, 0.01), Asked(), scenario, worlds).outcome
     latency, given = told[0].vehicles.latency_s, worlds.vehicles.latency_s
     assert (latency >= given - 1e-9).all() and (latency < given + 0.01).all() and (latency != given).mean() > 0.5
     assert np.abs(latency / 0.01 - np.rint(latency / 0.01)).max() < 1e-9
@@ -152,10 +153,10 @@ def test_world__fares_the_same_alone_and_among_others_that_decide_at_other_times
     scenario = eb.load_scenario("stress-wide")
     options = {"uncertainty": "gaps_m=0.1"} if "robust" in agent else {}
     worlds, driver = scenario.sample(6, 7).worlds, eb.make_agent(agent, scenario=scenario, **options)
-    together = eb.drive_host(Bench(worlds, 0.01), driver, scenario, worlds).outcome.ledger
+    together = drive_host(Bench(worlds, 0.01), driver, scenario, worlds).outcome.ledger
     for k in range(6):
         one = worlds.take([k])
-        assert same(eb.drive_host(Bench(one, 0.01), driver, scenario, one).outcome.ledger, together.take([k]))
+        assert same(drive_host(Bench(one, 0.01), driver, scenario, one).outcome.ledger, together.take([k]))
 
 
 class Creeping(Bench):
@@ -171,7 +172,7 @@ class Creeping(Bench):
 def test_rest__is_below_a_millimetre_a_second(monkeypatch):
     worlds = PAPER.sample(20, 7).worlds
     monkeypatch.setattr(Creeping, "creep", 0.0009)
-    assert eb.drive_host(Creeping(worlds), eb.make_agent("full_brake"), PAPER, worlds).outcome.at_rest.all()
+    assert drive_host(Creeping(worlds), eb.make_agent("full_brake"), PAPER, worlds).outcome.at_rest.all()
 
 
 class DrivesOff:
@@ -196,7 +197,7 @@ def test_host__that_never_ends_sees_the_shield_hold_the_brakes_after_its_own_end
     monkeypatch.setattr(StepShield, "decide", told)
     worlds = PAPER.sample(200, 7).worlds
     driver = ShieldedDriver(DrivesOff(), PAPER, uncertainty="gaps_m=0.1,speeds_mps=0.1")
-    found = eb.drive_host(Creeping(worlds, 0.01), driver, PAPER, worlds)
+    found = drive_host(Creeping(worlds, 0.01), driver, PAPER, worlds)
     outcome, after = found.outcome, held
     assert not outcome.at_rest.any() and len(after) > 200 and all(after)
     assert not (outcome.first_impact_harm > outcome.predicted_harm).any() and 0 < found.distrusted.sum() < 200
@@ -274,10 +275,10 @@ def first_nan(values):
 )
 def test_host__that_goes_wrong_is_told_and_the_ledger_is_kept(make, message):
     worlds, driver = PAPER.sample(20, 7).worlds, eb.make_agent("full_brake")
-    with pytest.raises(eb.HostFailed) as failed:
-        eb.drive_host(make(worlds), driver, PAPER, worlds)
+    with pytest.raises(HostFailed) as failed:
+        drive_host(make(worlds), driver, PAPER, worlds)
     assert f" s: {message}" in str(failed.value) and str(failed.value).startswith(f"host {make.__name__} at ")
-    whole = eb.drive_host(Bench(worlds), driver, PAPER, worlds).outcome.ledger
+    whole = drive_host(Bench(worlds), driver, PAPER, worlds).outcome.ledger
     kept = failed.value.ledger
     assert failed.value.worlds.time_s.min() >= 1.8 and (failed.value.worlds.pair_hit == (kept.count > 0)).all()
     assert 0 < kept.impacts.sum() <= whole.impacts.sum()
@@ -396,8 +397,8 @@ SPEED = r"of world \d+ drives at \S+ m/s at \S+ s; its commands lead to \S+ to \
 def test_host__that_moves_as_nothing_can_is_refused_by_name(make, agent, message, dt):
     worlds = PAPER.sample(20, 7).worlds
     host = make(worlds, dt) if issubclass(make, Bench) else make(worlds)
-    with pytest.raises(eb.HostFailed) as failed:
-        eb.drive_host(host, eb.make_agent(agent), PAPER, worlds)
+    with pytest.raises(HostFailed) as failed:
+        drive_host(host, eb.make_agent(agent), PAPER, worlds)
     assert re.match(rf"host {make.__name__} at \d\.\d\d s: ", str(failed.value))
     assert re.search(message.replace("{dt}", f"{dt:g}"), str(failed.value)), str(failed.value)
     assert "\n" not in str(failed.value) and failed.value.worlds.n == 20
@@ -481,7 +482,7 @@ def test_host__that_is_a_little_off_is_driven_to_the_end(make, dt):
     scenario = eb.load_scenario("stress-wide")
     worlds = scenario.sample(10, 7).worlds
     for agent in (eb.make_agent("full_brake"), eb.make_agent("coast"), Shuffled()):
-        outcome = eb.drive_host(make(worlds, dt), agent, scenario, worlds).outcome
+        outcome = drive_host(make(worlds, dt), agent, scenario, worlds).outcome
         assert outcome.ledger.collided.any()
 
 
@@ -498,7 +499,7 @@ def test_host__that_is_a_little_off_is_driven_to_the_end(make, dt):
 )
 def test_host__that_does_not_fit_is_refused_before_anything_moves(host, message):
     with pytest.raises(eb.EthBrakeError) as refused:
-        eb.drive_host(host, eb.make_agent("full_brake"), PAPER, PAPER.sample(20, 7).worlds)
+        drive_host(host, eb.make_agent("full_brake"), PAPER, PAPER.sample(20, 7).worlds)
     assert message in str(refused.value)
 
 
@@ -516,10 +517,10 @@ def test_host__of_what_it_cannot_know_is_refused(scenario, agent, message):
     scenario = eb.load_scenario(scenario)
     worlds = scenario.sample(5, 7).worlds
     with pytest.raises(eb.EthBrakeError) as refused:
-        eb.drive_host(Bench(worlds), agent or eb.make_agent("full_brake"), scenario, worlds)
+        drive_host(Bench(worlds), agent or eb.make_agent("full_brake"), scenario, worlds)
     assert message in str(refused.value)
     with pytest.raises(eb.EthBrakeError, match=r"host: worlds = .* must be worlds, as"):
-        eb.drive_host(Bench(worlds), eb.make_agent("full_brake"), scenario, scenario.sample(5, 7))
+        drive_host(Bench(worlds), eb.make_agent("full_brake"), scenario, scenario.sample(5, 7))
 
 
 # What a loop of one's own needs, without `drive_host`.

@@ -7,6 +7,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl import errors
+from ethbrake_marl.extensions.hosts import drive_host
 from ethbrake_marl.extensions.hosts.sumo import SumoHost, find_host
 from tests.docs.site import DOCS
 
@@ -64,4 +65,4 @@ def test_sumo__is_driven_to_the_end_and_no_vehicle_drives_on_by_its_brakes_after
     scenario = eb.load_scenario("stress-wide")
     worlds = scenario.sample(60, 3).worlds
     with find_host(f"sumo:{dt}").open(worlds) as host:
-        assert eb.drive_host(host, eb.make_agent("full_brake"), scenario, worlds).outcome.ledger.collided.any()
+        assert drive_host(host, eb.make_agent("full_brake"), scenario, worlds).outcome.ledger.collided.any()

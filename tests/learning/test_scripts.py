@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import ethbrake_marl as eb
+from ethbrake_marl.extensions.datasets import write_dataset
 from tests.docs.site import load
 from tests.learning.tiny import harm_beside_full_braking
 
@@ -204,7 +205,7 @@ def test_clone__of_ppo_reaches_its_share_in_other_worlds(
     names = ("full_brake", "best_harm", "ppo@shipped")
     agents = {name: eb.make_agent(name, scenario=PAPER) for name in names}
     ppo = {"ppo": agents["ppo@shipped"]}
-    eb.write_dataset(tmp_path / "ppo.parquet", ppo, scenario=PAPER, episodes=episodes, seed=1)
+    write_dataset(tmp_path / "ppo.parquet", ppo, scenario=PAPER, episodes=episodes, seed=1)
     clone.train(tmp_path / "ppo.parquet", 0, tmp_path / "clone")
     agents["clone"] = eb.make_agent(f"{TRAIN / 'clone.py'}:make_agent:{tmp_path / 'clone'}", scenario=PAPER)
     found = eb.evaluate(PAPER.sample(500, 7), agents, scenario=PAPER, aftermath=False)
@@ -214,7 +215,7 @@ def test_clone__of_ppo_reaches_its_share_in_other_worlds(
 
 def test_clone__drives_as_the_network_itself(clone: ModuleType, tmp_path: Path) -> None:
     agents = {"full_brake": eb.make_agent("full_brake")}
-    eb.write_dataset(tmp_path / "a.parquet", agents, scenario=PAPER, episodes=10, seed=1)
+    write_dataset(tmp_path / "a.parquet", agents, scenario=PAPER, episodes=10, seed=1)
     seen, done, told = clone.read_dataset(tmp_path / "a.parquet")
     assert (seen.shape[1], done.shape[1], seen.dtype) == (27, 1, torch.float32) and bool((done == -1.0).all())
     network = clone.clone(seen, done, 0)

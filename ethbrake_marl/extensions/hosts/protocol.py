@@ -62,7 +62,9 @@ class HostState(NamedTuple):
     """What a host tells of its ``n`` lines of ``N`` vehicles, front to rear.
 
     >>> import ethbrake_marl as eb
-    >>> eb.HostState(0.0, [[5.0, 6.0]], [[20.0, 18.0, 20.0]]).impacts is None
+
+    >>> from ethbrake_marl.extensions.hosts import HostState
+    >>> HostState(0.0, [[5.0, 6.0]], [[20.0, 18.0, 20.0]]).impacts is None
     True
 
     """
@@ -77,7 +79,9 @@ class HostCommand(NamedTuple):
     """What a host is to do in one step.
 
     >>> import ethbrake_marl as eb
-    >>> eb.HostCommand._fields
+
+    >>> from ethbrake_marl.extensions.hosts import HostCommand
+    >>> HostCommand._fields
     ('acceleration_mps2', 'speeds_mps', 'wanted_mps2', 'until_s')
 
     """
@@ -95,19 +99,21 @@ class Host(Protocol):
     the next decision there, and one whose time that is already stays as it is.
 
     >>> import ethbrake_marl as eb
+
+    >>> from ethbrake_marl.extensions.hosts import HostState, drive_host
     >>> class Bench:
     ...     dt = 0.1
     ...     def __init__(self, worlds):
-    ...         self.told = eb.HostState(0.0, worlds.gaps_m, worlds.speeds_mps)
+    ...         self.told = HostState(0.0, worlds.gaps_m, worlds.speeds_mps)
     ...     def state(self):
     ...         return self.told
     ...     def apply(self, command):
     ...         after = command.speeds_mps + self.dt * command.acceleration_mps2
     ...         way = self.dt * (command.speeds_mps + after) / 2
     ...         gaps = self.told.gaps_m + way[:, :-1] - way[:, 1:]
-    ...         self.told = eb.HostState(self.told.time_s + self.dt, gaps, after)
+    ...         self.told = HostState(self.told.time_s + self.dt, gaps, after)
     >>> worlds = eb.load_scenario("paper-random").sample(5, seed=7).worlds
-    >>> eb.drive_host(Bench(worlds), eb.make_agent("full_brake"), "paper-random", worlds).outcome.at_rest.all()
+    >>> drive_host(Bench(worlds), eb.make_agent("full_brake"), "paper-random", worlds).outcome.at_rest.all()
     np.True_
 
     """
@@ -125,7 +131,9 @@ class HostFailed(EthBrakeError):
     """A host raised, or told what cannot be; ``ledger`` and ``worlds`` keep what had happened by then.
 
     >>> import ethbrake_marl as eb
-    >>> issubclass(eb.HostFailed, eb.EthBrakeError)
+
+    >>> from ethbrake_marl.extensions.hosts import HostFailed
+    >>> issubclass(HostFailed, eb.EthBrakeError)
     True
 
     """
