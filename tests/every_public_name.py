@@ -6,15 +6,12 @@ from typing import Any, assert_type
 import numpy as np
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.datasets import write_dataset
-from ethbrake_marl.extensions.hosts import Host, HostCommand, HostFailed, HostState, drive_host
-from ethbrake_marl.extensions.report import (
-    deceleration_curve,
-    deceleration_figure,
-    harm_against_total_gap,
-    trajectories,
-    write_picture,
-)
+from ethbrake_marl.extensions.datasets.minari import write_dataset
+from ethbrake_marl.extensions.hosts.protocol import Host, HostCommand, HostFailed, HostState, drive_host
+from ethbrake_marl.extensions.report.deceleration import deceleration_curve, deceleration_figure
+from ethbrake_marl.extensions.report.episode_figure import trajectories
+from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap
+from ethbrake_marl.extensions.report.style import write_picture
 
 
 class Cautious:

@@ -15,7 +15,7 @@ from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.evaluation.per_world import write_per_world
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
-from ethbrake_marl.extensions.report import trajectories
+from ethbrake_marl.extensions.report.episode_figure import trajectories
 from ethbrake_marl.extensions.search.best_harm import best_harm, task_problem
 from ethbrake_marl.game.harm import empty_ledger
 from ethbrake_marl.policies.manifest import ObservationSchema

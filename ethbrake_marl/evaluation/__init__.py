@@ -72,7 +72,7 @@ if TYPE_CHECKING:
     )
     from ethbrake_marl.evaluation.tally import Tally as Tally
     from ethbrake_marl.extensions.datasets.minari import check_dataset as check_dataset, write_dataset as write_dataset
-    from ethbrake_marl.extensions.report.deceleration_curve import (
+    from ethbrake_marl.extensions.report.deceleration import (
         DecelerationCurve as DecelerationCurve,
         deceleration_curve as deceleration_curve,
     )

@@ -25,8 +25,8 @@ from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.motion import EpisodeMotion, follow_episodes, state_at
 from ethbrake_marl.evaluation.named_worlds import make_lineup
 from ethbrake_marl.evaluation.record import record_episode
-from ethbrake_marl.extensions.datasets import minari as minari_module, recording, write_dataset
-from ethbrake_marl.extensions.datasets.minari import env_spec
+from ethbrake_marl.extensions.datasets import minari as minari_module, recording
+from ethbrake_marl.extensions.datasets.minari import env_spec, write_dataset
 from ethbrake_marl.extensions.datasets.parquet import KEY, decision_columns
 from ethbrake_marl.extensions.datasets.recording import Recording, Task, record_episodes
 from ethbrake_marl.extensions.report.film import film_bytes, film_scenes

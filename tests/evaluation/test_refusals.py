@@ -19,14 +19,15 @@ from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.seeds import interquartile_mean, mean_over_seeds, share_over_seeds
 from ethbrake_marl.evaluation.statistics import exact_sum, mean, paired_difference, rate
 from ethbrake_marl.evaluation.summary import summarise
-from ethbrake_marl.extensions.datasets import minari, write_dataset
-from ethbrake_marl.extensions.report.deceleration_curve import deceleration_curve
+from ethbrake_marl.extensions.datasets import minari
+from ethbrake_marl.extensions.datasets.minari import write_dataset
+from ethbrake_marl.extensions.report.deceleration import deceleration_curve
+from ethbrake_marl.extensions.report.episode_figure import trajectories
 from ethbrake_marl.extensions.report.film import film_bytes, film_scenes
 from ethbrake_marl.extensions.report.harm_figures import harm_by_agent
 from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap, learning_curve
 from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
 from ethbrake_marl.extensions.report.style import picture_ending
-from ethbrake_marl.extensions.report.trajectories import trajectories
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.scenario.task import Task
 from tests.contract.interfaces import CRASH

@@ -15,15 +15,17 @@ from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.extensions.cooperation.figures import signed_ticks
-from ethbrake_marl.extensions.report import deceleration_curve, deceleration_curve as module
-from ethbrake_marl.extensions.report.deceleration_curve import deceleration_curve
-from ethbrake_marl.extensions.report.deceleration_figure import deceleration_figure
+from ethbrake_marl.extensions.report.deceleration import (
+    deceleration_curve,
+    deceleration_curve as module,
+    deceleration_figure,
+)
+from ethbrake_marl.extensions.report.episode_figure import trajectories
 from ethbrake_marl.extensions.report.harm_figures import harm_by_agent, harm_in_parts, regret_distribution
 from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap, learning_curve
 from ethbrake_marl.extensions.report.scenario_figures import worlds_figure
 from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
 from ethbrake_marl.extensions.report.style import ShownFigure, label_text, new_figure, picture_bytes, series_style
-from ethbrake_marl.extensions.report.trajectories import trajectories
 from ethbrake_marl.extensions.search.limits import Limits, Proof
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.hosts import HostFailed, HostState, drive_host
+from ethbrake_marl.extensions.hosts.protocol import HostFailed, HostState, drive_host
 from ethbrake_marl.physics.left_out import Impacts
 from ethbrake_marl.physics.paper_map import advance_sampled
 from ethbrake_marl.shield.drivers import ShieldedDriver

@@ -7,7 +7,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl import errors
-from ethbrake_marl.extensions.hosts import drive_host
+from ethbrake_marl.extensions.hosts.protocol import drive_host
 from ethbrake_marl.extensions.hosts.sumo import SumoHost, find_host
 from tests.docs.site import DOCS
 

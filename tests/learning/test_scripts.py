@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.datasets import write_dataset
+from ethbrake_marl.extensions.datasets.minari import write_dataset
 from tests.docs.site import load
 from tests.learning.tiny import harm_beside_full_braking
 

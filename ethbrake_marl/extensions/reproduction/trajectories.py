@@ -10,9 +10,9 @@ import numpy as np
 from ethbrake_marl.errors import Progress
 from ethbrake_marl.evaluation.named_worlds import make_agents
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
+from ethbrake_marl.extensions.report.episode_figure import trajectories
 from ethbrake_marl.extensions.report.page import Part
 from ethbrake_marl.extensions.report.player import Played
-from ethbrake_marl.extensions.report.trajectories import trajectories
 from ethbrake_marl.extensions.reproduction.figures import profiles_figure, road_figure
 from ethbrake_marl.extensions.reproduction.folder import (
     POLICIES,
