@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.env.rendering import COLOURS, vehicle_colour
+from ethbrake_marl.envs.rendering import COLOURS, vehicle_colour
 from ethbrake_marl.extensions.report.style import DASHES, GREY, add_caption, new_figure, style_axes, write_picture
 from ethbrake_marl.scenario.schema import Scenario
 

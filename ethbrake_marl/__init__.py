@@ -17,22 +17,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ethbrake_marl.doors import names_behind
-from ethbrake_marl.env.registration import register_environments
+from ethbrake_marl.envs.registration import register_environments
 from ethbrake_marl.errors import naming_extras
 
 if TYPE_CHECKING:
     # Environments
     from ethbrake_marl.engine.engine import Engine as Engine
-    from ethbrake_marl.env.making import make_engine as make_engine
-    from ethbrake_marl.env.pettingzoo import (
+    from ethbrake_marl.envs.making import make_engine as make_engine
+    from ethbrake_marl.envs.pettingzoo import (
         EthBrakeParallelEnv as EthBrakeParallelEnv,
         env as env,
         parallel_env as parallel_env,
         raw_env as raw_env,
     )
-    from ethbrake_marl.env.sb3 import EthBrakeVecEnv as EthBrakeVecEnv, make_sb3_vec_env as make_sb3_vec_env
-    from ethbrake_marl.env.gymnasium import EthBrakeEnv as EthBrakeEnv
-    from ethbrake_marl.env.vector import CostEnv as CostEnv, EthBrakeVectorEnv as EthBrakeVectorEnv
+    from ethbrake_marl.envs.sb3 import EthBrakeVecEnv as EthBrakeVecEnv, make_sb3_vec_env as make_sb3_vec_env
+    from ethbrake_marl.envs.gymnasium import EthBrakeEnv as EthBrakeEnv
+    from ethbrake_marl.envs.vector import CostEnv as CostEnv, EthBrakeVectorEnv as EthBrakeVectorEnv
 
     # Scenarios, and the worlds drawn from them
     from ethbrake_marl.scenario.catalogue import list_scenarios as list_scenarios, load_scenario as load_scenario
@@ -75,7 +75,7 @@ if TYPE_CHECKING:
 
     # Training
     from ethbrake_marl.training.recipe import TrainingRecipe as TrainingRecipe, load_recipe as load_recipe
-    from ethbrake_marl.training.train import TrainResult as TrainResult, resume as resume, train as train
+    from ethbrake_marl.training.session import TrainResult as TrainResult, resume as resume, train as train
     from ethbrake_marl.errors import Progress as Progress
 
     # Evaluation

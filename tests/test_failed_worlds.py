@@ -8,7 +8,7 @@ import pytest
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.engine.stream import FailedWorld
-from ethbrake_marl.env.making import make_engine
+from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.forecast import forecast

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import ethbrake_marl as eb
-from ethbrake_marl.env.making import make_engine
+from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.game.actions import action_to_command, checked_action, command_to_action
 from ethbrake_marl.game.harm import Ledger, empty_ledger, split
 from ethbrake_marl.game.objectives import STANDARD, objective_harm, objectives_of, scored

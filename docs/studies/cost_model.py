@@ -18,7 +18,7 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.training.recipe import load_recipe
-from ethbrake_marl.training.train import train
+from ethbrake_marl.training.session import train
 
 SCENARIO = "paper-random"
 UPDATES = {"ppo": 5, "counterfactual": 4, "quick": 4}  # of which the first does not count

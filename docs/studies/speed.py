@@ -24,8 +24,8 @@ import numpy as np
 import ethbrake_marl as eb
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
-from ethbrake_marl.env.making import make_engine
-from ethbrake_marl.env.pettingzoo import parallel_env
+from ethbrake_marl.envs.making import make_engine
+from ethbrake_marl.envs.pettingzoo import parallel_env
 from ethbrake_marl.extensions.studies.machine import this_machine
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.game.harm import empty_ledger

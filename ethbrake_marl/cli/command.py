@@ -17,7 +17,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.segment import Segment
 
-from ethbrake_marl.env.registration import register_environments
+from ethbrake_marl.envs.registration import register_environments
 from ethbrake_marl.errors import InvalidInput, Progress as PartProgress, one_line, plain_text
 
 _KEPT = "\n\t\N{NO-BREAK SPACE}"  # in lines of a result; the last stands between a number and its unit

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from ethbrake_marl.env.pettingzoo import SeededInside
-from ethbrake_marl.env.sb3 import EthBrakeVecEnv
+from ethbrake_marl.envs.pettingzoo import SeededInside
+from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.state import Bools
 from ethbrake_marl.shield.options import Proposing

@@ -16,7 +16,7 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent, Team
-from ethbrake_marl.env.pettingzoo import InTurns, Ordered, SeededInside
+from ethbrake_marl.envs.pettingzoo import InTurns, Ordered, SeededInside
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.state import Bools, Floats

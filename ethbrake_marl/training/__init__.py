@@ -13,12 +13,12 @@ if TYPE_CHECKING:
         register_algorithm as register_algorithm,
     )
     from ethbrake_marl.training.run_folder import RunDirectory as RunDirectory, Training as Training
-    from ethbrake_marl.training.settings import Settings as Settings, read_settings as read_settings
-    from ethbrake_marl.training.train import (
+    from ethbrake_marl.training.session import (
         StopAt as StopAt,
         TrainResult as TrainResult,
         resume as resume,
         train as train,
     )
+    from ethbrake_marl.training.settings import Settings as Settings, read_settings as read_settings
 else:
     __getattr__ = front_door(__name__, __file__)

@@ -10,7 +10,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import CSVOutputFormat, KVWriter, TensorBoardOutputFormat
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
-from ethbrake_marl.env.sb3 import EthBrakeVecEnv, make_sb3_vec_env
+from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.policies.manifest import Float32s, NetworkSpec
 from ethbrake_marl.policies.network import Policy

@@ -9,7 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from torch.optim import Optimizer
 
-from ethbrake_marl.env.sb3 import EthBrakeVecEnv
+from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.training.central_critic import CentralCriticPolicy
 from ethbrake_marl.training.independent import IndependentPPO
 from ethbrake_marl.training.networks import ppo_arguments

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from torch import Tensor
     from torch.optim import Optimizer
 
-    from ethbrake_marl.env.sb3 import EthBrakeVecEnv
+    from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 
 RunStatus = Literal["running", "finished", "interrupted", "failed"]
 

@@ -8,7 +8,7 @@ from stable_baselines3 import SAC
 from torch import Tensor
 from torch.optim import Optimizer
 
-from ethbrake_marl.env.sb3 import EthBrakeVecEnv
+from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.training.networks import ACTIVATIONS
 from ethbrake_marl.training.recipes import SacRecipe
 from ethbrake_marl.training.run_folder import Algorithm, Training

@@ -14,7 +14,7 @@ from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import AgentSpec, agent_entries, agent_names, make_agent, parse_spec, register_agent
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.env.making import make_engine
+from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.identity import worlds_sha256
 from ethbrake_marl.evaluation.motion import follow_episodes

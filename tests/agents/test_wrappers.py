@@ -17,7 +17,7 @@ from stable_baselines3.common.monitor import Monitor
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.env.pettingzoo import InTurns
+from ethbrake_marl.envs.pettingzoo import InTurns
 from ethbrake_marl.errors import InvalidInput
 
 SCENARIO = eb.load_scenario("paper-random")

@@ -15,7 +15,7 @@ from packaging.requirements import Requirement
 from ethbrake_marl.agents.e_v2x_bm import coupled, pairwise
 from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.doctor import Check, diagnose
-from ethbrake_marl.env.making import make_engine
+from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.extensions.studies.machine import this_machine
 from ethbrake_marl.kernel_store import cache_folder
 from ethbrake_marl.physics import advance as advance_module

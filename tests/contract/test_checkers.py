@@ -15,17 +15,17 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
 
 import ethbrake_marl as eb
-from ethbrake_marl.env.gymnasium import EthBrakeEnv
-from ethbrake_marl.env.motion import Viewer
-from ethbrake_marl.env.pettingzoo import env, parallel_env
-from ethbrake_marl.env.rendering import HEIGHT, WIDTH
+from ethbrake_marl.envs.gymnasium import EthBrakeEnv
+from ethbrake_marl.envs.motion import Viewer
+from ethbrake_marl.envs.pettingzoo import env, parallel_env
+from ethbrake_marl.envs.rendering import HEIGHT, WIDTH
 from tests.contract.interfaces import FIVE, LEVELS, PAPER, REST, SCENARIOS, line
 
 pytestmark = pytest.mark.filterwarnings(
     "error",
     # PettingZoo's checkers pass {"options": 1} on purpose; asking for a warning here is our own rule.
-    "ignore:reset. unknown option options, ignored:ethbrake_marl.env.making.UnknownResetOption",
-    "ignore::ethbrake_marl.env.making.IgnoredAction",  # they act for all agents
+    "ignore:reset. unknown option options, ignored:ethbrake_marl.envs.making.UnknownResetOption",
+    "ignore::ethbrake_marl.envs.making.IgnoredAction",  # they act for all agents
     "ignore:.*is different from the unwrapped version",  # a shield is: that is its use
 )
 ANY_START = PAPER.replace(early_impacts="keep")

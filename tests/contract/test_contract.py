@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.env.making import UnknownResetOption
+from ethbrake_marl.envs.making import UnknownResetOption
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.fields import QUANTITY

@@ -7,7 +7,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.engine.engine import Engine, Moment
-from ethbrake_marl.env.making import make_engine
+from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.learners import branches
 from ethbrake_marl.extensions.learners.branches import Offsets, play_to_the_end

@@ -7,8 +7,8 @@ import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.env.making import make_engine
-from ethbrake_marl.env.pettingzoo import parallel_env
+from ethbrake_marl.envs.making import make_engine
+from ethbrake_marl.envs.pettingzoo import parallel_env
 from ethbrake_marl.errors import UnknownName
 from ethbrake_marl.game.actions import checked_action
 from ethbrake_marl.game.harm import empty_ledger, injury_probability

@@ -20,11 +20,11 @@ from stable_baselines3.common.monitor import Monitor
 import ethbrake_marl as eb
 from ethbrake_marl import ethbrake_v0
 from ethbrake_marl.engine.stream import Stream
-from ethbrake_marl.env.gymnasium import EthBrakeEnv
-from ethbrake_marl.env.making import IgnoredAction, action_box, feature_box, make_engine
-from ethbrake_marl.env.pettingzoo import env, parallel_env
-from ethbrake_marl.env.registration import GYMNASIUM_ID, PETTINGZOO_ID, register_environments
-from ethbrake_marl.env.sb3 import EthBrakeVecEnv, make_sb3_vec_env
+from ethbrake_marl.envs.gymnasium import EthBrakeEnv
+from ethbrake_marl.envs.making import IgnoredAction, action_box, feature_box, make_engine
+from ethbrake_marl.envs.pettingzoo import env, parallel_env
+from ethbrake_marl.envs.registration import GYMNASIUM_ID, PETTINGZOO_ID, register_environments
+from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.learners.branches import play_to_the_end
 from ethbrake_marl.game.features import Feature

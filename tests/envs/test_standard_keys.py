@@ -13,7 +13,7 @@ from gymnasium.wrappers import TimeAwareObservation
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import ethbrake_marl as eb
-from ethbrake_marl.env.making import UnknownResetOption
+from ethbrake_marl.envs.making import UnknownResetOption
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario.schema import Scenario
 from tests.contract.interfaces import PAPER, REST, actions

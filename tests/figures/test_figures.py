@@ -8,18 +8,14 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.env.rendering import BODY_M, COLOURS
+from ethbrake_marl.envs.rendering import BODY_M, COLOURS
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.extensions.cooperation.figures import signed_ticks
-from ethbrake_marl.extensions.report.deceleration import (
-    deceleration_curve,
-    deceleration_curve as module,
-    deceleration_figure,
-)
+from ethbrake_marl.extensions.report.deceleration import deceleration_curve, deceleration_figure
 from ethbrake_marl.extensions.report.episode_figure import trajectories
 from ethbrake_marl.extensions.report.harm_figures import harm_by_agent, harm_in_parts, regret_distribution
 from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap, learning_curve

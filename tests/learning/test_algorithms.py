@@ -52,7 +52,7 @@ from ethbrake_marl.training.networks import ppo_arguments, tensors_of
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.training.run_folder import Training
 from ethbrake_marl.training.sac import sac_arguments
-from ethbrake_marl.training.train import resume, train
+from ethbrake_marl.training.session import resume, train
 from tests.learning.tiny import (
     MODES,
     TINY_COUNTERFACTUAL,

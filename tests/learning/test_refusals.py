@@ -19,8 +19,8 @@ from ethbrake_marl.training.ppo import Ppo
 from ethbrake_marl.training.recipe import load_recipe, register_algorithm
 from ethbrake_marl.training.recipes import PpoRecipe
 from ethbrake_marl.training.run_folder import RunDirectory, Training
+from ethbrake_marl.training.session import resume, train
 from ethbrake_marl.training.settings import read_settings
-from ethbrake_marl.training.train import resume, train
 from tests.fixtures.policies import make_policy
 from tests.learning.test_algorithms import A2C, recipe_file
 from tests.learning.tiny import TINY_COUNTERFACTUAL, TINY_MODES, TINY_OPTIONS, TINY_PPO

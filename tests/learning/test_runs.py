@@ -38,7 +38,7 @@ from ethbrake_marl.training.models import TrainingDiverged, open_logs
 from ethbrake_marl.training.progress import Course
 from ethbrake_marl.training.recipe import LearningRate, TrainingRecipe, load_recipe
 from ethbrake_marl.training.run_folder import RunDirectory, Training
-from ethbrake_marl.training.train import TrainResult, resume, train as train_module
+from ethbrake_marl.training.session import TrainResult, resume, train as train_module
 from tests.docs.site import load
 from tests.learning.tiny import (
     MODES,
@@ -537,8 +537,8 @@ def test_resume__after_a_failure_and_another_stop_it_ends_as_if_nothing_had_happ
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from ethbrake_marl.env.sb3 import EthBrakeVecEnv
-from ethbrake_marl.training.train import train
+from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
+from ethbrake_marl.training.session import train
 from tests.learning.test_runs import TRAININGS, measure
 folder, step, left = Path(sys.argv[2]), EthBrakeVecEnv.step_wait, [5]
 

@@ -17,7 +17,7 @@ from ethbrake_marl.policies.teams import PolicyTeam
 from ethbrake_marl.training.models import make_model
 from ethbrake_marl.training.recipe import TrainingRecipe, algorithm_names, load_recipe
 from ethbrake_marl.training.run_folder import RunDirectory, Training
-from ethbrake_marl.training.train import train
+from ethbrake_marl.training.session import train
 from tests.learning.tiny import TINY_PPO, Answer, files_of, harm_beside_full_braking, marked, watch_steps
 
 PAIR = eb.load_scenario("cooperation-3-pair")

@@ -10,7 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.env.rendering import COLOURS
+from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import AlreadyExists, plain_text
 from ethbrake_marl.evaluation.named_worlds import make_lineup
 from ethbrake_marl.extensions.report import page as page_module

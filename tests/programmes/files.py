@@ -31,7 +31,7 @@ from ethbrake_marl.policies.manifest import content_sha256
 from ethbrake_marl.policies.network import load_policy
 from ethbrake_marl.policies.shipped import shipped_policies
 from ethbrake_marl.training.checkpoint import NUMBERS
-from ethbrake_marl.training.train import train
+from ethbrake_marl.training.session import train
 from tests.programmes.cage import NASTY, OUTSIDE, PRECIOUS, Case, damaged, write
 
 # ---------------------------------------------------------------- text

@@ -10,7 +10,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import script_agents
 from ethbrake_marl.engine.profiles import identities
-from ethbrake_marl.env.making import make_engine
+from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.evaluation.identity import worlds_sha256
 from ethbrake_marl.game.observations import observe
 from ethbrake_marl.physics.columns import Packed

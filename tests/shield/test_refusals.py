@@ -14,10 +14,10 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.env.gymnasium import EthBrakeEnv
-from ethbrake_marl.env.pettingzoo import env as aec_env, parallel_env
-from ethbrake_marl.env.sb3 import make_sb3_vec_env
-from ethbrake_marl.env.vector import EthBrakeVectorEnv
+from ethbrake_marl.envs.gymnasium import EthBrakeEnv
+from ethbrake_marl.envs.pettingzoo import env as aec_env, parallel_env
+from ethbrake_marl.envs.sb3 import make_sb3_vec_env
+from ethbrake_marl.envs.vector import EthBrakeVectorEnv
 from ethbrake_marl.errors import UncertifiedStep, UnknownName
 from ethbrake_marl.extensions.certified.uncertainty import Interval, Uncertainty, parse_uncertainty
 from ethbrake_marl.scenario.catalogue import load_scenario

@@ -17,7 +17,7 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from ethbrake_marl.env.making import feature_box, make_engine
+from ethbrake_marl.envs.making import feature_box, make_engine
 from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.observed import full_state, observation_for, state_features

@@ -22,7 +22,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from ethbrake_marl.agents.protocol import Driver, Team
-from ethbrake_marl.env.making import action_box, feature_box
+from ethbrake_marl.envs.making import action_box, feature_box
 from ethbrake_marl.errors import (
     AlreadyExists,
     InvalidInput,

@@ -19,7 +19,7 @@ from ethbrake_marl.agents.driving import episode_engine, script_agents
 from ethbrake_marl.agents.protocol import Driver, Team
 from ethbrake_marl.engine.compiled_step import Step
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.env.infos import Report
+from ethbrake_marl.envs.infos import Report
 from ethbrake_marl.errors import PhysicsError, renumbered
 from ethbrake_marl.evaluation.record import line_positions
 from ethbrake_marl.evaluation.rollout import ShovedFront

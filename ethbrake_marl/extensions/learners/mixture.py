@@ -11,7 +11,7 @@ from stable_baselines3.common.utils import update_learning_rate
 from torch.nn.functional import mse_loss, softplus
 
 from ethbrake_marl.engine.engine import Moment
-from ethbrake_marl.env.sb3 import EthBrakeVecEnv
+from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.actors import (
     AveragedActor,
     Tried,

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from ethbrake_marl.engine.engine import Moment
-from ethbrake_marl.env.sb3 import EthBrakeVecEnv
+from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.actors import (
     Deterministic,
     adam,

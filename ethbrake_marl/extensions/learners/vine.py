@@ -5,7 +5,7 @@ from __future__ import annotations
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch.optim import Optimizer
 
-from ethbrake_marl.env.sb3 import EthBrakeVecEnv
+from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.actors import widened
 from ethbrake_marl.extensions.learners.mixture import ModesModel
 from ethbrake_marl.extensions.learners.recipes import CounterfactualRecipe

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
-from ethbrake_marl.env.rendering import COLOURS
+from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.extensions.report.style import GREY, finish, name_axes, new_figure, style_axes

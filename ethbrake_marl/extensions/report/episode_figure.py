@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ethbrake_marl.env.rendering import vehicle_colour
+from ethbrake_marl.envs.rendering import vehicle_colour
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.record import EpisodeRecord

@@ -42,7 +42,7 @@ from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
 from ethbrake_marl.training.recipe import TrainingRecipe
 from ethbrake_marl.training.run_folder import RunDirectory
-from ethbrake_marl.training.train import TrainResult, train
+from ethbrake_marl.training.session import TrainResult, train
 
 BESIDE = ("full_brake", "e_v2x_bm")  # beside the policy: in its figures, and on the other two of the three tests
 

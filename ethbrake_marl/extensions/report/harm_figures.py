@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 
-from ethbrake_marl.env.rendering import COLOURS
+from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.summary import SummaryRow

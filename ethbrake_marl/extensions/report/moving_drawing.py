@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from xml.sax.saxutils import escape
 
-from ethbrake_marl.env.rendering import BODY_M, Scene, Struck, star, vehicle_colour
+from ethbrake_marl.envs.rendering import BODY_M, Scene, Struck, star, vehicle_colour
 from ethbrake_marl.errors import plain_text
 
 _FILM_WIDTH = 800

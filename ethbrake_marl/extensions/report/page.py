@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from ethbrake_marl.env.rendering import BODY_M
+from ethbrake_marl.envs.rendering import BODY_M
 from ethbrake_marl.errors import InvalidInput, plain_text
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.extensions.report.player import DATA, PLAYER_SCRIPTS, Played
@@ -126,9 +126,7 @@ class Part:
             where: the file that the SVG was read from, for the error where that holds what no figure of ours does.
 
         """
-        from ethbrake_marl.extensions.report.svg import (
-            inline_svg,  # matplotlib takes a second to load, and some pages draw nothing
-        )
+        from ethbrake_marl.extensions.report.svg import inline_svg
 
         try:
             svg, caption = inline_svg(figure, f"{title}. {description}", recolour=not alone)

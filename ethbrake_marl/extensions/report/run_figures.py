@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from ethbrake_marl.env.rendering import COLOURS
+from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.statistics import mean

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from ethbrake_marl.env.rendering import BODY_M, vehicle_colour
+from ethbrake_marl.envs.rendering import BODY_M, vehicle_colour
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.named_worlds import drawn_alike
 from ethbrake_marl.extensions.report.style import (

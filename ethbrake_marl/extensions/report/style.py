@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import findfont, get_font
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from ethbrake_marl.env.rendering import COLOURS
+from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import InvalidInput, plain_text
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.physics.state import Floats

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ethbrake_marl.env.rendering import vehicle_colour
+from ethbrake_marl.envs.rendering import vehicle_colour
 from ethbrake_marl.evaluation.record import EpisodeRecord
 from ethbrake_marl.extensions.report.style import GREY, band, finish, name_axes, new_panels, series_style
 from ethbrake_marl.files.sheet import Estimate

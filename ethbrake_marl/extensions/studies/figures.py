@@ -13,7 +13,7 @@ from ethbrake_marl.files.store import remove_folder
 from ethbrake_marl.policies.network import Policy
 from ethbrake_marl.policies.teams import read_trained
 from ethbrake_marl.training.run_folder import RunDirectory
-from ethbrake_marl.training.train import StopAt
+from ethbrake_marl.training.session import StopAt
 
 _MEASURED = ("first_impact_harm", "total_harm", "collision_rate")
 

@@ -19,7 +19,7 @@ from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.training.run_folder import RunDirectory, Training
 
 if TYPE_CHECKING:
-    from ethbrake_marl.training.train import StopAt
+    from ethbrake_marl.training.session import StopAt
 
 
 def train_all(trainings: Sequence[TrainingJob], jobs: int = 1, tell: OnProgress | None = None) -> bool:
@@ -75,7 +75,7 @@ class TrainingJob:
 
         Raises what ``train`` and ``resume`` raise.
         """
-        from ethbrake_marl.training.train import resume, train  # torch takes seconds to load
+        from ethbrake_marl.training.session import resume, train  # torch takes seconds to load
 
         def say(progress: Progress) -> None:
             if tell is not None:
@@ -95,7 +95,7 @@ class TrainingJob:
 
     def time(self, sample: Sample | None = None) -> Timed:
         """Time a few updates, and the policy on the first worlds of ``sample``; None: of the recipe's list."""
-        from ethbrake_marl.training.train import train
+        from ethbrake_marl.training.session import train
 
         told: list[Progress] = []
         recipe, scenario = self.training.recipe, self.training.scenario

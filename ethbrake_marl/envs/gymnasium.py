@@ -14,9 +14,9 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.env.infos import OneWorld, Report
-from ethbrake_marl.env.making import AnyScenario, action_box, feature_box, learner_actions, make_engine, only_learner
-from ethbrake_marl.env.motion import Viewer
+from ethbrake_marl.envs.infos import OneWorld, Report
+from ethbrake_marl.envs.making import AnyScenario, action_box, feature_box, learner_actions, make_engine, only_learner
+from ethbrake_marl.envs.motion import Viewer
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec
 from ethbrake_marl.game.rewards import Reward, RewardParams

@@ -12,9 +12,9 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from ethbrake_marl.engine.compiled_step import Step
-from ethbrake_marl.env.gymnasium import EthBrakeEnv, Specified
-from ethbrake_marl.env.infos import Begun, Report
-from ethbrake_marl.env.making import (
+from ethbrake_marl.envs.gymnasium import EthBrakeEnv, Specified
+from ethbrake_marl.envs.infos import Begun, Report
+from ethbrake_marl.envs.making import (
     INITIAL_STATE,
     LISTED_WORLD,
     RESET_MASK,
@@ -25,7 +25,7 @@ from ethbrake_marl.env.making import (
     only_learner,
     warn_of_unknown,
 )
-from ethbrake_marl.env.motion import Viewer
+from ethbrake_marl.envs.motion import Viewer
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.game.actions import own_actions
 from ethbrake_marl.game.observations import Observation, Observations

@@ -15,9 +15,9 @@ from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.env.infos import OneWorld, Report
-from ethbrake_marl.env.making import AnyScenario, IgnoredAction, action_box, feature_box, learner_actions, make_engine
-from ethbrake_marl.env.motion import Viewer
+from ethbrake_marl.envs.infos import OneWorld, Report
+from ethbrake_marl.envs.making import AnyScenario, IgnoredAction, action_box, feature_box, learner_actions, make_engine
+from ethbrake_marl.envs.motion import Viewer
 from ethbrake_marl.errors import InvalidInput, check_whole_number, unknown_name
 from ethbrake_marl.game.actions import checked_action
 from ethbrake_marl.game.observations import Observation, Observations

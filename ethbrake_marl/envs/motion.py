@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.env.rendering import (
+from ethbrake_marl.envs.rendering import (
     AHEAD_M,
     BEHIND_M,
     BODY_M,

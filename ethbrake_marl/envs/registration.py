@@ -17,8 +17,8 @@ def register_environments() -> None:
             continue
         gymnasium.register(
             id_,
-            entry_point="ethbrake_marl.env.gymnasium:EthBrakeEnv",
-            vector_entry_point="ethbrake_marl.env.vector:EthBrakeVectorEnv",
+            entry_point="ethbrake_marl.envs.gymnasium:EthBrakeEnv",
+            vector_entry_point="ethbrake_marl.envs.vector:EthBrakeVectorEnv",
         )
     if PETTINGZOO_ID not in pettingzoo.parallel_registry:
         pettingzoo.register("parallel", PETTINGZOO_ID, "ethbrake_marl.ethbrake_v0:parallel_env")

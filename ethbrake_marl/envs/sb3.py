@@ -13,9 +13,9 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from ethbrake_marl.engine.compiled_step import Step
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.memory import Arrays, renew_memory
-from ethbrake_marl.env.draws import Columns
-from ethbrake_marl.env.infos import Begun, Report, plain_rows, shield_columns
-from ethbrake_marl.env.making import (
+from ethbrake_marl.envs.draws import Columns
+from ethbrake_marl.envs.infos import Begun, Report, plain_rows, shield_columns
+from ethbrake_marl.envs.making import (
     INITIAL_STATE,
     AnyScenario,
     action_box,
@@ -24,7 +24,7 @@ from ethbrake_marl.env.making import (
     make_engine,
     warn_of_unknown,
 )
-from ethbrake_marl.env.motion import Viewer
+from ethbrake_marl.envs.motion import Viewer
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.actions import own_actions
 from ethbrake_marl.game.observations import Observation, Observations
