@@ -15,6 +15,7 @@ from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.extensions.cooperation.figures import signed_ticks
+from ethbrake_marl.extensions.report import deceleration as module
 from ethbrake_marl.extensions.report.deceleration import deceleration_curve, deceleration_figure
 from ethbrake_marl.extensions.report.episode_figure import trajectories
 from ethbrake_marl.extensions.report.harm_figures import harm_by_agent, harm_in_parts, regret_distribution
