@@ -20,7 +20,7 @@ from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import CHUNK, HELD, own_versions, policies_of, result_versions, scenario_sha256
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.own_measures import LOADED, REGISTERED, load_measures
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk
 from ethbrake_marl.evaluation.summary import SummaryTable

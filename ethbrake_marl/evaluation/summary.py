@@ -16,7 +16,8 @@ from ethbrake_marl.evaluation.identity import result_versions, scenario_sha256, 
 from ethbrake_marl.evaluation.measures import BASELINE, BELOW, CHOSEN, HORIZON, KNOWN, measures
 from ethbrake_marl.evaluation.outcome import COLUMN, UNSTATED, LeftOut
 from ethbrake_marl.evaluation.own_measures import heading_of, registered_measure
-from ethbrake_marl.extensions.report.tests import PAPER_NOTE, PAPER_PARAMETERS, PAPER_ROWS, TESTS, check_papers_test
+from ethbrake_marl.extensions.report.paper_rows import PAPER_NOTE, PAPER_PARAMETERS, PAPER_ROWS, check_papers_test
+from ethbrake_marl.extensions.report.three_tests import TESTS
 from ethbrake_marl.extensions.search.limits import Limits
 from ethbrake_marl.extensions.search.regret import Between
 from ethbrake_marl.files.sheet import DASH, Column, Estimate, Row, Sheet, Shown, terminal_text

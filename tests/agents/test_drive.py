@@ -17,8 +17,8 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.identity import worlds_sha256
+from ethbrake_marl.evaluation.lineup import FIELD
 from ethbrake_marl.evaluation.motion import follow_episodes
-from ethbrake_marl.evaluation.named_worlds import FIELD
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.extensions.datasets.recording import Task, record_episodes

@@ -12,7 +12,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli import scenario as module
-from ethbrake_marl.evaluation.named_worlds import load_runnable
+from ethbrake_marl.evaluation.trial import load_runnable
 from ethbrake_marl.extensions.search import best_harm, planner
 from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.files.yaml import flow_text, parse_yaml

@@ -19,15 +19,15 @@ import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.exploits import Exploits
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.outcome import IncompleteTable, Outcome
 from ethbrake_marl.evaluation.own_measures import load_measures
 from ethbrake_marl.evaluation.per_world import read_harms, write_per_world
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
 from ethbrake_marl.extensions.report.experiment import results_csv
+from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS, is_papers_test
 from ethbrake_marl.extensions.report.report import Report
-from ethbrake_marl.extensions.report.tests import PAPER_ROWS, is_papers_test
 from ethbrake_marl.extensions.search import limits, shipped
 from ethbrake_marl.extensions.search.limits import Unproven, known_limits, unproven_because
 from ethbrake_marl.extensions.search.regret import KNOWN_OF_WORLDS, Between

@@ -20,17 +20,18 @@ from ethbrake_marl import registry
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput, PhysicsError, Unfamiliar
 from ethbrake_marl.evaluation import chunks, identity
+from ethbrake_marl.evaluation.aftermath import ShovedFront
 from ethbrake_marl.evaluation.chunks import Lineup, evaluate_held, summarise_tally, tally_list
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.exploits import FAR_M
 from ethbrake_marl.evaluation.identity import policy_sha256, scenario_sha256, worlds_sha256
+from ethbrake_marl.evaluation.lineup import make_agents, make_lineup
 from ethbrake_marl.evaluation.measures import measures
-from ethbrake_marl.evaluation.named_worlds import make_agents, make_lineup
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.own_measures import MEASURES, REGISTERED
 from ethbrake_marl.evaluation.per_world import write_per_world
 from ethbrake_marl.evaluation.record import record_episode
-from ethbrake_marl.evaluation.rollout import ShovedFront, chunks_of, drive_chunk, evaluate
+from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk, evaluate
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.evaluation.tally import Tally
 from ethbrake_marl.extensions.report.report import Report

@@ -19,7 +19,7 @@ from ethbrake_marl.cli.evaluate import GROUP_EPISODES
 from ethbrake_marl.engine.profiles import Profiles, profile_problem
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
 from ethbrake_marl.evaluation import chunks, evaluation
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.per_world import write_per_world
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import summarise
@@ -29,7 +29,7 @@ from ethbrake_marl.extensions.proofs.ramped_meetings import onset_states
 from ethbrake_marl.extensions.proofs.team_bound import team_bound
 from ethbrake_marl.extensions.report.harm_figures import harm_in_parts
 from ethbrake_marl.extensions.report.report import avoidable_section, worst_section
-from ethbrake_marl.extensions.report.tests import TESTS
+from ethbrake_marl.extensions.report.three_tests import TESTS
 from ethbrake_marl.extensions.search import shipped
 from ethbrake_marl.extensions.search.best_harm import best_harm, fold_episodes, search_list, task_problem
 from ethbrake_marl.extensions.search.extreme_profiles import KEPT, extreme_profiles

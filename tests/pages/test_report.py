@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 import ethbrake_marl as eb
 from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import AlreadyExists, plain_text
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.report import page as page_module
 from ethbrake_marl.extensions.report.page import Part, Section, read_file
 from ethbrake_marl.extensions.report.report import Report

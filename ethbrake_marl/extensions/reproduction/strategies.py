@@ -10,7 +10,7 @@ from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import Progress
 from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.named_worlds import make_agents
+from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.extensions.reproduction.folder import Reproduction
 from ethbrake_marl.extensions.reproduction.trainings import EARLY, STOPPED
