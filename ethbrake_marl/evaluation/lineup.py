@@ -6,27 +6,20 @@ from collections.abc import Mapping, Sequence
 
 from ethbrake_marl.agents.driving import episode_engine, script_agents
 from ethbrake_marl.agents.protocol import Agent, Driver, Team
-from ethbrake_marl.agents.registry import make_agent, parse_spec, split_specs
+from ethbrake_marl.agents.registry import (
+    agents_of_group,
+    make_agent,
+    parse_spec,
+    settings_needed,
+    shields_with,
+    split_specs,
+)
 from ethbrake_marl.engine.memory import ask_script, begin_script
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.evaluation.familiar import warn_unfamiliar
-from ethbrake_marl.extensions.certified.uncertainty import Uncertainty
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.state import Worlds
 from ethbrake_marl.scenario.schema import Scenario
-
-LADDER = (  # from no decision at all up to the best that is known
-    "coast",
-    "full_brake",
-    "e_v2x_bm:pairwise",
-    "e_v2x_bm",
-    "planner",
-    "best_harm",
-)
-
-FIELD = ("idm", "acc", "cacc", "rss", "r157_human", "r157_fsm", "aeb")  # of other people
-
-_GROUPS = {"ladder": LADDER, "field": FIELD}
 
 
 def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, *, warn: bool = False) -> None:
@@ -55,26 +48,27 @@ def make_lineup(
     scenario: Scenario,
     *,
     harm_count: HarmCount = "first",
-    uncertainty: Uncertainty | None = None,
+    uncertainty: object = None,
     alone: bool = False,
     bare: bool = False,
 ) -> dict[str, Driver]:
     """One fresh agent per spec of ``make_agent``, by its spec, to drive the scenario's learners.
 
-    A text has commas between specs. ``ladder`` stands for every agent of ``LADDER``, ``field`` of ``FIELD``.
-    ``harm_count`` is the harm that optimising and choosing agents minimise. ``uncertainty`` is what agents with
-    ``+robust`` certify against. ``alone``: each drives one vehicle. ``bare``: they go behind a shield, and have none.
+    A text has commas between specs. ``ladder`` and other names of groups stand for several agents.
+    ``harm_count`` is the harm that optimising and choosing agents minimise. ``uncertainty`` is for shields that
+    do not know the world. ``alone``: each drives one vehicle. ``bare``: they go behind a shield, and have none.
     Raises ``InvalidInput`` for a spec given twice, an uncertainty that is missing or that nobody uses, a team or a
     shield that has no place, and what ``make_agent`` raises.
     """
     listed = split_specs(specs) if isinstance(specs, str) else specs
-    specs = [each for spec in listed for each in _GROUPS.get(spec, (spec,))]
+    specs = [each for spec in listed for each in agents_of_group(spec) or (spec,)]
     written = [parse_spec(spec) for spec in specs]
     for k, each in enumerate(written):
         if each in written[:k]:
             raise InvalidInput(f"agent {str(each)!r} is given twice; each agent drives every world once")
-    if uncertainty is not None and not any(each.shield in ("robust", "robust:interior") for each in written):
-        raise InvalidInput(f"uncertainty {uncertainty}: nobody uses it; an agent with +robust does: ppo@PATH+robust")
+    if uncertainty is not None and not any("uncertainty" in settings_needed(each.shield) for each in written):
+        using = "".join(f"; an agent with +{shield} does: ppo@PATH+{shield}" for shield in shields_with("uncertainty"))
+        raise InvalidInput(f"uncertainty {uncertainty}: nobody uses it{using}")
     found = {
         str(each): make_agent(str(each), scenario=scenario, harm_count=harm_count, uncertainty=uncertainty)
         for each in written

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 
 from ethbrake_marl.agents.driving import Episodes, script_agents
-from ethbrake_marl.agents.registry import find_entry, make_agent, make_role, shield_forms
+from ethbrake_marl.agents.registry import (
+    agents_of_group,
+    find_entry,
+    make_agent,
+    make_role,
+    settings_needed,
+    shield_forms,
+)
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.memory import ask_script, begin_script
 from ethbrake_marl.errors import AgentFailed, InvalidInput, check_one_learner
 from ethbrake_marl.evaluation.identity import LIST_SEED
-from ethbrake_marl.evaluation.lineup import LADDER, check_agents
-from ethbrake_marl.extensions.certified.uncertainty import UNCERTAINTY_EXAMPLE
-from ethbrake_marl.extensions.search.best_harm import task_problem
+from ethbrake_marl.evaluation.lineup import check_agents
 from ethbrake_marl.files.yaml import Override, read_yaml
 from ethbrake_marl.physics.state import Ints, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario, scenario_path
 from ethbrake_marl.scenario.roles import ScriptSpec
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.scenario.task import Task
 
 TRIED_CANDIDATES = 16  # of a script that searches, when a scenario is only checked
 
@@ -115,15 +119,16 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
 
 
 def _refusals(scenario: Scenario, worlds: Worlds) -> dict[str, str]:
-    """What refuses the scenario, each asked itself: agents, shields, a search, ``early_impacts: reject``; and why."""
+    """What refuses the scenario, and why. Agents, shields and ``early_impacts: reject`` are asked themselves."""
 
-    def drive_by(spec: str) -> None:
-        agent = make_agent(spec, scenario=scenario, most_candidates=TRIED_CANDIDATES, uncertainty=UNCERTAINTY_EXAMPLE)
-        check_agents({spec: agent}, worlds, scenario)
+    def drive_by(spec: str, needs: Mapping[str, Any]) -> None:
+        check_agents(
+            {spec: make_agent(spec, scenario=scenario, most_candidates=TRIED_CANDIDATES, **needs)}, worlds, scenario
+        )
 
-    asked: dict[str, Callable[[], object]] = {spec: partial(drive_by, spec) for spec in LADDER}
-    asked |= {f"+{shield}": partial(drive_by, f"full_brake+{shield}") for shield in shield_forms()}
-    asked["search_list"] = lambda: task_problem(worlds, Task(scenario, scenario.learners))
+    asked: dict[str, Callable[[], object]] = {spec: partial(drive_by, spec, {}) for spec in agents_of_group("ladder")}
+    for shield in shield_forms():
+        asked[f"+{shield}"] = partial(drive_by, f"full_brake+{shield}", settings_needed(shield))
     asked["early_impacts: reject"] = lambda: scenario.replace(early_impacts="reject")
     refused = {}
     for what, ask in asked.items():

@@ -17,11 +17,11 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.identity import worlds_sha256
-from ethbrake_marl.evaluation.lineup import FIELD
 from ethbrake_marl.evaluation.motion import follow_episodes
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.extensions.datasets.recording import Task, record_episodes
+from ethbrake_marl.extensions.field.controllers import FIELD
 from ethbrake_marl.extensions.report.film import film_scenes
 from ethbrake_marl.extensions.search.around import Searched
 from ethbrake_marl.physics.state import Floats, Worlds

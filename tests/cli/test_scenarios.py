@@ -72,7 +72,7 @@ def test_validate__drives_scripts_and_tells_what_refuses_them(ethbrake: Command,
 
     calm = told_json(tried("own_calm", "--json"))
     assert calm["not_state_free"] == {"vehicle_3": "own_calm"} and not calm["commands_out_of_range"]
-    assert {"e_v2x_bm", "best_harm", "+step", "search_list"} < calm["refused_by"].keys()
+    assert {"e_v2x_bm", "best_harm", "+step"} < calm["refused_by"].keys()
     assert "command is not fixed at the alert" in calm["refused_by"]["+step"]
     assert told_json(tried("own_fixed", "--json"))["refused_by"].keys() == {"+robust:interior", "early_impacts: reject"}
     greedy = tried("own_greedy")

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.measures import BASELINE
+from ethbrake_marl.evaluation.summary import RowsBeside, SummaryTable, summarise
 from ethbrake_marl.extensions.report.three_tests import is_as_shipped
 from ethbrake_marl.scenario.task import Task
 
@@ -72,3 +75,25 @@ def check_papers_test(task: Task, seed: int | None) -> None:
             f" are {'worlds of no known seed' if seed is None else 'a list'} of {task.scenario.name!r};"
             f" {'give evaluate the seed of the list, or ' if seed is None else ''}leave paper out"
         )
+
+
+def summarise_beside_paper(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTable:
+    """``summarise``, with the rows of the paper's tables below; ``InvalidInput`` where they are about another test."""
+    check_papers_test(evaluation.task, evaluation.seed)
+    return SummaryTable(summarise(evaluation, baseline=baseline), _beside())
+
+
+def _beside() -> RowsBeside:
+    rows: list[str | tuple[str, dict[str, str]]] = []
+    for paper in PAPER_ROWS:
+        section = f"paper, {paper.table}"
+        rows += [] if section in rows else [section]
+        texts = {
+            "collision_rate": f"{100 * paper.collision_rate:.4g} %",
+            "first_impact_harm": f"{paper.average_harm:.6g}",
+        }
+        if paper.harm_decrease is not None:
+            texts["harm_decrease_first"] = f"{100 * paper.harm_decrease:.4g} %"
+        rows.append((paper.agent, texts))
+    conditions = [("quiet", f"Paper, {name}: {told}.") for name, told in PAPER_PARAMETERS.items()]
+    return RowsBeside(rows, [*conditions, ("note", PAPER_NOTE)])
