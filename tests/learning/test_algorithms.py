@@ -395,7 +395,7 @@ def test_visit__every_decision_of_every_episode() -> None:
     engine = new_model(TINY_MODES).engine
     _, start = engine.first_moments(20)
     seen, moments = visit(engine.branch(start), _full_brake)
-    assert seen.shape == (len(moments.state), 1, 27)
+    assert seen.shape == (len(moments.motion), 1, 27)
     assert np.array_equal(moments.take(np.arange(20)).state, start.state)
     first = engine.branch(moments.take(np.arange(20))).observe_all(np.array([1]))
     assert np.array_equal(first, seen[:20])
