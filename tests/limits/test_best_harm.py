@@ -30,7 +30,7 @@ from ethbrake_marl.extensions.proofs.team_bound import team_bound
 from ethbrake_marl.extensions.report.harm_figures import harm_in_parts
 from ethbrake_marl.extensions.report.report import avoidable_section, worst_section
 from ethbrake_marl.extensions.report.tests import TESTS
-from ethbrake_marl.extensions.search import shipped
+from ethbrake_marl.extensions.search import limits
 from ethbrake_marl.extensions.search.best_harm import best_harm, fold_episodes, search_list, task_problem
 from ethbrake_marl.extensions.search.extreme_profiles import KEPT, extreme_profiles
 from ethbrake_marl.extensions.search.limits import Unproven, known_limits, prove
@@ -402,7 +402,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, Mock]:
     """What computes each part of the limits, and evaluates, and counts how often it did."""
     found: dict[str, Mock] = {}
     for place, name in (
-        (shipped, "avoidability"), (bounding, "avoidability"), (shipped, "lower_bound"), (shipped, "best_known"),
+        (limits, "avoidability"), (bounding, "avoidability"), (limits, "lower_bound"), (limits, "best_known"),
         (evaluation, "known_limits"), (chunks, "drive_chunk"),
     ):  # fmt: skip
         monkeypatch.setattr(place, name, found.setdefault(name, Mock(wraps=getattr(place, name))))
