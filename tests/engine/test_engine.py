@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.engine.engine import Engine, Moment
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine.state import State
 from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.learners import branches
@@ -338,7 +339,7 @@ def test_branch__without_an_offset_is_what_the_engine_does(learners: list[str]) 
         moments.append(engine.moment())
         rewards.append(step_by_policy(engine).reward[:, engine.learners[last]])
     before = engine.moment()
-    gained, moved = play_to_the_end(engine.branch(Moment.join(moments[:5])), act, no_offsets(30, last), 1.0)
+    gained, moved = play_to_the_end(engine.branch(State.join(moments[:5])), act, no_offsets(30, last), 1.0)
     np.testing.assert_allclose(gained, np.concatenate([np.sum(rewards[k:], axis=0) for k in range(5)]), rtol=1e-12)
     assert (moved == 0.0).all() and gained.min() < 0.0
     assert all((a == b).all() for a, b in zip(before[:4], engine.moment()[:4], strict=True))  # untouched

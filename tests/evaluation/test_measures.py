@@ -28,7 +28,7 @@ from ethbrake_marl.evaluation.summary import SummaryTable, summarise
 from ethbrake_marl.extensions.report.experiment import results_csv
 from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS, is_papers_test, summarise_beside_paper
 from ethbrake_marl.extensions.report.report import Report
-from ethbrake_marl.extensions.search import limits, shipped
+from ethbrake_marl.extensions.search import limits
 from ethbrake_marl.extensions.search.limits import IncompleteTable, Unproven, known_limits, unproven_because
 from ethbrake_marl.extensions.search.regret import KNOWN_OF_WORLDS, Between, limits_of, regrets_of
 from ethbrake_marl.extensions.search.shipped import shipped_tables
@@ -762,7 +762,7 @@ def test_rows_of_the_paper__agree_with_themselves() -> None:
 
 
 def test_proven_of_table__leaves_out_what_cannot_be_advanced() -> None:
-    scenario, table = load_scenario("paper-delay-low"), shipped("paper-delay-low")
+    scenario, table = load_scenario("paper-delay-low"), shipped_table("paper-delay-low")
     worlds, task = scenario.sample(6, 7).worlds, Task(scenario, (1,))
     whole = STUDY.proven_of_table(worlds.take([0, 1, 3, 4, 5]), task, table)
     worlds.gaps_m[2], worlds.speeds_mps[2] = [0.2, -1.0], [10.0, 20.0, 16.0]

@@ -388,15 +388,15 @@ def test_own_worlds__are_those_within_the_margin() -> None:
     gained, _ = drive_from(engine, found.start, _coast, 1.0)
     own = own_worlds(engine, model.plan, found, _coast, 1.0)
     kept = (gained > found.gained - 5.0) & (found.harm > 0.0) & (np.abs(gained - found.gained) > 1e-2)
-    assert 0 < len(own.state) < 64 and np.array_equal(own.state, found.start.state[kept])
+    assert 0 < len(own.motion) < 64 and np.array_equal(own.motion, found.start.motion[kept])
 
 
 def test_visit__every_decision_of_every_episode() -> None:
     engine = new_model(TINY_MODES).engine
     _, start = engine.first_moments(20)
     seen, moments = visit(engine.branch(start), _full_brake)
-    assert seen.shape == (len(moments.state), 1, 27)
-    assert np.array_equal(moments.take(np.arange(20)).state, start.state)
+    assert seen.shape == (len(moments.motion), 1, 27)
+    assert np.array_equal(moments.take(np.arange(20)).motion, start.motion)
     first = engine.branch(moments.take(np.arange(20))).observe_all(np.array([1]))
     assert np.array_equal(first, seen[:20])
 

@@ -31,13 +31,13 @@ from ethbrake_marl.files.store import new_folder, write_file
 from ethbrake_marl.game.objectives import objective_harm, objectives_of
 from ethbrake_marl.policies.network import Policy, dense, load_policy
 from ethbrake_marl.policies.teams import Trained, read_trained
-from ethbrake_marl.training import models, progress as progress_module, random_state
+from ethbrake_marl.training import models, progress as progress_module, random_state, session as train_module
 from ethbrake_marl.training.checkpoint import ARRAYS, NUMBERS, TrainingState, read_checkpoint, write_checkpoint
 from ethbrake_marl.training.models import TrainingDiverged, open_logs
 from ethbrake_marl.training.progress import Course
 from ethbrake_marl.training.recipe import LearningRate, TrainingRecipe, load_recipe
 from ethbrake_marl.training.run_folder import RunDirectory, Training
-from ethbrake_marl.training.session import TrainResult, resume, train as train_module
+from ethbrake_marl.training.session import TrainResult, resume
 from tests.docs.site import load
 from tests.learning.tiny import (
     MODES,

@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from ethbrake_marl.engine.engine import Moment
+from ethbrake_marl.engine.state import State
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.actors import (
     Deterministic,
@@ -201,7 +201,7 @@ class OptionsModel(CounterfactualModel):
         self._n_updates += len(losses)
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
 
-    def _try_actions(self, seen: Float32s, moments: Moment) -> tuple[Float32s, Ints, Floats]:
+    def _try_actions(self, seen: Float32s, moments: State) -> tuple[Float32s, Ints, Floats]:
         """At some decisions: what is seen [B, F], numbers of the actions tried [B, C], and what each costs [B, C].
 
         The first one is the one that the actor takes. ``caution`` is part of the costs.

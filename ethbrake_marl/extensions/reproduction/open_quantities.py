@@ -1,5 +1,5 @@
-"""What the paper leaves open: each quantity, what the paper says of it, our default, alternatives, and how far the
-headline of the random test moves when one of them changes.
+"""Quantities that the paper leaves open: what it says of each, our default, alternatives, and how far the headline of
+the random test moves when one of them changes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What is known of each world whoever drives: whether contact is avoidable, the proven and the best known harm."""
+"""Limits of each world, whoever drives: whether contact is avoidable, the proven and the best known harm."""
 
 from __future__ import annotations
 
