@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from ethbrake_marl.doors import front_door
 
 if TYPE_CHECKING:
+    from ethbrake_marl.agents.protocol import policy_sha256 as policy_sha256
     from ethbrake_marl.evaluation.chunks import (
         Lineup as Lineup,
         evaluate_held as evaluate_held,
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
         EPISODES as EPISODES,
         HELD as HELD,
         LIST_SEED as LIST_SEED,
-        policy_sha256 as policy_sha256,
         result_identity as result_identity,
         result_versions as result_versions,
         worlds_sha256 as worlds_sha256,
