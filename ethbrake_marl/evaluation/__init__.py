@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         make_lineup as make_lineup,
     )
     from ethbrake_marl.evaluation.measures import (
+        MEASURE_SETS as MEASURE_SETS,
         Measure as Measure,
         MeasureSet as MeasureSet,
         Silent as Silent,

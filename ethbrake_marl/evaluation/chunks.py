@@ -21,7 +21,7 @@ from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import CHUNK, own_versions, policies_of, result_versions, scenario_sha256
 from ethbrake_marl.evaluation.lineup import make_lineup
-from ethbrake_marl.evaluation.measures import silent_in_long_lists
+from ethbrake_marl.evaluation.measures import MEASURE_SETS, silent_in_long_lists
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.own_measures import LOADED, REGISTERED, load_measures
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk
@@ -53,6 +53,7 @@ class Lineup:
         uncertainty: what shields do not know that take one, as text.
         measures: that evaluations tell, too, as ``load_measures`` takes them; with those that it was given before.
         told: names of all measures that evaluations tell, whatever is registered later.
+        sets: names of the sets of measures in the process that asks.
         same: what must be the same in every process; see ``Lineup.of``.
         packages: name -> version of each that gave a part to the process that asks: no other may be installed.
 
@@ -64,6 +65,7 @@ class Lineup:
     uncertainty: str | None = None
     measures: tuple[str, ...] = ()
     told: tuple[str, ...] = ()
+    sets: tuple[str, ...] = ()
     same: str = ""
     packages: Mapping[str, str] = field(default_factory=dict)
 
@@ -74,7 +76,8 @@ class Lineup:
         Raises what ``make_lineup`` raises.
         """
         load_measures(how.pop("measures", ()))
-        lineup = cls(tuple(agents), scenario, measures=tuple(LOADED), told=tuple(REGISTERED), **how)
+        sets = tuple(name for name, _ in MEASURE_SETS.items())  # loads them, so that their versions are known
+        lineup = cls(tuple(agents), scenario, measures=tuple(LOADED), told=tuple(REGISTERED), sets=sets, **how)
         made = lineup._make_anew()
         same = lineup._same(made)
         _MADE.clear()
@@ -86,7 +89,9 @@ class Lineup:
         if self.same not in _MADE:
             load_measures(self.measures)
             made = self._make_anew()
-            same = self._same(made) == self.same and {*self.told} <= REGISTERED.keys()
+            same = (
+                self._same(made) == self.same and {*self.told} <= REGISTERED.keys() and {*self.sets} <= {*MEASURE_SETS}
+            )
             if not same or any(_installed(name) != used for name, used in self.packages.items()):
                 raise InvalidInput(
                     "evaluate: a worker has other policies, measures or versions than the process that asks it;"
