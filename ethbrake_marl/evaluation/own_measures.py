@@ -139,6 +139,25 @@ def _tried() -> EpisodeImpacts:
     return EpisodeImpacts.unwritable(worlds, ImpactRows(np.array([0]), np.array([1]), *one))
 
 
+def measure_impacts(episodes: EpisodeImpacts) -> dict[str, Values]:
+    """Every registered measure of these episodes by column, [n]: ``NAME``, or ``NAME_1``, ``NAME_2``, ...
+
+    Raises ``InvalidInput`` that names measure and world.
+    """
+    columns: dict[str, Values] = {}
+    for metric in REGISTERED.values():
+        values = _checked(metric, episodes)
+        if _form(values) != metric.form:
+            raise InvalidInput(
+                f"measure {metric.name!r}: gave {_form(values)}; when it was registered it gave {metric.form}"
+            )
+        if values.ndim == 1:
+            columns[metric.name] = values
+        else:
+            columns |= {f"{metric.name}_{i + 1}": column.copy() for i, column in enumerate(values.T)}
+    return columns
+
+
 class Tape:
     """The steps of a batch of episodes as they are driven (``Watch``), and every impact in them.
 
@@ -167,21 +186,6 @@ class Tape:
         order = np.argsort(columns["world"], kind="stable")
         return ImpactRows(**{name: column[order] for name, column in columns.items()})
 
-    def measured(self) -> dict[str, Values]:
-        """Every registered measure of these episodes by column, [n]: ``NAME``, or ``NAME_1``, ``NAME_2``, ...
-
-        Raises ``InvalidInput`` that names measure and world.
-        """
-        episodes = EpisodeImpacts.unwritable(self.worlds.take(np.arange(self.worlds.n)), self.impacts())
-        found: dict[str, Values] = {}
-        for metric in REGISTERED.values():
-            values = _checked(metric, episodes)
-            if _form(values) != metric.form:
-                raise InvalidInput(
-                    f"measure {metric.name!r}: gave {_form(values)}; when it was registered it gave {metric.form}"
-                )
-            if values.ndim == 1:
-                found[metric.name] = values
-            else:
-                found |= {f"{metric.name}_{i + 1}": column.copy() for i, column in enumerate(values.T)}
-        return found
+    def episodes(self) -> EpisodeImpacts:
+        """What registered measures are computed from."""
+        return EpisodeImpacts.unwritable(self.worlds.take(np.arange(self.worlds.n)), self.impacts())

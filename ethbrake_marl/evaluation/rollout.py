@@ -31,7 +31,7 @@ from ethbrake_marl.evaluation.familiar import warn_unfamiliar
 from ethbrake_marl.evaluation.identity import CHUNK, EPISODES, LIST_SEED, policies_of
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.outcome import LeftOut, Outcome
-from ethbrake_marl.evaluation.own_measures import REGISTERED, Tape
+from ethbrake_marl.evaluation.own_measures import REGISTERED, Tape, measure_impacts
 from ethbrake_marl.physics.left_out import leaving_out_failed
 from ethbrake_marl.physics.state import Ints, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
@@ -205,7 +205,7 @@ def _roll_out(
         outcome,
         shoved_m=None if shoved is None else shoved.metres,
         sampled_harm=None if sampled is None else sampled.finish(),
-        metrics={} if impacts is None else impacts.measured(),
+        metrics={} if impacts is None else measure_impacts(impacts.episodes()),
     )
 
 
