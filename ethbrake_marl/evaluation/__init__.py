@@ -68,10 +68,10 @@ if TYPE_CHECKING:
     )
     from ethbrake_marl.evaluation.summary import (
         RowsBeside as RowsBeside,
-        SummaryRow as SummaryRow,
         SummaryTable as SummaryTable,
         summarise as summarise,
     )
+    from ethbrake_marl.evaluation.summary_row import SummaryRow as SummaryRow
     from ethbrake_marl.evaluation.tally import Tally as Tally
     from ethbrake_marl.evaluation.trial import load_runnable as load_runnable, try_scenario as try_scenario
     from ethbrake_marl.evaluation.varying import drawn_alike as drawn_alike, states_of as states_of

@@ -25,7 +25,7 @@ from ethbrake_marl.evaluation.measures import MEASURE_SETS, silent_in_long_lists
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.own_measures import LOADED, REGISTERED, load_measures
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk
-from ethbrake_marl.evaluation.summary import SummaryTable
+from ethbrake_marl.evaluation.summary import SummaryTable, summarise_sums
 from ethbrake_marl.evaluation.tally import Tally
 from ethbrake_marl.files.python_file import file_sha256
 from ethbrake_marl.game.harm import HarmCount
@@ -196,12 +196,12 @@ def summarise_tally(lineup: Lineup, tally: Tally, seed: int) -> SummaryTable:
     scenario = lineup.scenario
     task = Task(scenario, scenario.learners, lineup.harm_count)
     teams = {name: Team.of(agent, scenario.learners) for name, agent in lineup.make().items()}
-    return SummaryTable.of_tallies(
+    return summarise_sums(
         {name: tally.agents[name] for name in teams},
         Conditions.of_test(task, seed, tally.worlds, tally.silent, Conditions.of_ranges(tally.ranges)),
         silent_in_long_lists(),
-        {name: Knowledge.of(team) for name, team in teams.items()},
-        {name: policies_of(team.drivers) for name, team in teams.items()},
+        knows={name: Knowledge.of(team) for name, team in teams.items()},
+        policies={name: policies_of(team.drivers) for name, team in teams.items()},
         left_out=tally.left_out,
         hidden_share=tally.hidden / tally.worlds,
         worlds_sha256=f"{tally.worlds_hash:064x}",
