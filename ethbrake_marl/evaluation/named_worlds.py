@@ -31,6 +31,7 @@ from ethbrake_marl.scenario.catalogue import load_scenario, scenario_path
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.roles import ScriptSpec
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.tables import worlds_from_table
 from ethbrake_marl.scenario.task import Task
 
 SIZE_LIMIT = 8 << 20  # bytes of it: so many worlds of a long line
@@ -101,7 +102,7 @@ class NamedWorlds(FileModel):
         for k, world in enumerate(self.worlds):
             if world.state.keys() != columns:
                 raise InvalidInput(f"{where}: worlds[{k}].state has other columns than worlds[0]; all need the same")
-        return scenario.worlds_from_table({name: [world.state[name] for world in self.worlds] for name in columns})
+        return worlds_from_table(scenario, {name: [world.state[name] for world in self.worlds] for name in columns})
 
 
 def states_of(worlds: Worlds, scenario: Scenario) -> list[dict[str, float | None]]:
