@@ -85,7 +85,7 @@ def run_command(
             f" {trained.wall_s:.0f} s ({trained.status}). hybrid is the trained policy behind its shield. All minimise"
             f" {count} harm.\n"
         )
-        out.result(result.results, Text(told), result.rows.brief(result.beside), *result.rows.tables()[1:])
+        out.result(result.results, Text(told), result.brief, *result.rows.tables()[1:])
         out.note(f"report, with every measure and the paper's rows: {result.report}")
         _end(out, result.trained)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.extensions.report.shown_worlds import TRAINED_POLICY
 from ethbrake_marl.extensions.reproduction.folder import Reproduction

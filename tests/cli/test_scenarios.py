@@ -12,7 +12,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli import scenario as module
-from ethbrake_marl.evaluation.named_worlds import load_runnable
+from ethbrake_marl.evaluation.trial import load_runnable
 from ethbrake_marl.extensions.search import best_harm, planner
 from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.files.yaml import flow_text, parse_yaml
@@ -73,7 +73,7 @@ def test_validate__drives_scripts_and_tells_what_refuses_them(ethbrake: Command,
 
     calm = told_json(tried("own_calm", "--json"))
     assert calm["not_state_free"] == {"vehicle_3": "own_calm"} and not calm["commands_out_of_range"]
-    assert {"e_v2x_bm", "best_harm", "+step", "search_list"} < calm["refused_by"].keys()
+    assert {"e_v2x_bm", "best_harm", "+step"} < calm["refused_by"].keys()
     assert "command is not fixed at the alert" in calm["refused_by"]["+step"]
     assert told_json(tried("own_fixed", "--json"))["refused_by"].keys() == {"+robust:interior", "early_impacts: reject"}
     greedy = tried("own_greedy")

@@ -20,9 +20,10 @@ from ethbrake_marl.agents.registry import Entry, make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.comparison import compare_results
-from ethbrake_marl.evaluation.named_worlds import NamedWorlds, check_agents, make_lineup
+from ethbrake_marl.evaluation.lineup import check_agents, make_lineup
 from ethbrake_marl.evaluation.per_world import read_result, write_per_world
 from ethbrake_marl.evaluation.statistics import mean, paired_difference, unpaired_difference
+from ethbrake_marl.extensions.studies.named_worlds import NamedWorlds
 from ethbrake_marl.files import python_file
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.policies.shipped import shipped_policies

@@ -16,9 +16,9 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.lineup import make_lineup
+from ethbrake_marl.extensions.report.paper_rows import PAPER_NOTE, PAPER_ROWS
 from ethbrake_marl.extensions.report.style import picture_bytes
-from ethbrake_marl.extensions.report.tests import PAPER_NOTE, PAPER_ROWS
 from ethbrake_marl.extensions.reproduction import pages, strategies, tables as tables_module, verdicts
 from ethbrake_marl.extensions.reproduction.folder import Reproduction, Result, checked_result
 from ethbrake_marl.extensions.reproduction.items import ITEMS

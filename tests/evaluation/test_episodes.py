@@ -22,8 +22,8 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.motion import EpisodeMotion, follow_episodes, state_at
-from ethbrake_marl.evaluation.named_worlds import make_lineup
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.extensions.datasets import minari as minari_module, recording
 from ethbrake_marl.extensions.datasets.minari import env_spec, write_dataset

@@ -24,6 +24,7 @@ from ethbrake_marl.extensions.report.scenario_figures import worlds_figure
 from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
 from ethbrake_marl.extensions.report.style import ShownFigure, label_text, new_figure, picture_bytes, series_style
 from ethbrake_marl.extensions.search.limits import Limits, Proof
+from ethbrake_marl.extensions.search.regret import regrets_of
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.tables import worlds_from_table
@@ -153,7 +154,7 @@ def test_harm_in_parts__add_up_to_the_means(evaluation: Evaluation, figures: dic
 
 def test_regret_distribution__shares_are_those_of_the_worlds(evaluation: Evaluation, pair: Scenario) -> None:
     drawn = regret_distribution(evaluation).axes[0].lines[0]
-    values = evaluation.regrets.regret(evaluation.outcome("full_brake"), "first")
+    values = regrets_of(evaluation).regret(evaluation.outcome("full_brake"), "first")
     assert drawn.get_ydata() == pytest.approx([np.mean(values > x) for x in drawn.get_xdata()])
     assert regret_distribution(evaluate(pair.sample(3, 0), BRAKE, scenario=pair)).axes  # without limits
 

@@ -16,6 +16,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
+from ethbrake_marl.extensions.search.regret import limits_of
 from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.motion import stopping_distances
@@ -273,7 +274,7 @@ def test_search_and_shield__execute_what_they_foresee(slow: Scenario) -> None:
     assert harm["best_harm"].mean() < harm["e_v2x_bm"].mean() < harm["full_brake"].mean()
     assert (harm["constant:2+step"] <= harm["e_v2x_bm"] + 1e-9).all()  # its bound
     assert (harm["constant:2+step"] != harm["e_v2x_bm"]).any()
-    proof = result.limits.proof  # of harm, not of contact
+    proof = limits_of(result).proof  # of harm, not of contact
     assert proof.avoidable is None and (proof.harm <= harm["best_harm"] + 1e-9).all() and proof.harm.mean() > 5.0
 
 

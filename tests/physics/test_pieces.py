@@ -7,7 +7,7 @@ import numpy as np
 import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine.profiles import profile_problem
-from ethbrake_marl.evaluation import named_worlds
+from ethbrake_marl.evaluation import trial
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.state import make_worlds
 from ethbrake_marl.physics.trace import segment_pieces
@@ -98,7 +98,7 @@ def test_role__of_one_piece_is_that_constant_command() -> None:
     assert SOFT.roles["vehicle_1"] == "profile:0=3,1=5"
     assert SOFT.replace() == front("profile:0=3,1=5") == SOFT
     assert (
-        named_worlds.load_runnable("paper-random", read_settings(["roles.vehicle_1=profile:0=3,1=5"]).scenario).roles
+        trial.load_runnable("paper-random", read_settings(["roles.vehicle_1=profile:0=3,1=5"]).scenario).roles
         == SOFT.roles
     )
 

@@ -12,7 +12,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.evaluation.named_worlds import states_of
+from ethbrake_marl.evaluation.varying import states_of
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.extensions.search.limits import prove
 from ethbrake_marl.scenario.fields import QUANTITY

@@ -14,7 +14,7 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import Progress
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import mean, paired_difference
-from ethbrake_marl.extensions.report.tests import PAPER_ROWS
+from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS
 from ethbrake_marl.extensions.reproduction.figures import changes_figure
 from ethbrake_marl.extensions.reproduction.folder import (
     POLICIES,

@@ -21,6 +21,10 @@ _VEHICLES, _DRIVEN = 3, 1
 _DECIDED = ({1}, {1, 2})  # of three vehicles: who is driven where avoidability is proven
 
 
+class IncompleteTable(UserWarning):
+    """A table of best known harm holds some of the worlds asked about, and not the others."""
+
+
 @dataclass(frozen=True, slots=True)
 class Unproven:
     """Nothing is proven for a task in these worlds."""

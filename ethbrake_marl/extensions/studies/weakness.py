@@ -10,9 +10,11 @@ import numpy as np
 
 from ethbrake_marl.agents.protocol import Driver
 from ethbrake_marl.errors import InvalidInput, PhysicsError, unknown_name
-from ethbrake_marl.evaluation.named_worlds import NamedWorld, make_lineup, states_of
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.evaluation.varying import states_of
 from ethbrake_marl.extensions.studies.falsification import Falsified, Watcher, far_apart, search
+from ethbrake_marl.extensions.studies.named_worlds import NamedWorld
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.scenario.ranges import ranges
