@@ -111,25 +111,6 @@ class Document:
         except InvalidInput as error:
             raise type(error)(f"{self.where(path)}: {error}") from None
 
-    def explain(self, error: ValidationError, wording: Wording) -> InvalidInput:
-        """The error where it does not fit its schema.
-
-        The first is shown, unknown keys before all others, and "(and k more mistakes)" tells the rest. A missing
-        key that an unknown one was probably meant to be is not counted.
-        """
-        # A default that needs another field is not made after an error elsewhere: no defect of its own.
-        details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
-        unknown = [d for d in details if d["type"] == "extra_forbidden"]
-        meant = " ".join(suggestion(str(d["loc"][-1]), wording.known(_path(d))) for d in unknown)
-        rest = [d for d in details if d not in unknown and not (d["type"] == "missing" and f" {_path(d)[-1]}" in meant)]
-        shown = (unknown + rest)[0]
-        more = len(unknown) + len(rest) - 1
-        path = _path(shown)
-        absent = shown["type"] == "missing" and len(path) == 1
-        where = self.file if absent else self.where(path)
-        told = f" (and {more} more mistake{'s' * (more > 1)})" if more else ""
-        return InvalidInput(f"{where}: {_describe(shown, path, wording)}{told}")
-
 
 def read_yaml(path: str | Path, limit: int = SIZE_LIMIT) -> Document:
     """Read one YAML file of at most ``limit`` bytes.
@@ -351,6 +332,26 @@ class Wording:
         return ""
 
 
+def explain(document: Document, error: ValidationError, wording: Wording) -> InvalidInput:
+    """The error where it does not fit its schema.
+
+    The first is shown, unknown keys before all others, and "(and k more mistakes)" tells the rest. A missing
+    key that an unknown one was probably meant to be is not counted.
+    """
+    # A default that needs another field is not made after an error elsewhere: no defect of its own.
+    details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
+    unknown = [d for d in details if d["type"] == "extra_forbidden"]
+    meant = " ".join(suggestion(str(d["loc"][-1]), wording.known(_path(d))) for d in unknown)
+    rest = [d for d in details if d not in unknown and not (d["type"] == "missing" and f" {_path(d)[-1]}" in meant)]
+    shown = (unknown + rest)[0]
+    more = len(unknown) + len(rest) - 1
+    path = _path(shown)
+    absent = shown["type"] == "missing" and len(path) == 1
+    where = document.file if absent else document.where(path)
+    told = f" (and {more} more mistake{'s' * (more > 1)})" if more else ""
+    return InvalidInput(f"{where}: {_describe(shown, path, wording)}{told}")
+
+
 def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
@@ -369,7 +370,7 @@ def read_model(source: str | Path | Document, model: type[Model], wording: Wordi
     try:
         return model.model_validate(document.content)
     except ValidationError as error:
-        raise document.explain(error, wording) from None
+        raise explain(document, error, wording) from None
 
 
 def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:

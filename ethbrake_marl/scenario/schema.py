@@ -11,7 +11,7 @@ from pydantic_core import ErrorDetails
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.sheet import Sheet
-from ethbrake_marl.files.yaml import Document, FileSchema, Wording, YamlPath, flow_text, suggestion
+from ethbrake_marl.files.yaml import Document, FileSchema, Wording, YamlPath, explain, flow_text, suggestion
 from ethbrake_marl.scenario.checks import check_whole
 from ethbrake_marl.scenario.declared import ScenarioFields
 from ethbrake_marl.scenario.distributions import DISTRIBUTIONS
@@ -235,7 +235,7 @@ def _build(scenario: Scenario, document: Document) -> None:
     try:
         BaseModel.__init__(scenario, **document.content)
     except ValidationError as error:
-        raise document.explain(error, ScenarioWording(Scenario)) from None
+        raise explain(document, error, ScenarioWording(Scenario)) from None
     scenario._members = members
 
 
