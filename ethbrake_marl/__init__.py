@@ -77,7 +77,7 @@ if TYPE_CHECKING:
     # Training
     from ethbrake_marl.training.recipe import TrainingRecipe as TrainingRecipe, load_recipe as load_recipe
     from ethbrake_marl.training.session import TrainResult as TrainResult, resume as resume, train as train
-    from ethbrake_marl.errors import Progress as Progress
+    from ethbrake_marl.progress import Progress as Progress
 
     # Evaluation
     from ethbrake_marl.evaluation.evaluation import Evaluation as Evaluation

@@ -13,8 +13,9 @@ import typer
 from ethbrake_marl import evaluation, scenario as scenarios, training
 from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, SeedOption, SettingsOption, example
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.sheet import Sheet
-from ethbrake_marl.files.store import new_file, read_plain
+from ethbrake_marl.files.store import new_file
 from ethbrake_marl.files.yaml import flow_text
 
 TRIED_WORLDS = 200  # by `scenario validate`

@@ -35,7 +35,8 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.files.yaml import Document, FileModel, Wording, explain, require
+from ethbrake_marl.files.model import FileModel, Wording, explain, require
+from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.physics.messages import Messages
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Vehicles, Worlds
 
