@@ -19,6 +19,7 @@ from ethbrake_marl.files.yaml import flow_text, parse_yaml
 from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.tables import read_worlds
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
 from tests.cli.conftest import Answer, Command, check_refused, rows_of, told_json
 
@@ -131,7 +132,7 @@ def test_sample__draws_the_worlds_that_evaluate_draws(ethbrake: Command, tmp_pat
     table.write_text(ethbrake("scenario", "sample", "paper-random", *drawn).out)
     (one,) = told_json(ethbrake("evaluate", "--agents", "full_brake", "--json", *drawn))
     paper = eb.load_scenario("paper-random")
-    (row,) = eb.summarise(eb.evaluate(paper.read_worlds(table), "full_brake", scenario=paper))
+    (row,) = eb.summarise(eb.evaluate(read_worlds(paper, table), "full_brake", scenario=paper))
     other = row.to_json()
     assert all(one[name] == other[name] for name in ("first_impact_harm", "worlds_sha256"))
 
@@ -224,7 +225,7 @@ def test_how_to_own_data__its_table_is_read_and_its_distributions_are_valid(tmp_
     paper = load_runnable("paper-random")
     table = re.search(r"```text\n(gap_1_m.*?)```", OWN_DATA, re.DOTALL)
     (tmp_path / "mine.csv").write_text(table[1])
-    vehicles = paper.read_worlds(tmp_path / "mine.csv").vehicles
+    vehicles = read_worlds(paper, tmp_path / "mine.csv").vehicles
     assert (vehicles.mass_t[:, 1].tolist(), vehicles.braking_capacity_mps2[:, 1].tolist()) == ([1.4, 12], [7.5, 5.5])
     blocks = (parse_yaml(text, "page").content for text in re.findall(r"```yaml\n(.*?)```", OWN_DATA, re.DOTALL))
     drawn, typed, rows = blocks

@@ -29,6 +29,7 @@ from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.policies.shipped import shipped_policies
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.tables import read_worlds
 from tests.cli.conftest import Command, check_refused, rows_of, told_json
 from tests.failing_worlds import plant
 
@@ -49,7 +50,7 @@ def test_evaluate__a_world_computed_by_hand(tmp_path: Path) -> None:
     # closing speed squared 10^2 - 2 * 7 * 3 = 58. Vehicle 3 stands 5 km behind. In the second world nobody moves.
     own, out = tmp_path / "mine.csv", tmp_path / "worlds.csv"
     own.write_text("gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps,restitution\n8,5000,0,10,0,0\n8,5000,0,0,0,0\n")
-    found = eb.evaluate(SCENARIO.read_worlds(own), "full_brake", scenario=SCENARIO)
+    found = eb.evaluate(read_worlds(SCENARIO, own), "full_brake", scenario=SCENARIO)
     (row,) = eb.summarise(found)
     told = row.episodes, row.collision_rate.value, row.first_impact_harm.value
     assert told == (2, 0.5, pytest.approx(29.0, rel=1e-12))

@@ -175,10 +175,12 @@ TABLES: dict[str, How] = {
 
 PICTURES: dict[str, How] = {
     "emergency.svg": _by(NIGHTLY, "ethbrake watch --agents full_brake,universal@shipped --output emergency.svg"),
+    "game-loop.svg": _by(BY_HAND),
     "model-": _by(SUITE, "tests/docs/test_studies.py"),
     "deceleration.png": _by(
         NIGHTLY,
         'python -c "import ethbrake_marl as eb; from ethbrake_marl.scenario import Task;'
+        " from ethbrake_marl.extensions.report import deceleration_curve, deceleration_figure, write_picture;"
         " scenario = eb.load_scenario('paper-random');"
         " curve = deceleration_curve(scenario.sample(1, 7, first=5).worlds, Task(scenario, scenario.learners));"
         " figure = deceleration_figure(curve, title='paper-random, world 5 of the list of seed 7');"

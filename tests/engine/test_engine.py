@@ -13,6 +13,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.learners import branches
 from ethbrake_marl.extensions.learners.branches import Offsets, play_to_the_end
 from ethbrake_marl.game.harm import HARM_COUNTS
+from ethbrake_marl.scenario.tables import worlds_from_state
 from tests.physics.random_worlds import line
 
 PAPER = eb.load_scenario("paper-random").replace(early_impacts="keep")
@@ -50,7 +51,7 @@ class Refusing:
 # ---------------------------------------------------------------- what fails changes nothing
 
 # Vehicle 3 of these worlds cannot brake with 5 m/s2.
-WEAK = PAPER.worlds_from_state({"gaps_m": 3, "braking_capacity_mps2": 4, "speeds_mps": 20}).take([0, 0])
+WEAK = worlds_from_state(PAPER, {"gaps_m": 3, "braking_capacity_mps2": 4, "speeds_mps": 20}).take([0, 0])
 
 
 @pytest.mark.parametrize("who", ["script", "watcher", "constant:5"])

@@ -39,6 +39,7 @@ from ethbrake_marl.game.objectives import STANDARD, declared_objectives, parse_o
 from ethbrake_marl.physics.left_out import Impacts
 from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.tables import worlds_from_table
 from ethbrake_marl.scenario.task import Task
 from tests.contract.interfaces import CRASH
 from tests.docs.site import load
@@ -391,7 +392,7 @@ def test_per_world__every_number_reads_back_as_the_same_bits(tmp_path: Path, eva
     assert set(columns["ended"]) == {"at_rest"}
     assert set(rows[0]) == {"agent", "knows", "world", "hidden", "ended", *expected, *KNOWN_OF_WORLDS}
     names = ("gap_1_m", "gap_2_m", "speed_1_mps", "speed_2_mps", "speed_3_mps")
-    again = evaluation.scenario.worlds_from_table({name: columns[name].astype(float) for name in names})
+    again = worlds_from_table(evaluation.scenario, {name: columns[name].astype(float) for name in names})
     assert (
         again.gaps_m.tobytes() == worlds.gaps_m.tobytes() and again.speeds_mps.tobytes() == worlds.speeds_mps.tobytes()
     )
@@ -399,7 +400,7 @@ def test_per_world__every_number_reads_back_as_the_same_bits(tmp_path: Path, eva
 
 def test_per_world__a_quantity_that_differs_between_worlds_has_its_columns(tmp_path: Path, pair: Scenario) -> None:
     columns = {"gap_1_m": [1.0, 1.0], "speed_1_mps": [20.0, 20.0], "speed_2_mps": [20.0, 20.0]}
-    worlds = pair.worlds_from_table({**columns, "latency_2_s": [0.5, 0.25], "mass_1_t": [4.5, 4.5]})
+    worlds = worlds_from_table(pair, {**columns, "latency_2_s": [0.5, 0.25], "mass_1_t": [4.5, 4.5]})
     rows = per_world(evaluate(worlds, BRAKE, scenario=pair), tmp_path)
     told = [(row["latency_2_s"], row["latency_1_s"], row["predicted_harm"], row["chosen_policy"]) for row in rows]
     assert told == [("0.5", "0.0", "", ""), ("0.25", "0.0", "", "")] and "mass_1_t" not in rows[0]

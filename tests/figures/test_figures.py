@@ -27,6 +27,7 @@ from ethbrake_marl.extensions.search.limits import Limits, Proof
 from ethbrake_marl.extensions.search.regret import regrets_of
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.tables import worlds_from_table
 from ethbrake_marl.scenario.task import Task
 from tests.physics.random_worlds import line
 
@@ -50,7 +51,7 @@ def legend(figure: Figure) -> list[str]:
 def world(gap_1: float, gap_2: float) -> eb.Worlds:
     """A world of paper-distance."""
     columns = {"gap_1_m": [gap_1], "gap_2_m": [gap_2], "speed_1_mps": [20.0], "speed_2_mps": [18.0]}
-    return DISTANCE.worlds_from_table({**columns, "speed_3_mps": [20.0]})
+    return worlds_from_table(DISTANCE, {**columns, "speed_3_mps": [20.0]})
 
 
 @pytest.fixture(scope="module")

@@ -47,6 +47,7 @@ from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
 from ethbrake_marl.extensions.search.templates import best_templates
 from ethbrake_marl.game.objectives import scored
 from ethbrake_marl.policies.network import Actor, load_policy
+from ethbrake_marl.scenario.sampling import members_of
 from ethbrake_marl.training.models import TrainingDiverged, make_environment, make_model
 from ethbrake_marl.training.networks import ppo_arguments, tensors_of
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
@@ -577,7 +578,7 @@ def test_options__among_policies_drive_as_alone_and_costs_are_beside_those_usual
     both = model._try_actions(model._last_obs[np.newaxis], start)[2]
     usual = model.policy.usual.numpy()
     assert (usual > 0.0).all() and usual[0] < usual[1]
-    member = line.members_of(8, model.engine.seed, channel="training")
+    member = members_of(line, 8, model.engine.seed, channel="training")
     least = both[order].min(axis=1)
     for m in range(2):  # the first time what is usual is the mean of these
         assert least[member[rows] == m].mean() == pytest.approx(1.0)

@@ -23,7 +23,7 @@ from stable_baselines3.common.logger import Logger
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.train import run_folder
-from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, Progress
+from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.extensions.search import limits, regret
@@ -31,6 +31,7 @@ from ethbrake_marl.files.store import new_folder, write_file
 from ethbrake_marl.game.objectives import objective_harm, objectives_of
 from ethbrake_marl.policies.network import Policy, dense, load_policy
 from ethbrake_marl.policies.teams import Trained, read_trained
+from ethbrake_marl.progress import Progress
 from ethbrake_marl.training import models, progress as progress_module, random_state, session as train_module
 from ethbrake_marl.training.checkpoint import ARRAYS, NUMBERS, TrainingState, read_checkpoint, write_checkpoint
 from ethbrake_marl.training.models import TrainingDiverged, open_logs

@@ -24,6 +24,7 @@ from ethbrake_marl.physics.state import Floats, Ints, Worlds, make_worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.tables import worlds_from_table
 from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield.drivers import ShieldedDriver
 from tests.physics.random_worlds import Draws, line
@@ -324,7 +325,7 @@ def test_shield__of_several_learners_with_one_finite_rate_certifies_every_step(k
 def test_table__of_a_scenario_with_one_of_both_rates_is_read_again(key: str) -> None:
     one = load_scenario("paper-random").replace(**{key: 12})
     drawn = one.sample(3, seed=1).worlds
-    read = one.worlds_from_table(QUANTITY.columns(drawn))
+    read = worlds_from_table(one, QUANTITY.columns(drawn))
     assert np.array_equal(getattr(read.vehicles, key), getattr(drawn.vehicles, key))
 
 

@@ -11,6 +11,7 @@ from ethbrake_marl.evaluation import trial
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.state import make_worlds
 from ethbrake_marl.physics.trace import segment_pieces
+from ethbrake_marl.scenario.tables import read_worlds
 from ethbrake_marl.training.settings import read_settings
 from tests.shield.attacks import line
 
@@ -137,4 +138,4 @@ def test_roles__drive_worlds_of_another_list(empty_folder: Path) -> None:
     assert (harm(SOFT, "e_v2x_bm", PAPER.sample(30, 7)).first_impact_harm == bound).all()
     worlds = SOFT.sample(3, 7).worlds
     Path("rows.csv").write_text("gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps\n7,7,20,18,20\n")
-    assert SOFT.read_worlds("rows.csv").vehicles.pieces.tolist() == worlds.vehicles.pieces[:1].tolist()
+    assert read_worlds(SOFT, "rows.csv").vehicles.pieces.tolist() == worlds.vehicles.pieces[:1].tolist()

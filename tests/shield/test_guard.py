@@ -53,9 +53,9 @@ class Cheating(Engine):
         step = super()._advance(columns)
         rows = self.ended & ~before if self.last_only else ~before
         if self.what == "a step":
-            self._clock[rows, STEP] += 1.0
+            self.state.clock[rows, STEP] += 1.0
         else:
-            self._state[rows, STATE[self.what](self.packed.column)] += 1e-12
+            self.state.motion[rows, STATE[self.what](self.packed.column)] += 1e-12
         return step
 
 

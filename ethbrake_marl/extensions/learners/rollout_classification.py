@@ -34,6 +34,7 @@ from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.state import Floats, Ints
 from ethbrake_marl.policies.manifest import Float32s
 from ethbrake_marl.policies.network import Actor, Layers
+from ethbrake_marl.scenario.sampling import members_of
 from ethbrake_marl.training.networks import ACTIVATIONS
 from ethbrake_marl.training.run_folder import Algorithm, Training
 
@@ -262,8 +263,8 @@ class OptionsModel(CounterfactualModel):
         """What decisions [B] of these rows usually cost in their scenarios [B], to which these costs are added."""
         numbers = self._numbers[rows]
         first = int(numbers.min())
-        drawn = self.engine.scenario.members_of(
-            int(numbers.max()) - first + 1, self.engine.seed, first=first, channel="training"
+        drawn = members_of(
+            self.engine.scenario, int(numbers.max()) - first + 1, self.engine.seed, first=first, channel="training"
         )
         member, usual = drawn[numbers - first], self.policy.usual.numpy()
         for m in np.unique(member):

@@ -17,7 +17,7 @@ import numpy as np
 
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.errors import OnProgress, Progress, Unfamiliar, check_one_learner
+from ethbrake_marl.errors import Unfamiliar, check_one_learner
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import EPISODES, LIST_SEED
 from ethbrake_marl.evaluation.lineup import make_agents
@@ -34,12 +34,14 @@ from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap, 
 from ethbrake_marl.extensions.report.shown_worlds import TRAINED_POLICY
 from ethbrake_marl.extensions.report.style import write_picture
 from ethbrake_marl.extensions.report.three_tests import TESTS, brief, other_tests
+from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.sheet import Sheet, csv_text
-from ethbrake_marl.files.store import read_object, write_output
+from ethbrake_marl.files.store import write_output
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.game.rewards import RewardParams
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.network import Policy
+from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
 from ethbrake_marl.training.recipe import TrainingRecipe

@@ -12,10 +12,12 @@ from pydantic import Field
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.identity import scenario_sha256
-from ethbrake_marl.files.yaml import FileModel, Wording, flow_text, read_model, read_yaml
+from ethbrake_marl.files.model import FileModel, Wording, read_model
+from ethbrake_marl.files.yaml import flow_text, read_yaml
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.state import Worlds
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.tables import worlds_from_table
 
 MOST_NAMED_WORLDS = 1000  # of a file
 
@@ -87,4 +89,4 @@ class NamedWorlds(FileModel):
         for k, world in enumerate(self.worlds):
             if world.state.keys() != columns:
                 raise InvalidInput(f"{where}: worlds[{k}].state has other columns than worlds[0]; all need the same")
-        return scenario.worlds_from_table({name: [world.state[name] for world in self.worlds] for name in columns})
+        return worlds_from_table(scenario, {name: [world.state[name] for world in self.worlds] for name in columns})
