@@ -5,7 +5,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
-from tests.limits.worlds import line, opening, paper_line, random_profiles, wide_worlds
+from tests.fixtures.lines import line, opening, paper_line, random_profiles, wide_worlds
 from tests.reference.avoidability_lp import avoidable_by_lp
 from tests.reference.play_profile import play_profile
 

@@ -42,10 +42,11 @@ from ethbrake_marl.extensions.reproduction.verdicts import (
     summarise_verdicts,
 )
 from ethbrake_marl.files.sheet import Estimate, Sheet
+from tests.fixtures.page import Page
+from tests.fixtures.snapshots import check_snapshot
 from tests.learning.tiny import TINY_PPO
-from tests.pages.hostile import Page
-from tests.studies.conftest import check_snapshot
 
+SNAPSHOTS = Path(__file__).parent / "snapshots"
 HOSTILE = "<script>alert('x')</script>\"|*_\u202e"
 
 
@@ -200,6 +201,12 @@ def test_item__has_verdicts_parameters_tables_and_data(made_of: dict[str, Made],
     assert told.figures or name in ("hybrid-table", "random-table", "learning-high", "learning-low")
 
 
+@pytest.fixture
+def settings(tmp_path: Path) -> Reproduction:
+    """A quick reproduction of few worlds."""
+    return Reproduction("quick", tmp_path / "out", 24, machine="a machine")
+
+
 def test_page__whatever_a_result_says_is_text_and_no_name_leads_elsewhere(settings: Reproduction) -> None:
     own = replace(settings, folder=settings.folder.parent / "<b>out</b>'\"; {{ 7 * 7 }}\u202e")
     (result,), _ = make_items(own, [planted("gaps", lambda s: made(HOSTILE))])
@@ -280,7 +287,7 @@ def test_pages__tell_everything_that_a_result_holds(settings: Reproduction) -> N
     earlier = Page(render_page(own.folder, [checked_result(content, "result.json", "gaps")]))
     page = Page((own.folder / "index.html").read_text("utf-8"))
     texts = "\n\n".join([page.text, earlier.text, docs_page([result])])
-    check_snapshot("reproduction.txt", texts.replace(result.made_utc[:10], "(today)"))
+    check_snapshot(SNAPSHOTS / "reproduction.txt", texts.replace(result.made_utc[:10], "(today)"))
     assert page.open == []
     links = [attributes["href"] for tag, attributes in page.tags if tag == "a"]
     assert "./gaps/data.csv" in links and links.count("#a-title") == 1

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from tests.extensions.certified.test_uncertainty import STANDING
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive, script_agents
@@ -31,7 +32,6 @@ from ethbrake_marl.extensions.certified.uncertainty import Uncertainty, parse_un
 from ethbrake_marl.shield.drivers import ShieldedDriver
 from ethbrake_marl.shield.members import begin_running, plan_harm
 from ethbrake_marl.shield.step import StepShield
-from tests.shield.test_uncertainty import STANDING
 
 STEPS = 81
 PAPER = eb.load_scenario("paper-random")

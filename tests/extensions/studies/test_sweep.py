@@ -25,9 +25,9 @@ from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.training.run_folder import Training
 from ethbrake_marl.training.settings import read_settings
 from tests.cli.conftest import rows_of as read
+from tests.extensions.studies.conftest import TRIALS, Write, study, write_yaml
+from tests.extensions.studies.counting import PROGRAM, ROOT, end_when, finished, holders
 from tests.learning.tiny import marked
-from tests.studies.conftest import TRIALS, Write, study, write_yaml
-from tests.studies.counting import PROGRAM, ROOT, end_when, finished, holders
 
 DOCS = ROOT / "docs"
 
@@ -181,7 +181,7 @@ def test_disturbed_sweep__has_the_same_table(work: str, tiny: Path, write_sweep:
     pytest.importorskip("ray")
     seeds = {"count": 20 if work == "counting" else 6}  # enough that some are left at the last signal
     file = write_sweep(grid={"scenario": "paper-random", "recipe": str(tiny), "seed": seeds})
-    program = {"counting": [sys.executable, "-m", "tests.studies.counting", str(file)]}
+    program = {"counting": [sys.executable, "-m", "tests.extensions.studies.counting", str(file)]}
     program["training"] = [*PROGRAM, "study", "sweep", str(file), "--output"]
     command, folder = [*program[work], str(tmp_path / "out"), "--jobs", "2"], tmp_path / "out"
     alone = [*program[work], str(tmp_path / "alone"), "--jobs", "1"]

@@ -28,7 +28,7 @@ from ethbrake_marl.physics.motion import solo_motion
 from ethbrake_marl.physics.state import Vehicles, Worlds, make_worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.task import Task
-from tests.limits.worlds import (
+from tests.fixtures.lines import (
     REGIONS,
     line,
     moved_profiles,

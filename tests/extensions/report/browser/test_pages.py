@@ -13,9 +13,9 @@ from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.extensions.report.shown_worlds import TRAINED_POLICY
 from ethbrake_marl.extensions.reproduction.folder import Reproduction
 from ethbrake_marl.scenario.catalogue import load_scenario
-from tests.browser.conftest import AGENTS, PAPER, wait_until
-from tests.pages.hostile import HOSTILE
-from tests.pages.test_report import whole_page
+from tests.extensions.report.browser.conftest import AGENTS, PAPER, wait_until
+from tests.extensions.report.test_report import whole_page
+from tests.fixtures.page import HOSTILE
 
 pytestmark = pytest.mark.slow
 Open = Callable[..., Any]

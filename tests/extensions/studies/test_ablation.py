@@ -45,10 +45,13 @@ from ethbrake_marl.shield.drivers import Shielded
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.training.run_folder import Training
 from ethbrake_marl.training.session import train
+from tests.extensions.studies.conftest import ABLATE, LEVELS, study
+from tests.extensions.studies.counting import PROGRAM, end_when
+from tests.fixtures.page import Page
+from tests.fixtures.snapshots import check_snapshot
 from tests.learning.tiny import TINY_PPO
-from tests.pages.hostile import Page
-from tests.studies.conftest import ABLATE, LEVELS, check_snapshot, study
-from tests.studies.counting import PROGRAM, end_when
+
+SNAPSHOTS = Path(__file__).parent / "snapshots"
 
 
 def content(folder: Path) -> dict:
@@ -185,8 +188,8 @@ def test_tables_figures_and_page__show_what_was_found(levels, behind, found) -> 
             ]
             legends = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
             shown.append(repr([texts, labels, legends, figure.get_supxlabel()]))
-    check_snapshot("ablation.txt", "\n\n".join(shown) + "\n")
-    check_snapshot("ablation.json", json.dumps(shielded, indent=1) + "\n")
+    check_snapshot(SNAPSHOTS / "ablation.txt", "\n\n".join(shown) + "\n")
+    check_snapshot(SNAPSHOTS / "ablation.json", json.dumps(shielded, indent=1) + "\n")
     figures = dict(zip(FIGURES, ablation_figures(found, "40 worlds"), strict=True))
     html = ablation_page({**found, "settings": {"seeds": 2, "machine": "</script><b>"}}, "40 worlds.", figures)
     page = Page(html)

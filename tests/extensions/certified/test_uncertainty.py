@@ -12,7 +12,7 @@ from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.drivers import ShieldedDriver
 from ethbrake_marl.shield.members import ShieldReason, plan_harm
 from ethbrake_marl.shield.options import checked_uncertainty
-from tests.limits.worlds import line as one_line
+from tests.fixtures.lines import line as one_line
 from tests.shield.attacks import Hostile, begun, line
 
 EVERY = {

@@ -49,7 +49,7 @@ from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
 from tests.docs.site import load
 from tests.failing_worlds import planted_list, without
-from tests.limits.worlds import line
+from tests.fixtures.lines import line
 from tests.programmes.archives import CERTAIN, ONLY_A_PROBLEM_KNOWS
 
 BUDGET = 800

@@ -23,8 +23,8 @@ from ethbrake_marl.extensions.report.svg import inline_svg
 from ethbrake_marl.extensions.search.regret import regrets_of
 from ethbrake_marl.files.sheet import Column, Sheet, Shown
 from ethbrake_marl.game.harm import HarmCount
+from tests.fixtures.page import HOSTILE, UNSEEN, Page
 from tests.fixtures.pictures import draw_nothing
-from tests.pages.hostile import HOSTILE, UNSEEN, Page
 
 
 def whole_page(text: str) -> str:

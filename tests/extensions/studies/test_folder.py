@@ -21,9 +21,9 @@ from ethbrake_marl.extensions.studies.trainings import TrainingJob, train_all
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.training.recipe import load_recipe
 from ethbrake_marl.training.run_folder import Training
-from tests.studies.conftest import ABLATE, LEVELS
+from tests.extensions.studies.conftest import ABLATE, LEVELS
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 QUESTION = {"seed": 1, "levels": [1, 2], "versions": {"numpy": "2", "torch": "2"}}
 
 
@@ -81,7 +81,7 @@ def test_folder__what_a_killed_writer_left_goes(tmp_path: Path) -> None:
 
 TRAINING = """
 import sys
-from tests.studies.test_folder import tiny_trainings
+from tests.extensions.studies.test_folder import tiny_trainings
 from ethbrake_marl.extensions.studies.trainings import train_all
 
 if __name__ == "__main__":

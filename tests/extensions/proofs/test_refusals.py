@@ -18,7 +18,7 @@ from ethbrake_marl.extensions.search.shipped import TABLES
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.task import Task
-from tests.limits.worlds import line, wide_worlds
+from tests.fixtures.lines import line, wide_worlds
 from tests.programmes.archives import good, packed
 from tests.refused import refused
 

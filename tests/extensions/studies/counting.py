@@ -3,7 +3,7 @@
 It makes so many steps, each a hash of the one before, keeps a checkpoint of each as a training does, and sleeps in
 between, so that many of them disturb nobody.
 
-    python -m tests.studies.counting SWEEP.yaml FOLDER [--jobs N] [--ray ADDRESS]
+    python -m tests.extensions.studies.counting SWEEP.yaml FOLDER [--jobs N] [--ray ADDRESS]
 """
 
 import argparse
@@ -23,7 +23,7 @@ from filelock import FileLock
 from ethbrake_marl.extensions.studies.figures import FIGURES
 from ethbrake_marl.extensions.studies.sweep import RUNS, Row, SweepPlan
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 STEPS, SLEEP_S = 40, 0.01
 
 
@@ -61,7 +61,7 @@ class Counting(SweepPlan):
 
 
 def main() -> int:
-    from tests.studies.counting import Counting as Plan  # by a name that workers know, not of __main__
+    from tests.extensions.studies.counting import Counting as Plan  # by a name that workers know, not of __main__
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("file", type=Path)

@@ -1,6 +1,5 @@
 """Recipes of a second, and one finished folder of each study: none of them is to be changed."""
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,6 @@ import pytest
 import yaml
 
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.extensions.reproduction.folder import Reproduction
 from tests.fixtures.pictures import draw_nothing
 from tests.learning.tiny import TINY_PPO
 
@@ -125,17 +123,3 @@ def write_sweep(tmp_path: Path) -> Write:
 def write_tuning(tmp_path: Path, small_tuning: dict[str, Any]) -> Write:
     """Writes the file of the small tuning, with changes."""
     return lambda **changes: write_yaml(tmp_path / "tuning.yaml", {**small_tuning, **changes})
-
-
-@pytest.fixture
-def settings(tmp_path: Path) -> Reproduction:
-    """A quick reproduction of few worlds."""
-    return Reproduction("quick", tmp_path / "out", 24, machine="a machine")
-
-
-def check_snapshot(name: str, text: str) -> None:
-    """The text is that of ``tests/studies/snapshots/NAME``; with ETHBRAKE_SNAPSHOTS=write it is written there."""
-    file = Path(__file__).parent / "snapshots" / name
-    if os.environ.get("ETHBRAKE_SNAPSHOTS") == "write":
-        file.write_text(text, "utf-8")
-    assert text == file.read_text("utf-8")
