@@ -84,11 +84,8 @@ if TYPE_CHECKING:
     from ethbrake_marl.evaluation.outcome import Outcome as Outcome
     from ethbrake_marl.evaluation.record import EpisodeRecord as EpisodeRecord, record_episode as record_episode
     from ethbrake_marl.evaluation.rollout import evaluate as evaluate
-    from ethbrake_marl.evaluation.summary import (
-        SummaryRow as SummaryRow,
-        SummaryTable as SummaryTable,
-        summarise as summarise,
-    )
+    from ethbrake_marl.evaluation.summary import SummaryTable as SummaryTable, summarise as summarise
+    from ethbrake_marl.evaluation.summary_row import SummaryRow as SummaryRow
     from ethbrake_marl.evaluation.comparison import compare_results as compare_results
     from ethbrake_marl.evaluation.per_world import read_result as read_result
     from ethbrake_marl.evaluation.groups import summarise_by as summarise_by

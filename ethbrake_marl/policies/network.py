@@ -230,6 +230,10 @@ class Policy:
         """Decisions of learners after which it was taken."""
         return self.manifest.steps
 
+    def policy_sha256(self) -> str:
+        """The hash in its manifest."""
+        return self.manifest.manifest_sha256
+
     @property
     def drivers(self) -> dict[str, Policy]:
         """The policy that drives each of its learners."""

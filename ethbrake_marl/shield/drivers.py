@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.driving import Episodes, drive
-from ethbrake_marl.agents.protocol import Agent, Driver, Knowledge, Source, Team, check_agent
+from ethbrake_marl.agents.protocol import Agent, ByPolicy, Driver, Knowledge, Source, Team, check_agent
 from ethbrake_marl.engine.engine import Engine, Guard
 from ethbrake_marl.errors import InvalidInput, renumbered
 from ethbrake_marl.extensions.certified.enclosure import CORNERS
@@ -21,7 +21,7 @@ from ethbrake_marl.shield.paper_hybrid import HybridAgent
 from ethbrake_marl.shield.step import StepShield
 
 
-class ShieldedDriver:
+class ShieldedDriver(ByPolicy):
     """An agent, or a team, behind a shield in mode ``step`` or ``robust``: it proposes, a guard in the engine decides.
 
     Where an agent harms no more than the coupled optimum, rolled out at the alert, it drives unhindered, and its harm

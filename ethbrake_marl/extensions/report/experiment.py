@@ -24,7 +24,8 @@ from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.evaluation.per_world import results_to_json, write_per_world
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.summary import SummaryRow, SummaryTable, summarise
+from ethbrake_marl.evaluation.summary import SummaryTable, summarise
+from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.episode_figure import trajectories
 from ethbrake_marl.extensions.report.page import Part
 from ethbrake_marl.extensions.report.paper_rows import is_papers_test, summarise_beside_paper

@@ -15,9 +15,11 @@ from ethbrake_marl.agents.protocol import Driver
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.notes import identity_line
 from ethbrake_marl.evaluation.shield_modes import ShieldModes, compare_modes
 from ethbrake_marl.evaluation.statistics import mean, rate
-from ethbrake_marl.evaluation.summary import SummaryRow, SummaryTable
+from ethbrake_marl.evaluation.summary import SummaryTable
+from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.harm_figures import harm_by_agent, harm_in_parts, regret_distribution
 from ethbrake_marl.extensions.report.page import Page, Part, Section
 from ethbrake_marl.extensions.report.player import Played
@@ -196,7 +198,7 @@ class Report:
         for title, about, told_rows in self.tests:
             rows = _table_of(told_rows)
             notes = [Part.paragraph(text, "note") for text in _remarks(rows)]
-            told = [_short_table(rows), *notes, *_measured(rows), Part.paragraph(rows.identity_line(), "quiet")]
+            told = [_short_table(rows), *notes, *_measured(rows), Part.paragraph(identity_line(rows), "quiet")]
             sections.append(Section(title, [about, *told]))
             nowhere.intersection_update(_empty(rows))
         unseen = tuple(name for name in sheet.headings[2:] if name in nowhere)
@@ -207,7 +209,7 @@ class Report:
             if any(each.startswith(name) for each in seen) or not any(each.startswith(name) for each in unseen)
         }
         versions = [Part.facts(self.versions)] if self.versions else []
-        versions += [Part.paragraph(all_rows.identity_line(), "quiet")] if all_rows else []
+        versions += [Part.paragraph(identity_line(all_rows), "quiet")] if all_rows else []
         sections += [
             Section("How to read the tables", [Part.facts(meanings)]),
             Section("Settings and seeds", [Part.facts(self.settings)] if self.settings else ()),
