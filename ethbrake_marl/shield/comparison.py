@@ -8,7 +8,8 @@ import numpy as np
 
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.state import Bools, Floats, Worlds
-from ethbrake_marl.shield.members import Running, ends_of_plans
+from ethbrake_marl.shield.certify import ends_of_plans
+from ethbrake_marl.shield.running import Running
 
 SLACK = 1e-9  # by more than this (m, m/s) a world lies outside what several members predict; one member is exact
 

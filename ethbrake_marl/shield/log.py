@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.physics.state import Floats, Ints
-from ethbrake_marl.shield.members import Backup, Decision, Running
+from ethbrake_marl.shield.certify import Backup, Decision
+from ethbrake_marl.shield.running import Running
 
 
 class Intervention(NamedTuple):

@@ -13,8 +13,7 @@ from ethbrake_marl.envs.pettingzoo import SeededInside
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.state import Bools
-from ethbrake_marl.shield.options import Proposing
-from ethbrake_marl.shield.paper_hybrid import Attached
+from ethbrake_marl.shield.attach import Attached, Proposing
 
 
 class ShieldedVecEnv(SeededInside, VecEnvWrapper):

@@ -21,9 +21,9 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.state import Bools, Floats
 from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.shield.attach import Attached, Proposing
 from ethbrake_marl.shield.drivers import ShieldedDriver, shielded
-from ethbrake_marl.shield.options import Proposing
-from ethbrake_marl.shield.paper_hybrid import Attached, HybridAgent
+from ethbrake_marl.shield.paper_hybrid import HybridAgent
 
 Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # what a step of the environment returns
 

@@ -15,7 +15,7 @@ from ethbrake_marl.extensions.search.best_harm import best_harm, chunks_left
 from ethbrake_marl.extensions.studies.trainings import Timed, train_all
 from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shield.drivers import Shielded
+from ethbrake_marl.shield.episodes import Shielded
 from ethbrake_marl.training.run_folder import RunDirectory
 
 

@@ -27,7 +27,7 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shield.drivers import Shielded
+from ethbrake_marl.shield.episodes import Shielded
 from ethbrake_marl.training.run_folder import RunDirectory, Training
 
 
