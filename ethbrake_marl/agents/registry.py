@@ -285,7 +285,7 @@ def make_agent(
         harm_count: which harm an optimising agent minimises, ``first`` or ``total``.
         horizon_s: until when it looks ahead, s; None: the scenario's horizon, or 8 s.
         most_candidates: for trying an agent out: no search of it takes more.
-        uncertainty: what a robust shield does not know, such as ``"gaps_m=0.5"``.
+        uncertainty: what a shield that certifies uncertain worlds does not know, such as ``"gaps_m=0.5"``.
         time_step_s: between two decisions of what searches or follows a law; None: the scenario's, or 0.1 s.
 
     Raises ``UnknownName`` with a suggestion for an unknown name, ``InvalidInput`` for a bad argument, harm count or
@@ -413,6 +413,12 @@ def shield_forms() -> tuple[str, ...]:
         return each.rpartition(":")[2] in variants_of(each.partition(":")[0])
 
     return tuple(each for each in around_forms() if not (_around(each).inner or is_variant(each)))
+
+
+def around_one_vehicle() -> list[str]:
+    """The names of all that goes around an agent but not around a team: first what goes inside a shield."""
+    return [entry.name for inner in (True, False) for entry in _SHIELDS.usable().values()
+            if entry.inner is inner and not entry.teams]  # fmt: skip
 
 
 def shield_names() -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from ethbrake_marl.shield.options import ShieldOptions, read_options
 
 
 def proposing_agent(policy: object, where: str) -> Agent:
-    """An agent as it is, a loaded policy as an agent. Raises ``InvalidInput`` for anything else."""
+    """The policy as an agent; an agent is returned as it is. Raises ``InvalidInput`` for anything else."""
     if not isinstance(policy, type):
         if isinstance(policy, Agent):
             return policy
@@ -32,9 +32,9 @@ def proposing_agent(policy: object, where: str) -> Agent:
 def proposing_agents(
     policy: Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy], vehicles: Sequence[int], where: str
 ) -> dict[int, Agent]:
-    """Who proposes for each shielded vehicle: a team, policies by name of vehicle, or one for all.
+    """The agent that proposes for each shielded vehicle, from a team, policies by name of vehicle, or one for all.
 
-    Raises ``InvalidInput`` for what is none of these, and a team of other vehicles.
+    Raises ``InvalidInput`` for anything else, and for a team of other vehicles.
     """
     if isinstance(policy, Team):
         given: dict[int, Agent] = policy.drivers
@@ -55,7 +55,7 @@ Proposing = Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy]
 
 
 def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -> ShieldGuard:
-    """The guard of the options' mode for all learners of an engine, who proposes among them.
+    """The guard of these options for all learners of an engine. ``policy`` proposes where the caller does not.
 
     Raises ``InvalidInput`` where nobody learns, for several learners in another mode than ``step``, and for what is no
     policy.
@@ -108,7 +108,7 @@ class Attached:
 
     @property
     def memory(self) -> Guarded:
-        """What the guard remembers now, or, once it was closed, remembered last."""
+        """The guard's memory now; once it was closed, its last one."""
         memory: Guarded | None = self.engine.guarded if self.engine.guard is self.guard else self._left
         return Guarded(None, {}) if memory is None else memory
 
@@ -116,7 +116,7 @@ class Attached:
     def shield(self) -> Any:
         """As it is now, to be read; None before a reset.
 
-        A ``StepShield`` or ``BelievedShield``; in mode ``episode`` what the ``HybridAgent`` remembers.
+        A ``StepShield``, or the shield of another mode; in mode ``episode`` the memory of the ``HybridAgent``.
         """
         return self.memory.shield
 
@@ -135,13 +135,13 @@ class Attached:
             raise InvalidInput(f"{self.options.where}: this shield was closed; put a new one around the environment")
 
     def close(self) -> None:
-        """Let go of the engine."""
+        """Take the guard out of the engine."""
         if self.engine.guard is self.guard:
             self._left = self.memory
             self.engine.protect(None)
 
     def penalty(self) -> Floats:
-        """What the interventions of the last step take off the rewards, [n, L]."""
+        """The penalty of the last step's interventions, to be taken off the rewards, [n, L]."""
         self.check_open()
         ruling = self.engine.ruling
         if ruling is None:

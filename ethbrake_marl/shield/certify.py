@@ -1,7 +1,8 @@
-"""The members of a world, advanced decision by decision under the actions of the vehicles that are shielded.
+"""``certify``: is there a plan behind the proposed action that keeps the budget? If not, apply the backup's action.
 
-A world has M members, worlds that must all keep the bound: one without uncertainty, then nothing here costs more. K
-of its vehicles are shielded; an action is a row [K], a plan [L, K] holds one for each decision.
+A plan is tried in every member of a world, one after the other, with the kernels of ``members``. After the proposal
+these plans are tried: the rest of the current plan, then the best constant action. ``step`` says why the harm of the
+episode then stays within the first bound.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from ethbrake_marl.shield.reasons import (
 )
 from ethbrake_marl.shield.running import Running, put
 
-APPLIED, REASON, BOUND, MARGIN = range(4)  # columns of what is told of each vehicle
+APPLIED, REASON, BOUND, MARGIN = range(4)  # columns of a decision, of each vehicle
 
 NEARLY = 1e-9  # a constant whose harm (m2/s2) in one segment is above the limit by less is certified step by step
 
@@ -275,15 +276,15 @@ CONSTANTS = tuple(-k / 10 for k in range(11))  # actions that are tried as const
 
 
 class Backup(NamedTuple):
-    """What is executed if nothing else is certified."""
+    """The plan that is executed where nothing else is certified."""
 
     plan: Floats  # [n, L] or [n, L, K] actions, column j for decision j
-    harm: Floats  # [n] of the episode if it is executed from now on, in the worst member (m2/s2)
+    harm: Floats  # [n] of the episode, in the worst member, if the plan is executed from now on (m2/s2)
     constants: Floats = np.array(CONSTANTS)  # [C] or [C, K] actions that may replace the rest of a plan
 
 
 class Decision(NamedTuple):
-    """What is applied, why, and what holds from now on."""
+    """The applied actions, the reasons, and the bound and plan that hold from now on."""
 
     applied: Floats  # [n] or [n, K] actions in [-1, 1]
     intervened: Bools  # [n] or [n, K] what is applied is not what was proposed (clipped)
@@ -300,7 +301,7 @@ class Decision(NamedTuple):
         return np.array(texts).reshape(self.reason.shape)
 
     def put(self, rows: Ints, other: Decision, taken: Ints) -> Decision:
-        """A copy in which some worlds, with the plans and bounds that go on, are those ``taken`` from another one."""
+        """A copy with some worlds taken from another decision: ``rows`` of this one are ``taken`` of the other."""
         columns: dict[str, Any] = {
             name: put(getattr(self, name), rows, getattr(other, name)[taken]) for name in self._fields[:5]
         }
@@ -315,15 +316,15 @@ class Decision(NamedTuple):
 
 
 def plan_harm(running: Running, plan: Floats) -> Floats:
-    """Harm of the episodes, in the worst member, if the plans are executed from here, [n] m2/s2; whoever bears it.
+    """Harm of the episodes in the worst member if the plans are executed from here, [n] m2/s2, caps aside.
 
-    It is to the engine's bits.
+    It equals the engine's to the bit.
     """
     return bettered_plan(running, plan, np.zeros(0))[1]
 
 
 def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Floats, Floats]:
-    """The plans, or where it harms less in the worst member the best of the constant actions; and that harm."""
+    """The plans, or the best constant action where it harms less in the worst member; and that harm."""
     value = np.empty(running.n)
     _check_plan(running, plan)
     plans = np.array(plan, np.float64, order="C")
@@ -335,17 +336,23 @@ def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Fl
 
 
 def from_now(past: Floats, later: Floats | float, steps: Ints) -> Floats:
-    """The plans that are ``past`` before the decisions ``steps`` [n], which was applied, and ``later`` after."""
+    """Plans with the actions of ``past``, which were applied, before the decisions ``steps`` [n], then ``later``."""
     made = np.arange(past.shape[1]) < steps[:, np.newaxis]
     return np.where(made if past.ndim == 2 else made[:, :, np.newaxis], past, later)
 
 
 def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) -> Decision:
-    """Decide in every world which proposed actions ([n], or [n, K]) are applied, and where the backup's; see the claim.
+    """Decide in every world which proposed actions are applied, and where the backup's; no argument is changed.
 
-    ``budget`` [n] is the harm that is guaranteed, at least the backup's. A proposal beyond [-1, 1] is clipped first;
-    one that is no number is replaced. Nothing given is changed. Raises ``InvalidInput`` for shapes that do not fit or a
-    budget below the backup's harm, ``PhysicsError`` naming the worlds that cannot be advanced by what would be applied.
+    Args:
+        running: the episodes, at this decision.
+        proposed: actions [n] or [n, K]. One beyond [-1, 1] is clipped first; one that is no number is replaced.
+        backup: the plan that is applied where a proposal has no certificate, and its harm.
+        budget: the harm [n] that is guaranteed, at least the backup's.
+
+    Raises ``InvalidInput`` for shapes that do not fit or a budget below the backup's harm, ``PhysicsError`` naming the
+    worlds that cannot be advanced by what would be applied.
+
     """
     n, problem, vehicles = running.n, running.problem, len(running.problem.vehicles)
     _check_plan(running, backup.plan)

@@ -1,4 +1,4 @@
-"""Drivers behind a shield, in evaluations: what they did, and what the shield did to them, world by world."""
+"""Episodes of a driver behind a step shield: harm, bound, and replaced decisions, world by world."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ CHUNK = 500  # worlds advanced together: bounds memory, changes no result
 class Shielded(NamedTuple):
     """Episodes behind a step shield: n worlds (any axes before), N vehicles, K of them shielded."""
 
-    harm: Floats  # [n] of the count that is guarded (m2/s2)
-    vehicle_harm: Floats  # [n, N] what each vehicle bears of it
-    bound: Floats  # [n] that was told at the alert, with the allowance
-    baseline: Floats  # [n, N] what each vehicle bears under the baseline plan
-    replaced: Ints  # [n, K] decisions of each shielded vehicle that were replaced
-    decisions: Ints  # [n] of each of them
+    harm: Floats  # [n] under the guarded count (m2/s2)
+    vehicle_harm: Floats  # [n, N] the share of it that each vehicle bears
+    bound: Floats  # [n] at the alert, with the allowance
+    baseline: Floats  # [n, N] harm that each vehicle bears under the baseline plan
+    replaced: Ints  # [n, K] replaced decisions of each shielded vehicle
+    decisions: Ints  # [n] decisions of each shielded vehicle
     moving: Bools  # [n] the horizon cut the episode off
 
     @staticmethod
     def of(episodes: Episodes, task: Task) -> Shielded:
-        """What a step shield did in these episodes."""
+        """The episodes of a driver behind a step shield, once they have ended."""
         shield: StepShield = episodes.guarded.shield
         assert shield.running is not None
         return Shielded(
@@ -45,22 +45,25 @@ class Shielded(NamedTuple):
         )
 
     @staticmethod
-    def driven(driver: Driver, worlds: Worlds, task: Task, **settings: Any) -> Shielded:
-        """A copy of the ``driver`` drives every world behind a step shield, ``CHUNK`` at a time; as ``around``."""
-        parts = []
-        for first in range(0, worlds.n, CHUNK):
-            rows = np.arange(first, min(first + CHUNK, worlds.n))
-            with renumbered(rows):
-                episodes = drive(worlds.take(rows), ShieldedDriver.around(driver, task, **settings), task.scenario)
-            parts.append(Shielded.of(episodes, task))
-        return Shielded.join(parts)
-
-    @staticmethod
     def join(parts: Sequence[Shielded]) -> Shielded:
-        """Consecutive worlds as one."""
+        """The worlds of all parts, one after the other."""
         return Shielded(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
     @staticmethod
     def stack(parts: Sequence[Shielded]) -> Shielded:
-        """Several drivers in the same worlds, on an axis in front."""
+        """Several drivers in the same worlds, on a new first axis."""
         return Shielded(*(np.stack(columns) for columns in zip(*parts, strict=True)))
+
+
+def drive_shielded(driver: Driver, worlds: Worlds, task: Task, **settings: Any) -> Shielded:
+    """Drive a copy of the ``driver`` behind a step shield through every world, ``CHUNK`` worlds at a time.
+
+    ``settings`` are those of ``ShieldedDriver``.
+    """
+    parts = []
+    for first in range(0, worlds.n, CHUNK):
+        rows = np.arange(first, min(first + CHUNK, worlds.n))
+        with renumbered(rows):
+            episodes = drive(worlds.take(rows), ShieldedDriver.around(driver, task, **settings), task.scenario)
+        parts.append(Shielded.of(episodes, task))
+    return Shielded.join(parts)

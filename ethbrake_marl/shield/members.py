@@ -1,7 +1,7 @@
-"""The members of a world, advanced decision by decision under the actions of the vehicles that are shielded.
+"""One member of a world, advanced decision by decision with the operations of the engine's step, in their order.
 
-A world has M members, worlds that must all keep the bound: one without uncertainty, then nothing here costs more. K
-of its vehicles are shielded; an action is a row [K], a plan [L, K] holds one for each decision.
+A world has M members, possible worlds that must all keep the bound; usually it is its only one, and then nothing here
+costs more. K of its vehicles are shielded. An action is a row [K]; a plan [L, K] holds one for each decision.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from ethbrake_marl.physics.rows import ROW, place_rates, rows_for
 from ethbrake_marl.physics.state import Bools, Floats, Ints
 from ethbrake_marl.shield.running import Running
 
-# rows of the lines: command of those that are not shielded (m/s2), latency (s), mass (t), speed limit (m/s), rates at
-# which brakes build up and are released (m/s3), and the harm that each vehicle may bear (m2/s2), a row that is missing
-# where there is no such limit
+# Rows of the lines: command of the vehicles without a shield (m/s2), latency (s), mass (t), speed limit (m/s), rates at
+# which brakes build up and are released (m/s3), and the most harm that each vehicle may bear (m2/s2). Without such a
+# limit the last row is missing.
 OF_COMMAND, OF_LATENCY, OF_MASS, OF_LIMIT, OF_BRAKE_RATE, OF_RELEASE_RATE, OF_CAP = range(7)
 
 

@@ -1,4 +1,4 @@
-"""Why a shield accepted or replaced an action."""
+"""The reasons for which a shield accepts or replaces an action."""
 
 from __future__ import annotations
 
@@ -30,5 +30,5 @@ class ShieldReason(IntEnum):
         return self.name.lower().replace("_", " ")
 
 
-# those that kernels give
+# The codes that kernels give, as plain integers.
 SAME_AS_PLAN, PLAN_REMAINS, CONSTANT, NO_CERTIFICATE, NOT_A_NUMBER, ENDED = map(int, list(ShieldReason)[1:7])

@@ -1,8 +1,4 @@
-"""The members of a world, advanced decision by decision under the actions of the vehicles that are shielded.
-
-A world has M members, worlds that must all keep the bound: one without uncertainty, then nothing here costs more. K
-of its vehicles are shielded; an action is a row [K], a plan [L, K] holds one for each decision.
-"""
+"""Running episodes at a decision, as a shield knows them: the state that it certifies from."""
 
 from __future__ import annotations
 
@@ -17,22 +13,21 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 
 class Running(NamedTuple):
-    """Running episodes at a decision, as the shield knows them: n worlds with M members each (``shield.uncertainty``).
+    """Running episodes at a decision: n worlds with M members each; M is 1 unless possible worlds are given.
 
-    World k's members are the rows k * M to k * M + M - 1, the nominal one first; without uncertainty M is 1. Of several
-    shielded vehicles, proposals and actions are [n, K], and plans [n, L, K]; of one they are [n] and [n, L], or [n, 1]
-    and [n, L, 1].
+    The members of world k are the rows k * M to k * M + M - 1, the nominal one first. Of several shielded vehicles,
+    proposals and actions are [n, K], and plans [n, L, K]. Of one they are [n] and [n, L], or [n, 1] and [n, L, 1].
     """
 
     problem: ProfileProblem  # parameters, commands of the others, grid of decisions; K vehicles; n * M rows
-    states: Floats  # [n * M, S] of ``physics.kernel``: speeds, gaps, hit flags, both harms so far, forces
+    states: Floats  # [n * M, S] as ``physics.episode.save`` leaves them: speeds, gaps, hit flags, harms so far, forces
     steps: Ints  # [n] number of the decision
     ended: Bools  # [n * M]
     caps: Floats = np.zeros((0, 0))  # [n * M, N] most harm that each vehicle may bear (m2/s2); [0, 0]: any
 
     @property
     def uncapped(self) -> Running:
-        """The same, whoever bears the harm."""
+        """The same episodes without caps."""
         return self._replace(caps=np.zeros((0, 0)))
 
     @property

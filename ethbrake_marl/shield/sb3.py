@@ -76,6 +76,6 @@ class ShieldedVecEnv(SeededInside, VecEnvWrapper):
         self.class_attributes = dict(inspect.getmembers(self.__class__))
 
     def close(self) -> None:
-        """Let go of the environment, and close it."""
+        """Take the shield off the environment, and close that."""
         self.attached.close()
         super().close()

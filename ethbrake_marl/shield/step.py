@@ -54,8 +54,8 @@ from ethbrake_marl.shield.checks import check_amount, check_scenario
 from ethbrake_marl.shield.comparison import SLACK, ends_under
 from ethbrake_marl.shield.first_plan import best_constants, joint_constants
 from ethbrake_marl.shield.log import Intervention, interventions
-from ethbrake_marl.shield.reasons import NO_CERTIFICATE, ShieldReason
-from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts, rolled_out
+from ethbrake_marl.shield.reasons import ShieldReason
+from ethbrake_marl.shield.rollouts import Proposer, certify_by_policy, rolled_out
 from ethbrake_marl.shield.running import Running, begin_running, put
 
 Cap = Literal["baseline"]  # whose plan a vehicle's harm is the most that it may bear
@@ -336,14 +336,8 @@ class StepShield:
         given[self.distrusted] = np.nan
         held, budget = self.backup, self.bound
         decision = certify(now, given, held, budget)
-        rejected = (decision.reason == NO_CERTIFICATE).reshape(len(asked), -1).any(axis=1)
-        if proposer is not None and (rows := np.flatnonzero(rejected)).size:
-            found = certify_rollouts(now, given, rows, budget, held.plan, proposer)
-            margin, plan = decision.margin.copy(), found.backup.plan
-            margin[rows] = np.maximum(margin[rows], found.margin)
-            assert (plan == from_now(decision.backup.plan[rows], plan, found.after.steps - 1)).all()  # one past
-            kept = np.flatnonzero((found.reason != NO_CERTIFICATE).reshape(len(rows), -1).all(axis=1))
-            decision = decision._replace(margin=margin).put(rows[kept], found._replace(margin=margin[rows]), kept)
+        if proposer is not None:
+            decision = certify_by_policy(decision, now, given, budget, held.plan, proposer)
         decision = self._also_certified(now, held, budget, decision, asked & ~self.distrusted)
         decision.reason[asked & self.distrusted] = ShieldReason.ASSUMPTION_BROKEN
         decision.applied[goes_on] = -1.0  # its episode was to be over: it holds the brakes

@@ -15,7 +15,7 @@ from ethbrake_marl.shield import episodes as episodes_module
 from ethbrake_marl.shield.certify import Backup, certify, plan_harm
 from ethbrake_marl.shield.comparison import ends_under
 from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.episodes import Shielded
+from ethbrake_marl.shield.episodes import Shielded, drive_shielded
 from ethbrake_marl.shield.first_plan import joint_constants
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
 from ethbrake_marl.shield.reasons import ShieldReason
@@ -504,7 +504,7 @@ def test_drive_chunks__is_what_the_shielded_team_does_whatever_the_chunk(monkeyp
     for _ in range(2):  # a second batch begins anew
         episodes = drive(worlds, team.on((1, 2)), PAIR)
         ledger, shield = episodes.ledger, episodes.guarded.shield
-        whole = Shielded.driven(eb.make_agent("coast"), worlds, task)
+        whole = drive_shielded(eb.make_agent("coast"), worlds, task)
         assert whole.harm.tolist() == ledger.world_harm("total").tolist() == shield.bound.tolist()
         assert whole.vehicle_harm.tolist() == ledger.vehicle_harm("total").tolist() == shield.shares().tolist()
         assert whole.bound.tolist() == shield.predicted_harm.tolist() and (whole.harm <= whole.bound).all()
@@ -514,7 +514,7 @@ def test_drive_chunks__is_what_the_shielded_team_does_whatever_the_chunk(monkeyp
     assert whole.replaced.tolist() == logged.tolist() and (logged.sum(axis=0) > 0).all()
     assert (whole.replaced <= whole.decisions[:, np.newaxis]).all()
     monkeypatch.setattr(episodes_module, "CHUNK", 5)
-    parts = Shielded.driven(eb.make_agent("coast"), worlds, task)
+    parts = drive_shielded(eb.make_agent("coast"), worlds, task)
     assert all(np.array_equal(*columns) for columns in zip(whole, parts, strict=True))
     assert Shielded.stack([whole, parts]).replaced.shape == (2, 12, 2)
 

@@ -1,4 +1,4 @@
-"""What this extension puts into the registry: the shield ``+robust``, and ``:believed`` behind agents and shields."""
+"""The registry entries of this extension: the shield ``+robust``, and ``:believed`` behind agents and shields."""
 
 from __future__ import annotations
 
