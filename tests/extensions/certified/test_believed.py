@@ -164,7 +164,8 @@ def test_parallel__does_what_the_agent_of_evaluations_does(scenario: eb.Scenario
         assert sum(each["intervened"] for each in told) == shield.interventions[0]
         assert told[1]["bound_harm"] <= shield.predicted_harm[0]
         assert all(
-            (each["mode"], each["trusted"], "members" in each) == (eb.ShieldMode[mode.upper()], *2 * [mode == "robust"])
+            (each["mode"], each["trusted"], "members" in each)
+            == ({"step": 1, "robust": 2}[mode], *2 * [mode == "robust"])
             for each in told
         )
 

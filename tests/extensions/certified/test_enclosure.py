@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from tests.extensions.certified.test_uncertainty import STANDING
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive, script_agents
@@ -27,11 +26,13 @@ from ethbrake_marl.extensions.certified.affine import (
 )
 from ethbrake_marl.extensions.certified.enclosure import Known, cell_of, wait
 from ethbrake_marl.extensions.certified.paths import go_on, may_meet_unseen, meet, new_stack
+from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.touching import backwards, bounce, stray
 from ethbrake_marl.extensions.certified.uncertainty import Uncertainty, parse_uncertainty
+from ethbrake_marl.shield.certify import plan_harm
 from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.members import begin_running, plan_harm
-from ethbrake_marl.shield.step import StepShield
+from ethbrake_marl.shield.running import begin_running
+from tests.extensions.certified.test_uncertainty import STANDING
 
 STEPS = 81
 PAPER = eb.load_scenario("paper-random")
@@ -250,7 +251,7 @@ def test_bound__more_parts_never_make_it_worse():
 
 def test_shield__coasting_stays_within_the_bound_in_every_world_of_the_box():
     worlds, uncertainty = PAPER.sample(2, 7, first=11).worlds, parse_uncertainty("gaps_m=0.5")
-    shield = StepShield(PAPER, 1, uncertainty=uncertainty, robust="interior")
+    shield = RobustShield(PAPER, 1, uncertainty=uncertainty, robust="interior")
     shield.begin(worlds, np.arange(2))
     told, kept = [shield.bound.copy()], 0
     while not shield.running.finished.all():

@@ -7,11 +7,12 @@ import pytest
 
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.extensions.certified.options import checked_uncertainty
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.certify import plan_harm
 from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.members import ShieldReason, plan_harm
-from ethbrake_marl.shield.options import checked_uncertainty
+from ethbrake_marl.shield.reasons import ShieldReason
 from tests.fixtures.lines import line as one_line
 from tests.shield.attacks import Hostile, begun, line
 

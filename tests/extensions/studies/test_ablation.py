@@ -41,7 +41,7 @@ from ethbrake_marl.extensions.studies.trainings import TrainingJob
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.scenario.catalogue import load_scenario, scenario_path
 from ethbrake_marl.scenario.sample import Sample
-from ethbrake_marl.shield.drivers import Shielded
+from ethbrake_marl.shield.episodes import Shielded
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.training.run_folder import Training
 from ethbrake_marl.training.session import train
