@@ -64,8 +64,9 @@ if TYPE_CHECKING:
 
     # Shields: for any interface, and one for each
     from ethbrake_marl.shield.wrappers import shield as shield
-    from ethbrake_marl.shield.members import ShieldReason as ShieldReason
-    from ethbrake_marl.shield.options import ShieldMode as ShieldMode, ShieldOptions as ShieldOptions
+    from ethbrake_marl.shield.reasons import ShieldReason as ShieldReason
+    from ethbrake_marl.shield.contract import ShieldMode as ShieldMode
+    from ethbrake_marl.shield.options import ShieldOptions as ShieldOptions
     from ethbrake_marl.shield.wrappers import (
         HybridShield as HybridShield,
         ShieldedEnv as ShieldedEnv,

@@ -18,7 +18,7 @@ from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.options import MovingAtHorizon
+from ethbrake_marl.shield.guard import MovingAtHorizon
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
 from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv
 from tests.fixtures.asked import Acts, Asked

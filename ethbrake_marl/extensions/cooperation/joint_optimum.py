@@ -27,7 +27,7 @@ from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shield.drivers import Shielded
+from ethbrake_marl.shield.episodes import Shielded, drive_shielded
 from ethbrake_marl.training.run_folder import RunDirectory, Training
 
 
@@ -207,7 +207,7 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
             for harm_count in HARM_COUNTS if plan.shield else ():
                 task, parts = Task(level.scenario, level.scenario.learners, harm_count), []
                 for team in own:
-                    parts.append(Shielded.driven(team, sample.worlds, task))
+                    parts.append(drive_shielded(team, sample.worlds, task))
                     name = f"driving {team.name} behind the shield, {harm_count}"
                     say(Progress(name, sample.worlds.n, sample.worlds.n))
                 behind[harm_count] = Shielded.stack(parts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -375,3 +376,46 @@ def _table(sheet: Sheet, caption: str, names: set[str]) -> Part:
         f"The paper's {row.removeprefix('paper, ')}, as printed" if isinstance(row, str) else row for row in some.rows
     ]
     return Part.table(replace(some, title=caption, rows=rows))
+
+
+def write_evaluation(
+    path: Path,
+    evaluation: Evaluation,
+    rows: SummaryTable,
+    agents: Mapping[str, Driver],
+    *,
+    harm_count: HarmCount,
+    force: bool = False,
+    tell: Callable[[int, int], None] | None = None,
+) -> None:
+    """The page of ``ethbrake evaluate --report``, with episodes that ``agents`` drive again.
+
+    ``tell`` hears how many agents of how many have driven theirs. Raises what ``Report.write`` raises.
+    """
+    done: list[str] = []
+
+    def on_agent(agent: str) -> None:
+        done.append(agent)
+        if tell is not None:
+            tell(len(done), len(agents))
+
+    scenario, names, asked = evaluation.scenario, ", ".join(row.agent for row in rows), rows[0].parameters
+    scripts = ", ".join(f"{vehicle} by {script}" for vehicle, script in asked["scripts"].items())
+    report = Report(
+        f"{scenario.name}: {names}" if len(names) <= 60 else f"{scenario.name}: {len(rows)} agents compared",
+        rows,
+        evaluation,
+        harm_count=harm_count,
+        summary=scenario.title or "Agents on the same worlds.",
+        settings={
+            "Command": "ethbrake " + " ".join(sys.argv[1:]),
+            "Agents": names,
+            "Harm that agents minimise": "first impacts only" if harm_count == "first" else "every impact",
+            "Worlds": asked.line,
+            "Driven by the agents": asked.get("controlled_vehicle") or ", ".join(asked["controlled_vehicles"]),
+            "Driven by scripts": scripts or "none",
+            "Time step, horizon": f"{asked['time_step_s']:g} s, {asked['horizon_s']:g} s",
+        },
+        versions=rows[0].versions,
+    )
+    report.driven(agents, on_agent=on_agent).write(path, force=force)
