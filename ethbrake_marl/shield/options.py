@@ -63,8 +63,10 @@ class ShieldOptions:
     where: str = field(default="shield", compare=False)
 
     def __new__(cls, mode: str | None = None, **settings: Any) -> ShieldOptions:
-        """Of the class that has these settings, as ``pathlib.Path`` makes the path of the system that it runs on."""
-        return object.__new__(_class_with(mode, settings) if cls is ShieldOptions else cls)
+        """Make one of the class that has these settings, as ``pathlib.Path`` makes a path of the system it runs on."""
+        if cls is ShieldOptions:
+            cls = _class_with("step" if mode is None else check_mode(mode), settings)
+        return object.__new__(cls)
 
     def __post_init__(self) -> None:
         mode, where = check_mode("step" if self.mode is None else self.mode), self.where
@@ -159,21 +161,19 @@ def one_learner(scenario: Scenario) -> int | None:
     return scenario.learners[0] if len(scenario.learners) == 1 else None
 
 
-def read_options(where: str, given: Mapping[str, Any]) -> ShieldOptions:
-    """The options of an interface's keywords. Raises ``UnknownName`` for a keyword that no mode has."""
-    if unfit := [name for name in given if name not in _names(_class_with(given.get("mode"), given))]:
-        known = {name for mode in _modes() for name in _names(shield_settings(mode))}
-        raise unknown_name(f"{where} option", next((name for name in unfit if name not in known), unfit[0]), known)
-    return ShieldOptions(**given, where=where)
+def _class_with(mode: str, settings: Mapping[str, Any]) -> type[ShieldOptions]:
+    """The class of settings of a mode, or of the first other one, that has all these settings.
 
-
-def _class_with(mode: str | None, settings: Mapping[str, Any]) -> type[ShieldOptions]:
-    """The class of settings of a mode, or the first other one that has all these settings."""
-    for name in ("step" if mode is None else mode, *_others()):
+    Raises ``UnknownName`` for a setting that no mode has.
+    """
+    for name in (mode, *_others()):
         each = shield_settings(name)
         if each is not None and {*settings} <= {*_names(each), "where"}:
             return each
-    return ShieldOptions
+    known = {name for mode in _modes() for name in _names(shield_settings(mode))}
+    unfit = [name for name in settings if name not in {*_names(shield_settings(mode)), "where"}]
+    wrong = next((name for name in unfit if name not in known), unfit[0])
+    raise unknown_name(f"{settings.get('where', 'shield')} option", wrong, known)
 
 
 def _names(options: Any) -> set[str]:
