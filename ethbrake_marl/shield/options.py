@@ -170,7 +170,7 @@ def _class_with(mode: str, settings: Mapping[str, Any]) -> type[ShieldOptions]:
     own: type[ShieldOptions] = shield_settings(mode)
     if {*settings} <= _names(own):
         return own
-    modes = shield_modes()
+    modes: dict[str, type[ShieldOptions]] = shield_modes()
     for each in modes.values():
         if {*settings} <= _names(each):
             return each
