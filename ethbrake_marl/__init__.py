@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.scenario.catalogue import list_scenarios as list_scenarios, load_scenario as load_scenario
     from ethbrake_marl.scenario.sample import Sample as Sample
     from ethbrake_marl.scenario.schema import Scenario as Scenario
+    from ethbrake_marl.scenario.tables import read_worlds as read_worlds, worlds_from_table as worlds_from_table
     from ethbrake_marl.physics.advance import advance as advance
     from ethbrake_marl.physics.state import Worlds as Worlds, make_worlds as make_worlds
 
@@ -77,18 +78,15 @@ if TYPE_CHECKING:
     # Training
     from ethbrake_marl.training.recipe import TrainingRecipe as TrainingRecipe, load_recipe as load_recipe
     from ethbrake_marl.training.session import TrainResult as TrainResult, resume as resume, train as train
-    from ethbrake_marl.errors import Progress as Progress
+    from ethbrake_marl.progress import Progress as Progress
 
     # Evaluation
     from ethbrake_marl.evaluation.evaluation import Evaluation as Evaluation
     from ethbrake_marl.evaluation.outcome import Outcome as Outcome
     from ethbrake_marl.evaluation.record import EpisodeRecord as EpisodeRecord, record_episode as record_episode
     from ethbrake_marl.evaluation.rollout import evaluate as evaluate
-    from ethbrake_marl.evaluation.summary import (
-        SummaryRow as SummaryRow,
-        SummaryTable as SummaryTable,
-        summarise as summarise,
-    )
+    from ethbrake_marl.evaluation.summary import SummaryTable as SummaryTable, summarise as summarise
+    from ethbrake_marl.evaluation.summary_row import SummaryRow as SummaryRow
     from ethbrake_marl.evaluation.comparison import compare_results as compare_results
     from ethbrake_marl.evaluation.per_world import read_result as read_result
     from ethbrake_marl.evaluation.groups import summarise_by as summarise_by

@@ -9,9 +9,9 @@ from __future__ import annotations
 import inspect
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -221,6 +221,7 @@ class Entry:
     make: Factory | Wrapper
     inner: bool = False  # of what goes around an agent: directly, inside a shield
     teams: bool = False  # likewise: around a team, too
+    needs: Mapping[str, object] = field(default_factory=dict)  # settings that it cannot do without -> an example
     options: type | None = None  # of a shield that also goes around environments: the class of its settings
 
     @property
@@ -358,9 +359,9 @@ def find_entry(spec: AgentSpec | str) -> Entry:
         form = f"{written.name}[:ARGUMENT][@POLICY]"
         return Entry(written.name, form, "your own", Source.UNSTATED, make_from_file)
     if written.name not in _AGENTS:
-        if written.name in _SEVERAL:
+        if written.name in group_names():
             raise InvalidInput(f"agent {written.core!r}: stands for several agents in --agents; here one is needed")
-        raise _AGENTS.unknown(written.name, {*agent_names(), *_SEVERAL})
+        raise _AGENTS.unknown(written.name, {*agent_names(), *group_names()})
     entry = _AGENTS[written.name]
     if written.argument is not None and ":" not in entry.whole_form:
         raise InvalidInput(f"agent {written.core!r}: {written.name} takes no argument")
@@ -408,10 +409,6 @@ def around_forms() -> tuple[str, ...]:
 
 def shield_forms() -> tuple[str, ...]:
     """The shields among that, without their variants."""
-
-    def is_variant(each: str) -> bool:
-        return each.rpartition(":")[2] in variants_of(each.partition(":")[0])
-
     return tuple(each for each in around_forms() if not (_around(each).inner or is_variant(each)))
 
 
@@ -435,6 +432,31 @@ def variants_of(name: str) -> tuple[str, ...]:
     """The words that may stand behind an agent or a shield, after its argument, and make another one of it."""
     keys = (key.rpartition(".") for key in _VARIANTS)
     return tuple(variant for of, _, variant in keys if of == name)
+
+
+def is_variant(form: str) -> bool:
+    """Whether the last word of ``NAME:WORD`` makes another agent or shield of it."""
+    return form.rpartition(":")[2] in variants_of(form.partition(":")[0])
+
+
+def settings_needed(shield: str | None) -> Mapping[str, object]:
+    """Settings that a shield cannot do without, each with an example; a variant of it needs none."""
+    return {} if shield is None or is_variant(shield) else _around(shield).needs
+
+
+def shields_with(setting: str) -> tuple[str, ...]:
+    """The installed shields that cannot do without a setting."""
+    return tuple(entry.words[0] for entry in _SHIELDS.usable().values() if setting in entry.needs)
+
+
+def group_names() -> tuple[str, ...]:
+    """Names that stand for several agents in ``--agents``."""
+    return tuple(dict.fromkeys(name.partition(".")[0] for name in _GROUPS))
+
+
+def agents_of_group(group: str) -> tuple[str, ...]:
+    """The agents for which a group's name stands; its own come first, then those of ``GROUP.MORE``, by name."""
+    return tuple(spec for name in sorted(_GROUPS) if name.partition(".")[0] == group for spec in _GROUPS[name])
 
 
 def register_agent(
@@ -466,7 +488,7 @@ def register_agent(
     """
     if parse_spec(name) != AgentSpec(name, None, None, ()):
         raise InvalidInput(f"agent name {name!r}: must be a plain name without argument")
-    if name in _SEVERAL:
+    if name in group_names():
         raise AlreadyExists(f"agent {name!r}: stands for several agents in --agents; give another name")
     form = f"{name}[:ARGUMENT]{'[@POLICY]' * takes_policy}" if form is None else form
     _AGENTS.add(name, Entry(name, form, about, knows, factory), lambda entry: entry.make is factory)
@@ -481,6 +503,7 @@ def register_shield(
     form: str | None = None,
     inner: bool = False,
     teams: bool = False,
+    needs: Mapping[str, object] | None = None,
     options: type | None = None,
 ) -> None:
     """Make ``+name`` known behind every agent.
@@ -497,6 +520,7 @@ def register_shield(
         form: how it is written, ``+name[:WORD]`` with every word that it takes; None: with any argument.
         inner: it is no shield, and goes around the agent before one.
         teams: it also goes around a team.
+        needs: settings of ``AgentSettings`` that it cannot do without, each with an example.
         options: the class of its settings, ``shield.options.ShieldOptions`` or one derived from it, which makes its
             guard: then ``eb.shield(env, mode=name)`` knows it, too.
 
@@ -506,7 +530,7 @@ def register_shield(
     if not isinstance(name, str) or not _PLAIN.fullmatch(name):
         raise InvalidInput(f"shield name {name!r}: must be a plain name without argument")
     form = f"+{name}[:ARGUMENT]" if form is None else form
-    entry = Entry(name, form, about, knows, wrapper, inner, teams, options)
+    entry = Entry(name, form, about, knows, wrapper, inner, teams, needs or {}, options)
     _SHIELDS.add(name, entry, lambda entry: entry.make is wrapper)
 
 
@@ -531,13 +555,18 @@ _PLAIN = re.compile(r"[a-z][a-z0-9_.-]*")
 
 _PROFILE = "profile"  # a role of scenarios alone
 
-_SEVERAL = ("ladder", "field")  # stand for several agents in ``--agents``
-
 _AGENTS: Registry[Entry] = Registry("agent", "agents", register_agent)
 
 _SHIELDS: Registry[Entry] = Registry("shield or search", "shields", register_shield)
 
 _VARIANTS: Registry[Variant] = Registry("variant of an agent", "variants", register_variant)
+
+
+def _register_group(name: str, specs: tuple[str, ...]) -> None:
+    _GROUPS.add(name, specs, lambda other: other == specs)
+
+
+_GROUPS: Registry[tuple[str, ...]] = Registry("group of agents", "agent_groups", _register_group)
 
 
 def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: Driver) -> Driver:

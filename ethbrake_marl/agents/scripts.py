@@ -61,3 +61,6 @@ E_V2X_BM = Part(
     about="the best constant deceleration in this simulation; pairwise: the paper's closed form, from the true state",
     knows=Source.MODEL,
 )
+
+# Behind ``--agents ladder``, from no decision at all upwards; extensions add their rungs as ``ladder.NAME``.
+LADDER = ("coast", "full_brake", "e_v2x_bm:pairwise", "e_v2x_bm")

@@ -167,6 +167,7 @@ def _evaluate_group(
     told: list[dict[str, Any]] = []
     rows: list[Any] = []
     seed = evaluation.LIST_SEED if seed is None else seed
+    more = [each.group_column for each in evaluation.MEASURE_SETS.values() if each.group_column]
     for task in group:
         chosen = task.scenario
         sample = chosen.sample(GROUP_EPISODES if episodes is None else episodes, seed)
@@ -175,7 +176,7 @@ def _evaluate_group(
         found = evaluation.evaluate(sample, lineup, scenario=chosen, seed=seed)
         rows.append(chosen.name)
         for row in evaluation.summarise(found):
-            outcome, share = found.outcome(row.agent), row[f"share_of_possible_reduction_{task.harm_count}"]
+            outcome, shares = found.outcome(row.agent), [row[each.measures[task.harm_count]] for each in more]
             hardest = 3.6 * math.sqrt(outcome.ledger.pair_harm("first").max(initial=0.0))
             each: dict[str, Any] = {
                 "passed": not outcome.collided.any(),
@@ -185,8 +186,9 @@ def _evaluate_group(
                 "total_harm": float(outcome.total_harm.mean()),
             }
             shown = f"{each['collision_rate']:.1%}", f"{hardest:.1f}", *(f"{each[key]:.2f}" for key in list(each)[3:])
-            rows.append((row.agent, "passed" if each["passed"] else "failed", *shown, share))
-            each["share_of_possible_reduction"] = None if share is None else share.to_json()
+            rows.append((row.agent, "passed" if each["passed"] else "failed", *shown, *shares))
+            for head, share in zip(more, shares, strict=True):
+                each[head.column.name] = None if share is None else share.to_json()
             told.append({"scenario": chosen.name, "agent": row.agent, "worlds": found.worlds.n, **each})
     columns: list[Column | str] = [
         "Agent",
@@ -195,21 +197,13 @@ def _evaluate_group(
         Column("Hardest, km/h", short="Hardest,\nkm/h"),
         Column("First-impact harm", short="First-impact\nharm"),
         Column("Total harm", short="Total\nharm"),
-        Column(
-            "Share of the possible reduction",
-            digits=1,
-            scale=100.0,
-            unit=" %",
-            short="Share of\npossible",
-            interval="hidden",
-        ),
+        *(each.column for each in more),
     ]
     counted = "first-impact" if group[0].harm_count == "first" else "total"
     note = (
         f"{found.worlds.n:,} worlds of each, seed {seed}; `ethbrake scenario explain` tells their parameters."
         " Passed: nobody collides, in no world. Harms: means per world in m²/s². Hardest: the closing speed of a pair."
-        f" Share of the possible reduction of {counted} harm: 0 % for full braking,"
-        " 100 % for the best known harm; none where that is not known of every world."
+        + "".join(f" {each.note.format(harm=counted)}" for each in more)
     )
     _write_results(out, output, told)
     out.result(told, Sheet("", columns, rows, note))

@@ -13,8 +13,9 @@ import typer
 from ethbrake_marl import evaluation, scenario as scenarios, training
 from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, SeedOption, SettingsOption, example
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.sheet import Sheet
-from ethbrake_marl.files.store import new_file, read_plain
+from ethbrake_marl.files.store import new_file
 from ethbrake_marl.files.yaml import flow_text
 
 TRIED_WORLDS = 200  # by `scenario validate`
@@ -353,7 +354,7 @@ def scenario_sample(
 ) -> None:
     """Draw worlds of a list, as a table or a picture.
 
-    The table has a column for each quantity that the scenario does not fix; `Scenario.read_worlds` reads it. The
+    The table has a column for each quantity that the scenario does not fix; `eb.read_worlds` reads it. The
     picture shows distributions, pairs of quantities, and three worlds. The same list, seed and number are the same
     worlds on every machine.
     """

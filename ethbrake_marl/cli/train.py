@@ -19,7 +19,8 @@ from ethbrake_marl.cli.command import (
     StepsOption,
     schema_option,
 )
-from ethbrake_marl.errors import InvalidInput, Progress
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.progress import Progress
 
 KEPT = (
     "if the training had begun, the run's folder keeps the last good policy, and ethbrake train --resume FOLDER goes on"
@@ -85,7 +86,7 @@ def run_command(
             f" {trained.wall_s:.0f} s ({trained.status}). hybrid is the trained policy behind its shield. All minimise"
             f" {count} harm.\n"
         )
-        out.result(result.results, Text(told), result.rows.brief(result.beside), *result.rows.tables()[1:])
+        out.result(result.results, Text(told), result.brief, *result.rows.tables()[1:])
         out.note(f"report, with every measure and the paper's rows: {result.report}")
         _end(out, result.trained)
 

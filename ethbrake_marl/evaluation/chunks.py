@@ -19,13 +19,14 @@ from ethbrake_marl.agents.registry import parse_spec
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.identity import CHUNK, HELD, own_versions, policies_of, result_versions, scenario_sha256
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.identity import CHUNK, own_versions, policies_of, result_versions, scenario_sha256
+from ethbrake_marl.evaluation.lineup import make_lineup
+from ethbrake_marl.evaluation.measures import MEASURE_SETS, silent_in_long_lists
+from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.own_measures import LOADED, REGISTERED, load_measures
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk
-from ethbrake_marl.evaluation.summary import SummaryTable
+from ethbrake_marl.evaluation.summary import SummaryTable, summarise_sums
 from ethbrake_marl.evaluation.tally import Tally
-from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.files.python_file import file_sha256
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.parallel import Call, run_each
@@ -49,9 +50,10 @@ class Lineup:
         agents: specs, as on the command line.
         scenario: whose learners they drive.
         harm_count: harm that agents minimise.
-        uncertainty: what agents behind ``+robust`` do not know, as ``parse_uncertainty`` reads it.
+        uncertainty: what shields do not know that take one, as text.
         measures: that evaluations tell, too, as ``load_measures`` takes them; with those that it was given before.
         told: names of all measures that evaluations tell, whatever is registered later.
+        sets: names of the sets of measures in the process that asks.
         same: what must be the same in every process; see ``Lineup.of``.
         packages: name -> version of each that gave a part to the process that asks: no other may be installed.
 
@@ -63,6 +65,7 @@ class Lineup:
     uncertainty: str | None = None
     measures: tuple[str, ...] = ()
     told: tuple[str, ...] = ()
+    sets: tuple[str, ...] = ()
     same: str = ""
     packages: Mapping[str, str] = field(default_factory=dict)
 
@@ -73,7 +76,8 @@ class Lineup:
         Raises what ``make_lineup`` raises.
         """
         load_measures(how.pop("measures", ()))
-        lineup = cls(tuple(agents), scenario, measures=tuple(LOADED), told=tuple(REGISTERED), **how)
+        sets = tuple(name for name, _ in MEASURE_SETS.items())  # loads them, so that their versions are known
+        lineup = cls(tuple(agents), scenario, measures=tuple(LOADED), told=tuple(REGISTERED), sets=sets, **how)
         made = lineup._make_anew()
         same = lineup._same(made)
         _MADE.clear()
@@ -85,7 +89,9 @@ class Lineup:
         if self.same not in _MADE:
             load_measures(self.measures)
             made = self._make_anew()
-            same = self._same(made) == self.same and {*self.told} <= REGISTERED.keys()
+            same = (
+                self._same(made) == self.same and {*self.told} <= REGISTERED.keys() and {*self.sets} <= {*MEASURE_SETS}
+            )
             if not same or any(_installed(name) != used for name, used in self.packages.items()):
                 raise InvalidInput(
                     "evaluate: a worker has other policies, measures or versions than the process that asks it;"
@@ -96,8 +102,7 @@ class Lineup:
         return _MADE[self.same]
 
     def _make_anew(self) -> Mapping[str, Driver]:
-        intervals = None if self.uncertainty is None else parse_uncertainty(self.uncertainty)
-        return make_lineup(self.agents, self.scenario, harm_count=self.harm_count, uncertainty=intervals)
+        return make_lineup(self.agents, self.scenario, harm_count=self.harm_count, uncertainty=self.uncertainty)
 
     def _same(self, made: Mapping[str, Driver]) -> str:
         policies = {name: policies_of(Team.of(agent, self.scenario.learners).drivers) for name, agent in made.items()}
@@ -139,7 +144,13 @@ def evaluate_held(
 
 def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evaluation:
     found = drive_chunk(part, lineup.make(), lineup.scenario, seed, lineup.scenario.learners, first)
-    return found.telling(lineup.told)
+    return replace(found, outcomes={agent: _only(each, lineup.told) for agent, each in found.outcomes.items()})
+
+
+def _only(outcome: Outcome, names: Sequence[str]) -> Outcome:
+    """The outcome with these registered measures alone."""
+    kept = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
+    return replace(outcome, metrics=kept)
 
 
 def tally_list(
@@ -154,8 +165,7 @@ def tally_list(
 ) -> Tally:
     """The statistics of the worlds 0 to ``episodes - 1`` of a list of any length; no world is kept.
 
-    Nothing of what is known whoever drives is in them: proofs take longer than driving. ``jobs`` and ``ray`` as in
-    ``run_each``.
+    Sets of measures that take longer than driving are not in them. ``jobs`` and ``ray`` as in ``run_each``.
     """
     check_whole_number("episodes", episodes, 1, MOST_EPISODES)
     check_whole_number("seed", seed, 0)
@@ -186,13 +196,12 @@ def summarise_tally(lineup: Lineup, tally: Tally, seed: int) -> SummaryTable:
     scenario = lineup.scenario
     task = Task(scenario, scenario.learners, lineup.harm_count)
     teams = {name: Team.of(agent, scenario.learners) for name, agent in lineup.make().items()}
-    because = f"a list of more than {HELD:,} worlds is driven without proofs"
-    return SummaryTable.of_tallies(
+    return summarise_sums(
         {name: tally.agents[name] for name in teams},
-        Conditions.of_test(task, seed, tally.worlds, because, Conditions.of_ranges(tally.ranges)),
-        task,
-        {name: Knowledge.of(team) for name, team in teams.items()},
-        {name: policies_of(team.drivers) for name, team in teams.items()},
+        Conditions.of_test(task, seed, tally.worlds, tally.silent, Conditions.of_ranges(tally.ranges)),
+        silent_in_long_lists(),
+        knows={name: Knowledge.of(team) for name, team in teams.items()},
+        policies={name: policies_of(team.drivers) for name, team in teams.items()},
         left_out=tally.left_out,
         hidden_share=tally.hidden / tally.worlds,
         worlds_sha256=f"{tally.worlds_hash:064x}",

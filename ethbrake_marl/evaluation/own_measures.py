@@ -4,49 +4,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields, replace
-from typing import Literal
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, describe_error
+from ethbrake_marl.evaluation.impacts import EpisodeImpacts
 from ethbrake_marl.evaluation.outcome import Values
 from ethbrake_marl.files.python_file import load_from_file
-from ethbrake_marl.game.harm import INJURY_CURVES, injury_probability
-from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.left_out import ImpactRows
-from ethbrake_marl.physics.state import Floats, Worlds, make_worlds
+from ethbrake_marl.physics.state import make_worlds
 from ethbrake_marl.registry import Part, Registry
 
 _NAME = re.compile(r"(?!.*_([0-9]+|interval|low|high)\Z)[a-z][a-z0-9_]{0,63}")  # x_2 is that of the second vehicle
-
-
-@dataclass(frozen=True, slots=True)
-class EpisodeImpacts:
-    """What a registered measure is computed from, for n episodes of N vehicles; its arrays cannot be written to."""
-
-    worlds: Worlds  # [n] at the alert
-    rows: ImpactRows  # every impact, by world and then by time, arrays [k]
-
-    @classmethod
-    def unwritable(cls, worlds: Worlds, rows: ImpactRows) -> EpisodeImpacts:
-        """Those of these episodes; the arrays of ``rows`` cannot be written to from now on."""
-        for column in fields(rows):
-            getattr(rows, column.name).flags.writeable = False
-        return cls(worlds.read_only(), rows)
-
-    @property
-    def largest_speed_change_mps(self) -> Floats:
-        """The largest change of speed of each vehicle in one impact (delta-v), [n, N]; 0 without one.
-
-        One that is pushed by a vehicle that touches it already has no impact of its own, and so no change from it.
-        """
-        rows, change = self.rows, np.zeros(self.worlds.speeds_mps.shape)
-        np.maximum.at(change, (rows.world, rows.pair + 1), np.abs(rows.rear_speed_change_mps))
-        pairs = rows.pair >= 0  # an obstacle ahead is no vehicle
-        np.maximum.at(change, (rows.world[pairs], rows.pair[pairs]), np.abs(rows.front_speed_change_mps[pairs]))
-        return change
-
 
 EpisodeFunction = Callable[[EpisodeImpacts], Values]
 
@@ -117,47 +87,6 @@ def load_measures(names: Iterable[str]) -> None:
         LOADED[name] = None
 
 
-def _injury(curve: str, rule: Literal["", "_vehicle", "_every"]) -> EpisodeFunction:
-    def told(episodes: EpisodeImpacts) -> Values:
-        rows, found = episodes.rows, np.zeros(episodes.worlds.speeds_mps.shape)
-        struck = rows.pair >= 0  # an obstacle ahead is no vehicle
-        world = np.concatenate([rows.world, rows.world[struck]])
-        vehicle = np.concatenate([rows.pair + 1, rows.pair[struck]])
-        front, rear = np.abs(rows.rear_speed_change_mps), np.abs(rows.front_speed_change_mps[struck])
-        p = np.concatenate([injury_probability(front, "front", curve), injury_probability(rear, "rear", curve)])
-        if rule == "_every":
-            np.add.at(found, (world, vehicle), p)
-        else:  # of several entries for one vehicle the last one stays, which is that of the largest change
-            order = np.argsort(np.concatenate([front, rear]), kind="stable")
-            found[world[order], vehicle[order]] = p[order]
-        return 1_000.0 * (found if rule == "_vehicle" else found.sum(axis=1))
-
-    each = {
-        "": "summed over the vehicles, each by its largest change of speed",
-        "_vehicle": "by its largest change of speed",
-        "_every": "summed over every impact, as if each met other people",
-    }
-    about = INJURY_CURVES[curve]
-    told.__doc__ = (
-        f"Injuries of {about.injury} in 1,000 lines, {each[rule]}: {about.formula}; dv in m/s ({about.source})."
-    )
-    return told
-
-
-_RULES: tuple[Literal["", "_vehicle", "_every"], ...] = ("", "_vehicle", "_every")
-
-# The injuries in 1,000 lines, by each of ``harm.INJURY_CURVES``, under one name of the entry points (pyproject.toml).
-#
-# ``injury_CURVE`` is the sum over the vehicles of a line, each by its largest change of speed, as the literature takes
-# it; ``injury_CURVE_vehicle`` tells it of each; ``injury_CURVE_every`` sums over every impact, as if each met other
-# people. A vehicle that was not hit has none, nor has one pushed by a vehicle that touches it already.
-INJURY = {
-    f"injury_{curve}{rule}": Part(_injury(curve, rule), unit="per 1,000 lines")
-    for curve in INJURY_CURVES
-    for rule in _RULES
-}
-
-
 def heading_of(column: str) -> str:
     metric = registered_measure(column)
     if metric is None:  # of results that were computed before it was forgotten
@@ -209,49 +138,20 @@ def _tried() -> EpisodeImpacts:
     return EpisodeImpacts.unwritable(worlds, ImpactRows(np.array([0]), np.array([1]), *one))
 
 
-class Tape:
-    """The steps of a batch of episodes as they are driven (``Watch``), and every impact in them.
+def measure_impacts(episodes: EpisodeImpacts) -> dict[str, Values]:
+    """Every registered measure of these episodes by column, [n]: ``NAME``, or ``NAME_1``, ``NAME_2``, ...
 
-    With ``steps`` False only the impacts are kept.
+    Raises ``InvalidInput`` that names measure and world.
     """
-
-    def __init__(self, worlds: Worlds, *, steps: bool = True) -> None:
-        self.worlds = worlds  # at the alert
-        self.steps: list[tuple[Worlds, Floats, Floats]] = []  # before, commands [n, N], until [n]
-        self._keeps_steps = steps
-        self._rows: list[ImpactRows] = []
-
-    def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Keep one step."""
-        moving = until_s > before.time_s
-        some = np.flatnonzero(moving | (before.time_s == self.worlds.time_s))  # an impact at the very alert
-        rows = advance(before.take(some), command_mps2[some], until_s=until_s[some], record=True)[1].rows
-        assert rows is not None  # they were asked for
-        self._rows.append(replace(rows, world=some[rows.world]))
-        if self._keeps_steps:
-            self.steps.append((before, command_mps2, until_s))
-
-    def impacts(self) -> ImpactRows:
-        """Every impact so far, by world and then by time."""
-        columns = {f.name: np.concatenate([getattr(rows, f.name) for rows in self._rows]) for f in fields(ImpactRows)}
-        order = np.argsort(columns["world"], kind="stable")
-        return ImpactRows(**{name: column[order] for name, column in columns.items()})
-
-    def measured(self) -> dict[str, Values]:
-        """Every registered measure of these episodes by column, [n]: ``NAME``, or ``NAME_1``, ``NAME_2``, ...
-
-        Raises ``InvalidInput`` that names measure and world.
-        """
-        episodes = EpisodeImpacts.unwritable(self.worlds.take(np.arange(self.worlds.n)), self.impacts())
-        found: dict[str, Values] = {}
-        for metric in REGISTERED.values():
-            values = _checked(metric, episodes)
-            if _form(values) != metric.form:
-                raise InvalidInput(
-                    f"measure {metric.name!r}: gave {_form(values)}; when it was registered it gave {metric.form}"
-                )
-            if values.ndim == 1:
-                found[metric.name] = values
-            else:
-                found |= {f"{metric.name}_{i + 1}": column.copy() for i, column in enumerate(values.T)}
-        return found
+    columns: dict[str, Values] = {}
+    for metric in REGISTERED.values():
+        values = _checked(metric, episodes)
+        if _form(values) != metric.form:
+            raise InvalidInput(
+                f"measure {metric.name!r}: gave {_form(values)}; when it was registered it gave {metric.form}"
+            )
+        if values.ndim == 1:
+            columns[metric.name] = values
+        else:
+            columns |= {f"{metric.name}_{i + 1}": column.copy() for i, column in enumerate(values.T)}
+    return columns

@@ -23,8 +23,9 @@ from safetensors import SafetensorError
 
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, naming_extras
 from ethbrake_marl.files.arrays import ArrayRow, check_arrays, safetensors_headers
-from ethbrake_marl.files.store import new_folder, read_plain, write_file
-from ethbrake_marl.files.yaml import first_mistake, read_json_model
+from ethbrake_marl.files.model import first_mistake, read_json_model
+from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.files.store import new_folder, write_file
 from ethbrake_marl.game.features import FEATURES
 from ethbrake_marl.game.observations import ObservationSpec
 from ethbrake_marl.physics.elementary import PER_LN2, exp_rest
@@ -228,6 +229,10 @@ class Policy:
     def steps(self) -> int:
         """Decisions of learners after which it was taken."""
         return self.manifest.steps
+
+    def policy_sha256(self) -> str:
+        """The hash in its manifest."""
+        return self.manifest.manifest_sha256
 
     @property
     def drivers(self) -> dict[str, Policy]:

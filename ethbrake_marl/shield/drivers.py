@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from ethbrake_marl.agents.protocol import Agent, Driver, Knowledge, Source, Team, check_agent
+from ethbrake_marl.agents.protocol import Agent, ByPolicy, Driver, Knowledge, Source, Team, check_agent
 from ethbrake_marl.engine.engine import Engine, Guard
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.state import Worlds
@@ -16,7 +16,7 @@ from ethbrake_marl.shield.options import ShieldOptions
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
 
 
-class ShieldedDriver:
+class ShieldedDriver(ByPolicy):
     """An agent, or a team, behind a shield that certifies every action: mode ``step``, or one of an extension.
 
     Where an agent, rolled out at the alert, harms no more than the coupled optimum, it drives unhindered, and its harm

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import Field, field_validator, model_validator
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.yaml import refuse
+from ethbrake_marl.files.model import refuse
 from ethbrake_marl.registry import Part
 from ethbrake_marl.training.recipe import (
     Fraction,
@@ -104,4 +104,5 @@ class SacRecipe(TrainingRecipe):
 
 
 PPO = Part(PpoRecipe, "ethbrake_marl.training.ppo:Ppo")
+
 SAC = Part(SacRecipe, "ethbrake_marl.training.sac:Sac")

@@ -20,8 +20,10 @@ from pydantic import Field, model_validator
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput
-from ethbrake_marl.files.store import new_folder, parse_strict_json, read_object, read_plain, write_file
-from ethbrake_marl.files.yaml import Document, FileModel, Wording, read_model, refuse
+from ethbrake_marl.files.model import FileModel, Wording, read_model, refuse
+from ethbrake_marl.files.plain import parse_strict_json, read_object, read_plain
+from ethbrake_marl.files.store import new_folder, write_file
+from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.game.observations import ObservationSpec, choose_observation
 from ethbrake_marl.policies.manifest import installed_versions

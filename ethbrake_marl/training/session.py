@@ -18,16 +18,19 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Driver, Team
-from ethbrake_marl.errors import CorruptBundle, InvalidInput, OnProgress, Progress, Told, stop_on_signal
+from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import mean
-from ethbrake_marl.files.store import hold_lock, read_object, remove_folder, remove_unfinished
+from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.files.store import hold_lock, remove_folder, remove_unfinished
 from ethbrake_marl.game.objectives import objective_harm
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.network import Policy
 from ethbrake_marl.policies.teams import Trained
+from ethbrake_marl.progress import OnProgress, Progress, Told
 from ethbrake_marl.registry import versions_used
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.stopping import stop_on_signal
 from ethbrake_marl.training.checkpoint import TrainingState, newest_usable, write_checkpoint
 from ethbrake_marl.training.models import (
     Model,

@@ -23,22 +23,22 @@ from stable_baselines3.common.logger import Logger
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.train import run_folder
-from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, Progress
-from ethbrake_marl.evaluation import evaluation as evaluation_module
+from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import summarise
-from ethbrake_marl.extensions.search import limits
+from ethbrake_marl.extensions.search import limits, regret
 from ethbrake_marl.files.store import new_folder, write_file
 from ethbrake_marl.game.objectives import objective_harm, objectives_of
 from ethbrake_marl.policies.network import Policy, dense, load_policy
 from ethbrake_marl.policies.teams import Trained, read_trained
-from ethbrake_marl.training import models, progress as progress_module, random_state
+from ethbrake_marl.progress import Progress
+from ethbrake_marl.training import models, progress as progress_module, random_state, session as train_module
 from ethbrake_marl.training.checkpoint import ARRAYS, NUMBERS, TrainingState, read_checkpoint, write_checkpoint
 from ethbrake_marl.training.models import TrainingDiverged, open_logs
 from ethbrake_marl.training.progress import Course
 from ethbrake_marl.training.recipe import LearningRate, TrainingRecipe, load_recipe
 from ethbrake_marl.training.run_folder import RunDirectory, Training
-from ethbrake_marl.training.session import TrainResult, resume, train as train_module
+from ethbrake_marl.training.session import TrainResult, resume
 from tests.docs.site import load
 from tests.learning.tiny import (
     MODES,
@@ -154,7 +154,7 @@ def test_train__measures_what_an_evaluation_of_the_kept_policy_tells_and_proves_
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     prove = Mock(side_effect=limits.known_limits)
-    monkeypatch.setattr(evaluation_module, "known_limits", prove)
+    monkeypatch.setattr(regret, "known_limits", prove)
     result = train_module.train(TINY, SCENARIO, tmp_path / "run", steps=UPDATE, on_progress=None)
     prove.assert_not_called()
     worlds = result.training.scenario.sample(TINY.evaluation.worlds, TINY.evaluation.seed)

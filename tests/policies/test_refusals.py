@@ -11,7 +11,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, UnknownName
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.policies.network import Actor, Policy, load_policy
 from ethbrake_marl.policies.shipped import load_named_policy, shipped_name
 from ethbrake_marl.training.recipe import load_recipe

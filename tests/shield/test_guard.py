@@ -53,9 +53,9 @@ class Cheating(Engine):
         step = super()._advance(columns)
         rows = self.ended & ~before if self.last_only else ~before
         if self.what == "a step":
-            self._clock[rows, STEP] += 1.0
+            self.state.clock[rows, STEP] += 1.0
         else:
-            self._state[rows, STATE[self.what](self.packed.column)] += 1e-12
+            self.state.motion[rows, STATE[self.what](self.packed.column)] += 1e-12
         return step
 
 
@@ -111,7 +111,7 @@ def test_ledger__harm_that_nobody_predicted_is_seen_before_the_next_decision(gro
     *_, info = env.step(DRIVE)
     assert info["shield_trusted"]
     engine = env.attached.engine
-    engine._state[0, engine.packed.column.harm + 2 * group] += 1e-12
+    engine.packed.state[0, engine.packed.column.harm + 2 * group] += 1e-12
     *_, info = env.step(DRIVE)
     assert not info["shield_trusted"] and info["shield_reason"] == eb.ShieldReason.ASSUMPTION_BROKEN
 

@@ -32,7 +32,7 @@ from ethbrake_marl.shield.paper_hybrid import HybridAgent
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from ethbrake_marl.shield.step import StepShield
 from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
-from tests.limits.worlds import line as one_line
+from tests.fixtures.lines import line as one_line
 from tests.refused import refused
 from tests.shield.attacks import begun, line
 

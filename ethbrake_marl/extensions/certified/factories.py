@@ -9,6 +9,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.enclosure import CORNERS, checked_robust
 from ethbrake_marl.extensions.certified.estimating_agents import Believing, BelievingHybrid
 from ethbrake_marl.extensions.certified.options import RobustOptions, mode_uncertainty
+from ethbrake_marl.extensions.certified.uncertainty import UNCERTAINTY_EXAMPLE
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shield.drivers import ShieldedDriver, shielded
 from ethbrake_marl.shield.factories import shield_episodes
@@ -59,6 +60,7 @@ ROBUST = Part(
     form="+robust[:interior]",
     about="as +step where not everything is known: in the corners of an uncertainty, interior: in all of it",
     knows=Source.MODEL,
+    needs={"uncertainty": UNCERTAINTY_EXAMPLE},
     options=RobustOptions,
 )
 

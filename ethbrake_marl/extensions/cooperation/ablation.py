@@ -7,13 +7,13 @@ from functools import partial
 from pathlib import Path
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.errors import OnProgress
 from ethbrake_marl.extensions.cooperation.joint_optimum import measure, questions
 from ethbrake_marl.extensions.cooperation.levels import Json, Plan, common_worlds
 from ethbrake_marl.extensions.cooperation.page import write_ablation
 from ethbrake_marl.extensions.search.best_harm import best_harm, chunks_left
 from ethbrake_marl.extensions.studies.trainings import Timed, train_all
 from ethbrake_marl.game.harm import HARM_COUNTS
+from ethbrake_marl.progress import OnProgress
 from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield.episodes import drive_shielded
 from ethbrake_marl.training.run_folder import RunDirectory

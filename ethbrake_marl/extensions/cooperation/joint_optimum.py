@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Driver, Team
-from ethbrake_marl.errors import OnProgress, Progress
 from ethbrake_marl.evaluation.identity import result_identity
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.extensions.cooperation.levels import HARM, TOLERANCE, Level, Plan, common_worlds
@@ -24,6 +23,7 @@ from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount, Ledger
 from ethbrake_marl.game.objectives import objective_harm
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task

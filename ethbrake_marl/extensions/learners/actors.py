@@ -16,12 +16,11 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from ethbrake_marl.engine.engine import Moment
+from ethbrake_marl.engine.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.learners.recipes import CounterfactualRecipe
 from ethbrake_marl.extensions.learners.scout import Scout
 from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.elementary import exp, log
 from ethbrake_marl.physics.state import Bools, Floats
 from ethbrake_marl.policies.manifest import Float32s
@@ -218,10 +217,10 @@ def other_count(count: HarmCount) -> HarmCount:
     return "total" if count == "first" else "first"
 
 
-def moving_rows(moments: Moment) -> Bools:
+def moving_rows(moments: State) -> Bools:
     """In which rows some vehicle moves; where everything stands there is nothing to learn."""
-    column = Packed(moments.state, moments.params).column
-    moving: Bools = (moments.state[:, column.speed : column.command] != 0.0).any(axis=1)
+    column = moments.packed.column
+    moving: Bools = (moments.motion[:, column.speed : column.command] != 0.0).any(axis=1)
     return moving
 
 

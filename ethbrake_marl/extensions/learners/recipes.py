@@ -12,7 +12,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from ethbrake_marl.agents.protocol import Source
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.yaml import FileModel, refuse
+from ethbrake_marl.files.model import FileModel, refuse
 from ethbrake_marl.policies.manifest import Activation, NetworkSpec
 from ethbrake_marl.policies.network import Policy
 from ethbrake_marl.policies.shipped import SHIPPED, load_named_policy

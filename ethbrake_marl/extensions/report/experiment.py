@@ -17,27 +17,31 @@ import numpy as np
 
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.errors import OnProgress, Progress, Unfamiliar, check_one_learner
+from ethbrake_marl.errors import Unfamiliar, check_one_learner
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import EPISODES, LIST_SEED
-from ethbrake_marl.evaluation.named_worlds import make_agents
+from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.evaluation.per_world import results_to_json, write_per_world
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.summary import SummaryRow, SummaryTable, summarise
+from ethbrake_marl.evaluation.summary import SummaryTable, summarise
+from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.episode_figure import trajectories
 from ethbrake_marl.extensions.report.page import Part
+from ethbrake_marl.extensions.report.paper_rows import is_papers_test, summarise_beside_paper
 from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap, learning_curve
 from ethbrake_marl.extensions.report.shown_worlds import TRAINED_POLICY
 from ethbrake_marl.extensions.report.style import write_picture
-from ethbrake_marl.extensions.report.tests import TESTS, is_papers_test, other_tests
-from ethbrake_marl.files.sheet import csv_text
-from ethbrake_marl.files.store import read_object, write_output
+from ethbrake_marl.extensions.report.three_tests import TESTS, brief, other_tests
+from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.files.sheet import Sheet, csv_text
+from ethbrake_marl.files.store import write_output
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.game.rewards import RewardParams
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.network import Policy
+from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
 from ethbrake_marl.training.recipe import TrainingRecipe
@@ -132,6 +136,11 @@ class ExperimentResult:
     results: list[dict[str, Any]]
     beside: Mapping[str, SummaryTable] = field(default_factory=dict)  # by test: the other two of the three tests
 
+    @property
+    def brief(self) -> Sheet:
+        """The rows on one screen, with those of the other tests."""
+        return brief(self.rows, self.beside)
+
 
 def run_experiment(
     scenario: Scenario,
@@ -190,7 +199,8 @@ def run_experiment(
             tell(Progress(f"report{stage and ': '}{stage}", next(done), 3 + len(others)))
 
         begin("what nobody can avoid")
-        rows = summarise(evaluation, paper=is_papers_test(evaluation.task, list_seed))
+        beside_paper = is_papers_test(evaluation.task, list_seed)
+        rows = summarise_beside_paper(evaluation) if beside_paper else summarise(evaluation)
         beside: dict[str, SummaryTable] = {}
         for other in others:  # the policy was trained on ``scenario`` alone
             part = other.sample(min(episodes, 2_000), list_seed)
