@@ -14,7 +14,7 @@ from ethbrake_marl.physics.state import Floats, Worlds
 
 
 class LearnedPolicy(Protocol):
-    """What an agent needs of a policy; ``ethbrake_marl.policies.network.Policy`` is one."""
+    """What an agent needs of a policy; ``ethbrake_marl.policies.policy.Policy`` is one."""
 
     @property
     def observation(self) -> ObservationSpec:

@@ -21,7 +21,7 @@ from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import AgentAround
 from ethbrake_marl.files.python_file import files_run
 from ethbrake_marl.physics.state import Ints, Worlds
-from ethbrake_marl.policies.network import Policy
+from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.registry import versions_used
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario

@@ -26,7 +26,7 @@ from ethbrake_marl.extensions.search.best_harm import task_problem
 from ethbrake_marl.files.yaml import FileModel, Override, Wording, flow_text, read_model, read_yaml
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
-from ethbrake_marl.policies.network import Policy
+from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.scenario.catalogue import load_scenario, scenario_path
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.roles import ScriptSpec

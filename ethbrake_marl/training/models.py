@@ -12,13 +12,15 @@ from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
-from ethbrake_marl.policies.manifest import Float32s, NetworkSpec
-from ethbrake_marl.policies.network import Policy
+from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
+from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.teams import PolicyTeam, Trained
 from ethbrake_marl.scenario.observed import Appended
+from ethbrake_marl.training.algorithm import Algorithm
 from ethbrake_marl.training.checkpoint import TrainingState
 from ethbrake_marl.training.recipe import Scheme
-from ethbrake_marl.training.run_folder import Algorithm, RunDirectory, Training
+from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.training import Training
 
 Model = BaseAlgorithm  # of Stable-Baselines3
 

@@ -8,7 +8,7 @@ import numpy as np
 from stable_baselines3.common.policies import BasePolicy
 from torch import nn
 
-from ethbrake_marl.policies.manifest import Activation, Float32s, NetworkSpec
+from ethbrake_marl.policies.network_spec import Activation, Float32s, NetworkSpec
 from ethbrake_marl.training.recipe import NetworkShape
 
 ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh}

@@ -30,7 +30,7 @@ from ethbrake_marl.files.yaml import (
 )
 from ethbrake_marl.game.features import ListedFeatures, listed_features
 from ethbrake_marl.game.rewards import RewardParams, setting_names
-from ethbrake_marl.policies.manifest import Activation, NetworkSpec
+from ethbrake_marl.policies.network_spec import Activation, NetworkSpec
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.scenario.catalogue import check_file_name, shipped_folder
 from ethbrake_marl.scenario.schema import Scenario

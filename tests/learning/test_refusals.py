@@ -11,16 +11,17 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import script_agents
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, UnknownName
 from ethbrake_marl.evaluation.named_worlds import load_runnable
-from ethbrake_marl.extensions.learners.actors import widened
+from ethbrake_marl.extensions.learners.start_weights import widened
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.files.store import hold_lock
-from ethbrake_marl.policies.network import load_policy
+from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.training.ppo import Ppo
 from ethbrake_marl.training.recipe import load_recipe, register_algorithm
 from ethbrake_marl.training.recipes import PpoRecipe
-from ethbrake_marl.training.run_folder import RunDirectory, Training
+from ethbrake_marl.training.run_folder import RunDirectory
 from ethbrake_marl.training.session import resume, train
 from ethbrake_marl.training.settings import read_settings
+from ethbrake_marl.training.training import Training
 from tests.fixtures.policies import make_policy
 from tests.learning.test_algorithms import A2C, recipe_file
 from tests.learning.tiny import TINY_COUNTERFACTUAL, TINY_MODES, TINY_OPTIONS, TINY_PPO

@@ -11,13 +11,14 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.files.yaml import parse_yaml, read_yaml
-from ethbrake_marl.policies.manifest import NetworkSpec
-from ethbrake_marl.policies.network import load_policy
+from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.policies.network_spec import NetworkSpec
 from ethbrake_marl.policies.teams import PolicyTeam
 from ethbrake_marl.training.models import make_model
 from ethbrake_marl.training.recipe import TrainingRecipe, algorithm_names, load_recipe
-from ethbrake_marl.training.run_folder import RunDirectory, Training
+from ethbrake_marl.training.run_folder import RunDirectory
 from ethbrake_marl.training.session import train
+from ethbrake_marl.training.training import Training
 from tests.learning.tiny import TINY_PPO, Answer, files_of, harm_beside_full_braking, marked, watch_steps
 
 PAIR = eb.load_scenario("cooperation-3-pair")

@@ -43,8 +43,8 @@ from ethbrake_marl.scenario.catalogue import load_scenario, scenario_path
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.shield.drivers import Shielded
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, load_recipe
-from ethbrake_marl.training.run_folder import Training
 from ethbrake_marl.training.session import train
+from ethbrake_marl.training.training import Training
 from tests.learning.tiny import TINY_PPO
 from tests.pages.hostile import Page
 from tests.studies.conftest import ABLATE, LEVELS, check_snapshot, study

@@ -28,7 +28,8 @@ from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield.drivers import Shielded
-from ethbrake_marl.training.run_folder import RunDirectory, Training
+from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.training import Training
 
 
 @dataclass(frozen=True, slots=True)

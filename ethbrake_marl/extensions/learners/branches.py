@@ -12,11 +12,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.engine.engine import Engine, Moment
+from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.game.observations import Observations
-from ethbrake_marl.physics.columns import columns
+from ethbrake_marl.physics.columns import Packed, columns
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Bools, Floats, Ints
-from ethbrake_marl.policies.manifest import Float32s
+from ethbrake_marl.policies.network_spec import Float32s
 
 ROUNDING_MPS2 = 1e-5  # a command that differs by less is the same: networks round by the size of their batch
 
@@ -130,3 +131,15 @@ def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, sta
                 known = column.latency <= c < column.mass or (by_link and c >= column.news)
                 same = same and (not known or params[k, c] < before[m, column.time] or np.isinf(params[k, c]))
         stands[m] = same
+
+
+def other_count(count: HarmCount) -> HarmCount:
+    """Of both, the one that it is not."""
+    return "total" if count == "first" else "first"
+
+
+def moving_rows(moments: Moment) -> Bools:
+    """In which rows some vehicle moves; where everything stands there is nothing to learn."""
+    column = Packed(moments.state, moments.params).column
+    moving: Bools = (moments.state[:, column.speed : column.command] != 0.0).any(axis=1)
+    return moving

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 
-from ethbrake_marl.extensions.learners.actors import AveragedActor, Deterministic
-from ethbrake_marl.extensions.learners.gate import AveragedGate
-from ethbrake_marl.extensions.learners.recipes import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.averaged_actor import AveragedActor, Deterministic
+from ethbrake_marl.extensions.learners.gating_network import AveragedGate
+from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
 from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.policies.manifest import Float32s
+from ethbrake_marl.policies.network_spec import Float32s
 
 
 class ModesPolicy(Deterministic):

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from ethbrake_marl.physics.state import Floats, Ints
-from ethbrake_marl.policies.manifest import Float32s
+from ethbrake_marl.policies.network_spec import Float32s
 
 WIDTH = 64  # of its hidden layer
 

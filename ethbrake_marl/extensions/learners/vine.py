@@ -6,12 +6,13 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch.optim import Optimizer
 
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
-from ethbrake_marl.extensions.learners.actors import widened
-from ethbrake_marl.extensions.learners.mixture import ModesModel
-from ethbrake_marl.extensions.learners.recipes import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.mixture_model import ModesModel
+from ethbrake_marl.extensions.learners.start_weights import widened
 from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
+from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
 from ethbrake_marl.policies.shipped import load_named_policy
-from ethbrake_marl.training.run_folder import Algorithm, Training
+from ethbrake_marl.training.algorithm import Algorithm
+from ethbrake_marl.training.training import Training
 
 
 class Counterfactual(Algorithm):

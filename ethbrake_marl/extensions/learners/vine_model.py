@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from typing import Any, Self
 
 import numpy as np
@@ -14,29 +13,16 @@ from torch import Tensor
 
 from ethbrake_marl.engine.engine import Moment
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
-from ethbrake_marl.extensions.learners.actors import (
-    CUT,
-    REMEMBERED,
-    Adam,
-    AveragedActor,
-    Deterministic,
-    Tried,
-    descend,
-    follow,
-    limit_that_cuts,
-    moving_rows,
-    smallest_offset,
-    trusted_targets,
-)
-from ethbrake_marl.extensions.learners.branches import Act, Offsets, play_to_the_end
+from ethbrake_marl.extensions.learners.averaged_actor import AveragedActor, Deterministic
+from ethbrake_marl.extensions.learners.branches import Act, Offsets, moving_rows, play_to_the_end
+from ethbrake_marl.extensions.learners.gradient_limit import CUT, REMEMBERED, limit_that_cuts, smallest_offset
 from ethbrake_marl.extensions.learners.mixture_policy import ModesPolicy
-from ethbrake_marl.extensions.learners.recipes import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.optimizer import descend, follow
 from ethbrake_marl.extensions.learners.scout import choose_rows
+from ethbrake_marl.extensions.learners.trust_radius import Tried, trusted_targets
+from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
 from ethbrake_marl.physics.state import Floats, Ints
-from ethbrake_marl.policies.manifest import Float32s
-
-for _name in ("step", "add_param_group", "zero_grad", "state_dict", "load_state_dict"):
-    setattr(Adam, _name, torch.no_grad()(inspect.unwrap(getattr(torch.optim.Adam, _name))))
+from ethbrake_marl.policies.network_spec import Float32s
 
 
 class CounterfactualModel(BaseAlgorithm):

@@ -37,7 +37,7 @@ from ethbrake_marl.files.store import read_object, write_output
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.game.rewards import RewardParams
 from ethbrake_marl.policies.manifest import installed_versions
-from ethbrake_marl.policies.network import Policy
+from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
 from ethbrake_marl.training.recipe import TrainingRecipe

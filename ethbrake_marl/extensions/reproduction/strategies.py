@@ -17,7 +17,8 @@ from ethbrake_marl.extensions.reproduction.trainings import EARLY, STOPPED
 from ethbrake_marl.extensions.reproduction.verdicts import LIST_SEED, PREDICTED, PROVEN
 from ethbrake_marl.extensions.search.limits import Unproven
 from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.policies.network import Policy, load_policy
+from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.shipped import load_shipped
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario

@@ -10,10 +10,10 @@ from typing import Any
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.extensions.studies.trainings import TrainingJob
 from ethbrake_marl.files.store import remove_folder
-from ethbrake_marl.policies.network import Policy
+from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.teams import read_trained
 from ethbrake_marl.training.run_folder import RunDirectory
-from ethbrake_marl.training.session import StopAt
+from ethbrake_marl.training.stretch import StopAt
 
 _MEASURED = ("first_impact_harm", "total_harm", "collision_rate")
 

@@ -16,10 +16,11 @@ from ethbrake_marl.files.store import read_object
 from ethbrake_marl.parallel import run_each
 from ethbrake_marl.physics.state import Worlds
 from ethbrake_marl.scenario.sample import Sample
-from ethbrake_marl.training.run_folder import RunDirectory, Training
+from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.training import Training
 
 if TYPE_CHECKING:
-    from ethbrake_marl.training.session import StopAt
+    from ethbrake_marl.training.stretch import StopAt
 
 
 def train_all(trainings: Sequence[TrainingJob], jobs: int = 1, tell: OnProgress | None = None) -> bool:

@@ -11,13 +11,13 @@ from ethbrake_marl.engine.engine import Engine, Moment
 from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.extensions.learners.branches import Act, Offsets, play_on, play_to_the_end
-from ethbrake_marl.extensions.learners.recipes import ModesPlan
+from ethbrake_marl.extensions.learners.mixture_plan import ModesPlan
 from ethbrake_marl.extensions.search.templates import best_templates
 from ethbrake_marl.game.actions import command_to_action
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
-from ethbrake_marl.policies.manifest import Float32s
+from ethbrake_marl.policies.network_spec import Float32s
 
 NO_DIFFERENCE = 1e-2  # of returns: two networks that differ by less do the same
 

@@ -1,11 +1,11 @@
-"""The stages of a training of several experts: which updates do what."""
+"""The stages of training a mixture of experts: which updates do what."""
 
 from __future__ import annotations
 
 import math
 from typing import Literal, NamedTuple
 
-from ethbrake_marl.extensions.learners.recipes import ModesPlan
+from ethbrake_marl.extensions.learners.mixture_plan import ModesPlan
 
 ROUNDING = 1e-6  # of sums of shares, in updates
 

@@ -1,4 +1,4 @@
-"""The model that trains a mixture of experts: one expert alone, further ones, the gating network, then all together."""
+"""Train a mixture of experts: one expert alone, further experts, the gating network, then all together."""
 
 from __future__ import annotations
 
@@ -12,17 +12,11 @@ from torch.nn.functional import mse_loss, softplus
 
 from ethbrake_marl.engine.engine import Moment
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
-from ethbrake_marl.extensions.learners.actors import (
-    AveragedActor,
-    Tried,
-    adam,
-    descend,
-    follow,
-    moving_rows,
-    other_count,
-)
-from ethbrake_marl.extensions.learners.branches import visit
-from ethbrake_marl.extensions.learners.explored import (
+from ethbrake_marl.extensions.learners.averaged_actor import AveragedActor
+from ethbrake_marl.extensions.learners.branches import moving_rows, other_count, visit
+from ethbrake_marl.extensions.learners.mixture_policy import ModesPolicy
+from ethbrake_marl.extensions.learners.mixture_stages import Stage, stages_of
+from ethbrake_marl.extensions.learners.mixture_worlds import (
     NoOtherMode,
     Shown,
     drive_from,
@@ -30,13 +24,13 @@ from ethbrake_marl.extensions.learners.explored import (
     own_worlds,
     show_templates,
 )
-from ethbrake_marl.extensions.learners.mixture_policy import ModesPolicy
-from ethbrake_marl.extensions.learners.recipes import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.optimizer import adam, descend, follow
 from ethbrake_marl.extensions.learners.scout import choose_rows
-from ethbrake_marl.extensions.learners.stages import Stage, stages_of
+from ethbrake_marl.extensions.learners.trust_radius import Tried
 from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
+from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
 from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.policies.manifest import Float32s
+from ethbrake_marl.policies.network_spec import Float32s
 
 
 class ModesModel(CounterfactualModel):

@@ -1,4 +1,4 @@
-"""The gating network of a mixture of experts: what it has learned, and the average that decides."""
+"""The gating network of a mixture of experts: weights that learn, and their average, which decides."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 
-from ethbrake_marl.extensions.learners.actors import adam
-from ethbrake_marl.extensions.learners.recipes import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.optimizer import adam
 from ethbrake_marl.extensions.learners.scout import Scout
-from ethbrake_marl.policies.manifest import Float32s
+from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
+from ethbrake_marl.policies.network_spec import Float32s
 from ethbrake_marl.training.networks import ACTIVATIONS
 
 

@@ -1,0 +1,118 @@
+"""The recipe of rollout classification (``algorithm: options``)."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from operator import not_
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from ethbrake_marl.agents.protocol import Source
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.learners.recipe_keys import NO_SHAPING, Focus, OffsetRange, Steps
+from ethbrake_marl.files.yaml import refuse
+from ethbrake_marl.policies.network_spec import Activation, NetworkSpec
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.policies.shipped import SHIPPED, load_named_policy
+from ethbrake_marl.registry import Part
+from ethbrake_marl.training.agents import make_policy_agent
+from ethbrake_marl.training.recipe import Averaging, Layers, NonNegative, Positive, Shape, TrainingRecipe
+
+
+class ChoosingShape(Shape):
+    """Hidden layers of an actor that scores a number of actions, evenly from -1 to 1."""
+
+    policy: Layers
+    activation: Activation = "relu"
+    choices: Annotated[int, Field(ge=2, le=4096)]
+
+    def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
+        """The actor, which takes the action of the highest score."""
+        return super().spec(observation_size, output="choice", choices=self.choices, **more)
+
+
+PolicyName = Annotated[str, Field(pattern=r"^[a-z]+@.+$", max_length=4096)]
+
+
+class OptionsRecipe(TrainingRecipe):
+    """Try ``tried`` of the ``n_envs x n_steps`` decisions of a round with several actions each; learn to choose.
+
+    The actions of the policy are ``network.choices``, evenly from -1 to 1, and those of the policies ``among`` which it
+    chooses too. Tried are the one that it takes, one below and one above it in each of the distances ``near``, the
+    actions ``fixed``, and ``drawn`` ones: of the policies, or of the actions where there are none.
+    """
+
+    most_decisions = 2**22
+
+    algorithm: Literal["options"]
+    among: Annotated[tuple[PolicyName, ...], Field(strict=False, max_length=16, exclude_if=not_)] = ()
+    n_steps: Annotated[int, Field(ge=1)]
+    tried: Annotated[int, Field(ge=1)]
+    near: Annotated[tuple[OffsetRange, ...], Field(strict=False, max_length=8)]
+    fixed: Annotated[tuple[Annotated[float, Field(ge=-1.0, le=1.0)], ...], Field(strict=False, max_length=16)]
+    drawn: Annotated[int, Field(ge=0, le=16)]
+    holds: Annotated[tuple[Steps, ...], Field(strict=False, min_length=1, max_length=16)]
+    largest_cost: Positive
+    caution: Annotated[float, Field(ge=0.0, allow_inf_nan=False, exclude_if=not_)] = 0.0
+    tie_break: Annotated[float, Field(ge=0.0, allow_inf_nan=False, exclude_if=not_)] = 0.0
+    relative: Annotated[bool, Field(exclude_if=not_)] = False
+    focus: Focus = 0.0  # share of what is learned from that is drawn by what there is to lose
+    guide: NonNegative
+    memory: Annotated[int, Field(ge=1, le=500_000)]
+    gradient_steps: Annotated[int, Field(ge=1, le=100_000)]
+    batch_size: Annotated[int, Field(ge=2)]
+    averaging: Averaging
+    network: ChoosingShape
+
+    @model_validator(mode="after")
+    def _keys_fit(self) -> OptionsRecipe:
+        if self.reward.shaping > 0.0:
+            refuse(("reward", "shaping"), self.reward.shaping, NO_SHAPING)
+        visited = self.n_envs * self.n_steps
+        if not self.tried <= visited:
+            refuse(("tried",), self.tried, f"must be at most n_envs x n_steps = {visited}")
+        if not self.memory >= self.tried:
+            refuse(("memory",), self.memory, f"must be at least tried = {self.tried}")
+        if not self.others:
+            refuse(("near",), list(self.near), "must hold a range where there are neither fixed nor drawn actions")
+        return self
+
+    @property
+    def others(self) -> int:
+        """How many actions are tried beside the one that the policy takes."""
+        return 2 * len(self.near) + len(self.fixed) + self.drawn
+
+    def network_spec(self, observation_size: int) -> NetworkSpec:
+        """The actor, with the policies among which it chooses."""
+        several = {"observation_size": observation_size, "value_hidden": ()}
+        among = tuple(each.manifest.network.model_copy(update=several) for each in self.policies)
+        return self.network.spec(observation_size, among=among)
+
+    @cached_property
+    def policies(self) -> tuple[Policy, ...]:
+        """Those among which it chooses, read once; raises ``InvalidInput`` naming one that cannot be taken.
+
+        One that itself chooses among policies stands for those.
+        """
+        found: list[Policy] = []
+        for name in self.among:
+            kind, _, path = name.partition("@")
+            policy = load_named_policy(path)
+            where, by = f"recipe {self.name!r}: among: {name}", policy.manifest.algorithm
+            if path == SHIPPED or kind not in ("policy", by):
+                raise InvalidInput(f"{where}: give policy@shipped/NAME, or {by}@ and its path")
+            found += policy.among or [policy]
+        if found and not self.drawn <= len(found):
+            raise InvalidInput(f"recipe {self.name!r}: drawn = {self.drawn}: must be at most the {len(found)} of among")
+        return tuple(found)
+
+
+OPTIONS = Part(OptionsRecipe, "ethbrake_marl.extensions.learners.rollout_classification:Options")
+
+OPTIONS_AGENT = Part(
+    make_policy_agent,
+    form="options@PATH",
+    about="a policy trained by options: a run, a bundle, or shipped",
+    knows=Source.MESSAGES,
+)
