@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.training.session import TrainResult as TrainResult, resume as resume, train as train
     from ethbrake_marl.training.settings import Settings as Settings, read_settings as read_settings
     from ethbrake_marl.training.stretch import StopAt as StopAt
+    from ethbrake_marl.training.team import load_team as load_team
     from ethbrake_marl.training.training import Training as Training
 else:
     __getattr__ = front_door(__name__, __file__)

@@ -22,7 +22,7 @@ from ethbrake_marl.training.random_state import own_random_state
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe
 from ethbrake_marl.training.run_folder import RunDirectory
 from ethbrake_marl.training.stretch import Ended, Session, StopAt, Wishes
-from ethbrake_marl.training.training import Training
+from ethbrake_marl.training.training import Training, recorded_training
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +147,7 @@ def resume(
     """
     run = RunDirectory(Path(directory))
     config = run.read_config()
-    training = run.training(config)
+    training = recorded_training(run, config)
     status = read_object(run.status)
     resumable = any(run.checkpoints.glob("step_*"))
     if status["status"] == "finished" or (status.get("stage") is not None and not resumable):  # its report may be open

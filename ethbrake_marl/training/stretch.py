@@ -172,7 +172,7 @@ class Session(BaseCallback):
                 )
         updates, recipe = self.updates, self.recipe
         measure = self._evaluate is not None and (last or updates % recipe.evaluation.every_updates == 0)
-        if last or measure or updates % getattr(recipe, "log_every_updates", 1) == 0:
+        if last or measure or updates % recipe.updates_per_row == 0:
             self._rest()
             if measure:
                 self._measure()

@@ -34,13 +34,19 @@ from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.layers import dense
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.teams import Trained, read_trained
-from ethbrake_marl.training import model_state, models, progress as progress_module, random_state
+from ethbrake_marl.training import (
+    model_state,
+    models,
+    progress as progress_module,
+    random_state,
+    session as train_module,
+)
 from ethbrake_marl.training.checkpoint import ARRAYS, NUMBERS, TrainingState, read_checkpoint, write_checkpoint
 from ethbrake_marl.training.models import TrainingDiverged, open_logs
 from ethbrake_marl.training.progress import Course
 from ethbrake_marl.training.recipe import LearningRate, TrainingRecipe, load_recipe
 from ethbrake_marl.training.run_folder import RunDirectory
-from ethbrake_marl.training.session import TrainResult, resume, train as train_module
+from ethbrake_marl.training.session import TrainResult, resume
 from ethbrake_marl.training.training import Training
 from tests.docs.site import load
 from tests.learning.tiny import (

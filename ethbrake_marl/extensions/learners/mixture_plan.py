@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 from pydantic import Field, model_validator
 
 from ethbrake_marl.files.yaml import FileModel
@@ -29,16 +27,24 @@ class Shares(FileModel):
 class ModesPlan(FileModel):
     """How many networks, how the worlds of each further one are found, and how the gate between them learns."""
 
-    networks: Annotated[int, Field(ge=2, le=16)]
-    gate: Layers  # hidden layers
-    worlds: Annotated[int, Field(ge=1, le=1_000_000)]  # in which a mode is looked for
-    templates: Annotated[int, Field(ge=1, le=100_000)]  # drawn in each of them
-    gain: NonNegative  # return by which a template must be better than all networks before to be imitated
-    margin: Positive  # return by which a network may be worse than those before in a world of its own
-    imitation_epochs: Annotated[int, Field(ge=1, le=1000)]
-    gate_states: Annotated[int, Field(ge=1, le=1_000_000)]  # in each update, at which networks are compared
-    gate_memory: Annotated[int, Field(ge=1, le=1_000_000)]  # of them that are remembered
-    gate_steps: Annotated[int, Field(ge=1, le=100_000)]  # of its optimiser in each update
-    tie_break: NonNegative  # of the harm by the other count, added to minus the return when networks are compared
-    together_rate: Rate  # share of the learning rate in the last stage
-    shares: Shares
+    networks: int = Field(ge=2, le=16, description="how many")
+    gate: Layers = Field(description="hidden layers of the gate")
+    worlds: int = Field(ge=1, le=1_000_000, description="worlds of the training in which a mode is looked for")
+    templates: int = Field(ge=1, le=100_000, description="how many templates are drawn in each of them")
+    gain: NonNegative = Field(
+        description="return by which a template must be better than every network before, to be imitated"
+    )
+    margin: Positive = Field(
+        description="return by which a network may be worse than those before it in a world of its own"
+    )
+    imitation_epochs: int = Field(ge=1, le=1000, description="how often the shown decisions are gone through")
+    gate_states: int = Field(
+        ge=1, le=1_000_000, description="decisions of an update at which the networks are compared"
+    )
+    gate_memory: int = Field(ge=1, le=1_000_000, description="how many compared decisions are remembered")
+    gate_steps: int = Field(ge=1, le=100_000, description="steps of the gate's optimiser in each update")
+    tie_break: NonNegative = Field(description="weight of the other count's harm in that comparison")
+    together_rate: Rate = Field(
+        description="share of the learning rate in the last stage, where noise undoes what was learned"
+    )
+    shares: Shares = Field(description="share of all updates that each stage has, 1 in all")

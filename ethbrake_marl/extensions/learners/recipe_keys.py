@@ -25,7 +25,11 @@ class OffsetRange(FileModel):
         return value
 
 
-Steps = Annotated[int, Field(ge=1, le=1000)]
+Holds = Annotated[tuple[Annotated[int, Field(ge=1, le=1000)], ...], Field(strict=False, min_length=1, max_length=16)]
+
+Averaging = Annotated[float, Field(ge=0.0, lt=1.0)]  # 1 would keep the first weights for ever
+
+AVERAGING = "share of itself that the average of the weights, which drives, keeps in each gradient step"
 
 NO_SHAPING = "must be 0: what is tried is played to the end, where shaping tells nothing more"
 

@@ -10,22 +10,23 @@ from pydantic import Field, model_validator
 
 from ethbrake_marl.agents.protocol import Source
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.learners.recipe_keys import NO_SHAPING, Focus, OffsetRange, Steps
+from ethbrake_marl.extensions.learners.recipe_keys import AVERAGING, NO_SHAPING, Averaging, Focus, Holds, OffsetRange
 from ethbrake_marl.files.yaml import refuse
 from ethbrake_marl.policies.network_spec import Activation, NetworkSpec
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.shipped import SHIPPED, load_named_policy
 from ethbrake_marl.registry import Part
 from ethbrake_marl.training.agents import make_policy_agent
-from ethbrake_marl.training.recipe import Averaging, Layers, NonNegative, Positive, Shape, TrainingRecipe
+from ethbrake_marl.training.recipe import ACTOR_LAYERS, Layers, NonNegative, Positive, Shape, TrainingRecipe
+from ethbrake_marl.training.recipes import BATCH_SIZE, NETWORK
 
 
 class ChoosingShape(Shape):
     """Hidden layers of an actor that scores a number of actions, evenly from -1 to 1."""
 
-    policy: Layers
+    policy: Layers = Field(description=ACTOR_LAYERS)
     activation: Activation = "relu"
-    choices: Annotated[int, Field(ge=2, le=4096)]
+    choices: int = Field(ge=2, le=4096, description="how many actions, evenly from -1 to 1, the network scores")
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
         """The actor, which takes the action of the highest score."""
@@ -46,24 +47,59 @@ class OptionsRecipe(TrainingRecipe):
     most_decisions = 2**22
 
     algorithm: Literal["options"]
-    among: Annotated[tuple[PolicyName, ...], Field(strict=False, max_length=16, exclude_if=not_)] = ()
-    n_steps: Annotated[int, Field(ge=1)]
-    tried: Annotated[int, Field(ge=1)]
-    near: Annotated[tuple[OffsetRange, ...], Field(strict=False, max_length=8)]
-    fixed: Annotated[tuple[Annotated[float, Field(ge=-1.0, le=1.0)], ...], Field(strict=False, max_length=16)]
-    drawn: Annotated[int, Field(ge=0, le=16)]
-    holds: Annotated[tuple[Steps, ...], Field(strict=False, min_length=1, max_length=16)]
-    largest_cost: Positive
-    caution: Annotated[float, Field(ge=0.0, allow_inf_nan=False, exclude_if=not_)] = 0.0
-    tie_break: Annotated[float, Field(ge=0.0, allow_inf_nan=False, exclude_if=not_)] = 0.0
-    relative: Annotated[bool, Field(exclude_if=not_)] = False
-    focus: Focus = 0.0  # share of what is learned from that is drawn by what there is to lose
-    guide: NonNegative
-    memory: Annotated[int, Field(ge=1, le=500_000)]
-    gradient_steps: Annotated[int, Field(ge=1, le=100_000)]
-    batch_size: Annotated[int, Field(ge=2)]
-    averaging: Averaging
-    network: ChoosingShape
+    among: Annotated[tuple[PolicyName, ...], Field(strict=False, max_length=16, exclude_if=not_)] = Field(
+        (), description="policies of which one can act at each decision; one that chooses among others stands for them"
+    )
+    n_steps: int = Field(ge=1, description="decisions of each world between two updates")
+    tried: int = Field(ge=1, description="how many of the decisions of a round are tried with other actions")
+    near: Annotated[tuple[OffsetRange, ...], Field(strict=False, max_length=8)] = Field(
+        description="ranges of distances to the action taken, each tried below and above it; the logarithm drawn is"
+        " uniform"
+    )
+    fixed: Annotated[tuple[Annotated[float, Field(ge=-1.0, le=1.0)], ...], Field(strict=False, max_length=16)] = Field(
+        description="actions tried at each of these decisions, from -1 (full braking) to 1; the nearest of the choices"
+        " is"
+    )
+    drawn: int = Field(
+        ge=0,
+        le=16,
+        description="how many more are tried there: of the policies among, or where there are none of the choices",
+    )
+    holds: Holds = Field(description="for how many steps an action is tried, one of these")
+    largest_cost: Positive = Field(
+        description="an action that costs more than this beyond the best one counts as this much more"
+    )
+    caution: float = Field(
+        0.0,
+        ge=0.0,
+        allow_inf_nan=False,
+        exclude_if=not_,
+        description="how many times the excess over full braking from there on counts besides, at the end; it grows"
+        " from 0",
+    )
+    tie_break: float = Field(
+        0.0,
+        ge=0.0,
+        allow_inf_nan=False,
+        exclude_if=not_,
+        description="weight of the whole line's harm in the other count, beside the reward",
+    )
+    relative: bool = Field(
+        False, exclude_if=not_, description="true: in a mixture, costs count beside the usual ones of the same scenario"
+    )
+    focus: Focus = Field(0.0, description="share of what is learned from that is drawn where a choice matters most")
+    guide: NonNegative = Field(
+        description="weight of the convex part of the loss, without which learning can stand still at the beginning"
+    )
+    memory: int = Field(
+        ge=1,
+        le=500_000,
+        description="how many decisions are learned from: the last ones at which the tried actions differ in cost",
+    )
+    gradient_steps: int = Field(ge=1, le=100_000, description="steps of the optimiser in one update")
+    batch_size: int = Field(ge=2, description=BATCH_SIZE)
+    averaging: Averaging = Field(description=AVERAGING)
+    network: ChoosingShape = Field(description=NETWORK)
 
     @model_validator(mode="after")
     def _keys_fit(self) -> OptionsRecipe:

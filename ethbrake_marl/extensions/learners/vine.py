@@ -24,8 +24,9 @@ class Counterfactual(Algorithm):
         assert isinstance(recipe, CounterfactualRecipe)
         environment.engine.branch(environment.engine.moment())  # refuses what cannot be branched before it begins
         model = (CounterfactualModel if recipe.modes is None else ModesModel)(environment, recipe)
-        if training.start is not None:
-            kind, _, path = training.start.partition("@")
+        start = recipe.policy_to_start_from(training.scenario)
+        if start is not None:
+            kind, _, path = start.partition("@")
             policy = load_named_policy(path, kind, training.scenario, recipe.reward.harm_count)
             first = model.policy.actors[0] if isinstance(model, ModesModel) else model.policy
             first.take_over(widened(policy, training))
