@@ -17,16 +17,16 @@ from ethbrake_marl.training.training import Training
 
 AT_HORIZON = "horizon_rate"  # share of the fixed list's episodes in which something still moves at the horizon
 
-Evaluate = Callable[[Any], Mapping[str, float]]  # of what is trained: a ``Policy``, or a ``PolicyTeam``
+Evaluate = Callable[[Any], Mapping[str, float]]  # a ``Policy`` or a ``PolicyTeam`` -> metrics
 
 Measure = Callable[[Training], Evaluate]
 
 
 def measure_on_list(training: Training) -> Evaluate:
-    """What measures the learners' policies on the recipe's fixed list: the means that ``evaluate`` gives on it.
+    """Draw the recipe's fixed list, and return the function that measures policies on it.
 
-    These alone: no bound is proven and no best known harm is looked up, as nobody is shown them. Where a learner has
-    another objective than total, also what each one's makes of the harm, and the mean of these.
+    Metrics are means over the list, as ``evaluate`` gives them. If a learner has another objective than total harm,
+    the value of each learner's objective and their mean come after them.
     """
     recipe, scenario = training.recipe, training.scenario
     names = scenario.vehicle_names

@@ -2,34 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
+from typing import Literal
 
 from ethbrake_marl.errors import InvalidInput, Progress, Told, stop_on_signal
-from ethbrake_marl.files.store import hold_lock, read_object, remove_unfinished
+from ethbrake_marl.files.store import hold_lock, read_object, remove_folder, remove_unfinished
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.teams import Trained
 from ethbrake_marl.registry import versions_used
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.training.callback import RunCallback, StopAt, StopRequested, Watchers
 from ethbrake_marl.training.checkpoint import TrainingState, newest_usable
+from ethbrake_marl.training.finite import FiniteNumbers, TrainingDiverged, weights_are_finite
 from ethbrake_marl.training.fixed_list import Measure, measure_on_list
-from ethbrake_marl.training.models import make_environment, make_model
+from ethbrake_marl.training.logs import open_logs
+from ethbrake_marl.training.models import Learner, make_environment, make_model
 from ethbrake_marl.training.random_state import own_random_state
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe
-from ethbrake_marl.training.run_folder import RunDirectory
-from ethbrake_marl.training.stretch import Ended, Session, StopAt, Wishes
+from ethbrake_marl.training.run_folder import RunDirectory, RunStatus
 from ethbrake_marl.training.training import Training, recorded_training
+
+Ended = Literal["finished", "interrupted"]
+
+_BUSY = "another process is training here"
 
 
 @dataclass(frozen=True, slots=True)
 class TrainResult:
-    """What a training left behind.
+    """Policies of a training, and how it went.
 
-    ``trained`` is of the moment of least harm on the fixed list, or of the end where nothing was measured.
+    ``trained`` is the policy with the least harm on the fixed list, or the last policy if nothing was measured.
 
     >>> import ethbrake_marl as eb
     >>> short = {"n_envs": 8, "n_steps": 16, "batch_size": 64, "n_epochs": 1}
@@ -41,14 +47,14 @@ class TrainResult:
     """
 
     directory: Path  # the run's folder
-    training: Training  # recipe, scenario and what they come to
+    training: Training  # recipe and scenario
     trained: Trained  # one policy for all learners, or one for each; also saved as directory/policy
-    last: Trained  # of the end; also saved as directory/policy-last
+    last: Trained  # at the end; also saved as directory/policy-last
     status: Ended  # finished or interrupted
     steps: int  # decisions of all learners, a multiple of rows x rounds
     updates: int  # rounds of collecting and learning
-    wall_s: float  # s, of all stretches together
-    evaluations: tuple[Mapping[str, float], ...]  # what was measured on the way, in order
+    wall_s: float  # s, of all processes that trained here
+    evaluations: tuple[Mapping[str, float], ...]  # in order
 
     @property
     def policies(self) -> dict[str, Policy]:
@@ -57,12 +63,12 @@ class TrainResult:
 
     @property
     def policy(self) -> Policy:
-        """The policy that drives all learners; raises ``InvalidInput`` where each has its own."""
+        """The policy that drives all learners; raises ``InvalidInput`` if each learner has its own."""
         return _only(self.trained)
 
     @property
     def last_policy(self) -> Policy:
-        """The same of the training's end."""
+        """The last policy; raises ``InvalidInput`` if each learner has its own."""
         return _only(self.last)
 
 
@@ -87,38 +93,41 @@ def train(
     stop_at: StopAt | None = None,
     on_progress: Told = "show",
 ) -> TrainResult:
-    """Train the learners of ``scenario`` into the new ``directory``.
+    """Train the learners of ``scenario`` and write the run's folder: build, learn, evaluate, save.
 
     Ctrl-C stops after the update in progress (status ``interrupted``); a second one raises ``KeyboardInterrupt``.
-    Whatever ends it but a kill, ``policy/`` holds the best policy so far and ``policy-last/`` the last good one;
-    ``resume`` goes on. The same recipe, scenario, seed and machine give the same policy, bit for bit; global random
-    states are left as they were.
+    Unless the process is killed, ``policy/`` holds the best policy so far and ``policy-last/`` the last good one.
+    ``resume`` goes on. The same recipe, scenario, seed and machine give the same policy, bit for bit. The global
+    random generators are left as they were.
 
     Args:
         recipe: a recipe, its name, or the path of its file.
-        scenario: a scenario, its name, or the path of its file; its roles say who learns.
-        directory: the run's folder.
-        scheme: overrides the recipe's; without any, one learner is ``single`` and several are ``shared``.
-        turns: overrides the recipe's, of independent learners (docs/training-schemes.md).
-        seed: overrides the recipe's.
-        steps: overrides the recipe's decisions of learners; training ends after the first update at or beyond them.
+        scenario: a scenario, its name, or the path of its file. Its roles say who learns.
+        directory: the new folder of the run.
+        scheme: overrides the recipe's scheme. By default one learner is ``single``, several are ``shared``.
+        turns: overrides the recipe's turns of independent learners (docs/training-schemes.md).
+        seed: overrides the recipe's seed.
+        steps: overrides the recipe's decisions of learners. The last update may go beyond them.
         force: replace an earlier run.
-        settings: by which recipe and scenario differ from their files, ``KEY=VALUE`` each: noted in ``config.json``.
-        measure: makes of the training what measures its policies before the first update, then as the recipe says, and
-            at the end: by default on the recipe's fixed list. None: nothing is measured.
-        stop_at: is given every evaluation, as it stands in ``TrainResult.evaluations``, and gives a reason to stop
-            there, ``interrupted``, or None.
-        on_progress: is told how far the training is; by default stderr shows it, None: nobody is told.
+        settings: how recipe and scenario differ from their files, ``KEY=VALUE`` each; written to ``config.json``.
+        measure: called with the training; returns the function that measures its policies before the first update,
+            every few updates (a key of the recipe), and at the end. By default the recipe's fixed list. None: no
+            measurements.
+        stop_at: called with every evaluation (an entry of ``TrainResult.evaluations``); returns a reason to stop
+            there with status ``interrupted``, or None.
+        on_progress: called with the progress. By default stderr shows it; None: silent.
 
-    Raises ``AlreadyExists`` for an existing directory without ``force``, ``InvalidInput`` where recipe and scenario do
+    Raises ``AlreadyExists`` for an existing directory without ``force``, ``InvalidInput`` if recipe and scenario do
     not fit each other, ``TrainingDiverged`` for numbers that are not finite.
 
     """
     changes = {"scheme": scheme, "turns": turns, "seed": seed, "total_steps": steps}
     training = Training.of(recipe, scenario, **{name: value for name, value in changes.items() if value is not None})
     run = RunDirectory(Path(directory))
-    begin = partial(run.create, training.config(settings), team=training.team(), force=force)
-    return _run(run, begin, training, Wishes(measure, stop_at, Progress.listener(on_progress)))
+    with build(training, run, measure, stop_at, on_progress) as callback:  # may refuse, before there is a folder
+        run.create(training.config(settings), team=training.team(), force=force)
+        with hold_lock(run.lock, _BUSY):
+            return learn(callback, None)
 
 
 def resume(
@@ -129,82 +138,140 @@ def resume(
     on_progress: Told = "show",
     other_versions: bool = False,
 ) -> TrainResult:
-    """Go on with a training that was stopped or killed, to the policies that it would have come to: the same bits.
+    """Go on with a training that was stopped or killed. The policies are the same bits as without the stop.
 
-    It goes on from the newest checkpoint that is whole, or from the beginning when there is none; rows and events after
-    that checkpoint are dropped, so that nothing stands twice.
+    Training goes on from the newest checkpoint that is whole, or from the beginning if there is none. Rows and events
+    after that checkpoint are dropped.
 
     Args:
         directory: the run's folder.
-        measure: as it was given to ``train``.
-        stop_at: as it was given to ``train``; it hears of new evaluations only.
-        on_progress: is told how far the training is; by default stderr shows it, None: nobody is told.
-        other_versions: go on from a checkpoint that other versions wrote, although its numbers may differ.
+        measure: the argument that ``train`` was called with.
+        stop_at: the argument that ``train`` was called with. It is called with new evaluations only.
+        on_progress: called with the progress. By default stderr shows it; None: silent.
+        other_versions: go on from a checkpoint that other versions wrote, although the numbers may differ.
 
-    Raises ``InvalidInput`` for a folder without a training, one that has finished, one in which another process trains,
-    one whose ``config.json`` was edited since the checkpoint, and a checkpoint of other versions.
+    Raises ``InvalidInput`` for a folder without a training, with a finished one, with one that another process is
+    training, with a ``config.json`` edited since the checkpoint, and with a checkpoint of other versions.
 
     """
     run = RunDirectory(Path(directory))
-    config = run.read_config()
-    training = recorded_training(run, config)
-    status = read_object(run.status)
-    resumable = any(run.checkpoints.glob("step_*"))
-    if status["status"] == "finished" or (status.get("stage") is not None and not resumable):  # its report may be open
-        alone = len(training.drivers) == 1
-        agents = f"{training.recipe.algorithm}@{directory}+episode" if alone else f"team@{directory}"
-        raise InvalidInput(
-            f"{directory}: this training has finished; measure what it has learned with: ethbrake evaluate --scenario"
-            f" {training.scenario.name} --agents {agents}"
-        )
-
-    begin = partial(run.write_json, run.team, training.team())  # a damaged one would stay
-    wishes = Wishes(measure, stop_at, Progress.listener(on_progress))
-    return _run(run, begin, training, wishes, partial(_newest, run, training.identity, other_versions))
+    training = recorded_training(run, run.read_config())
+    _check_unfinished(run, training)
+    with build(training, run, measure, stop_at, on_progress) as callback:
+        run.write_json(run.team, training.team())  # the one that is there may be damaged
+        with hold_lock(run.lock, _BUSY):
+            state, damaged = _newest_checkpoint(run, training, other_versions)
+            return learn(callback, state, [f"a damaged checkpoint was left aside: {reason}" for reason in damaged])
 
 
-def _run(
-    run: RunDirectory,
-    begin: Callable[[], object],
-    training: Training,
-    wishes: Wishes,
-    find: Callable[[], tuple[TrainingState | None, list[str]]] = lambda: (None, []),
-) -> TrainResult:
-    """Train in the folder that ``begin`` makes or mends, once nothing can be wrong with environment and model.
-
-    ``find`` gives the checkpoint to go on from, if there is one, and why newer ones are not whole.
-    """
-    evaluate = None if wishes.measure is None else wishes.measure(training)
+@contextmanager
+def build(
+    training: Training, run: RunDirectory, measure: Measure | None, stop_at: StopAt | None, on_progress: Told
+) -> Iterator[RunCallback]:
+    """Build environment and model, and the callback that follows the training; raises what they refuse."""
+    evaluate = None if measure is None else measure(training)
     algorithm = training.recipe.make_algorithm()
     with own_random_state(), stop_on_signal() as stop, closing(make_environment(training)) as environment:
-        model = make_model(algorithm, training, environment)
-        begin()
-        with hold_lock(run.lock, "another process is training here"):
-            state, damaged = find()
-            session = Session(run, training, algorithm, model, wishes, evaluate, stop)
-            if state is not None:
-                session.restore(state)
-            if state is None and training.begins is not None:
-                session.notes.append(f"begins with {training.begins}")
-            session.notes += [f"a damaged checkpoint was left aside: {reason}" for reason in damaged]
-            status = session.learn(state)
-    course = session.course
-    assert course.policy is not None and course.kept is not None  # set before the first rollout
+        learner = Learner(training, algorithm, make_model(algorithm, training, environment))
+        yield RunCallback(run, learner, Watchers(evaluate, stop_at, Progress.listener(on_progress), stop))
+
+
+def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[str] = ()) -> TrainResult:
+    """Learn from a checkpoint, or from the beginning without one, to the end or the next stop; then save.
+
+    The callback evaluates on the way. However the training ends, its folder is complete.
+    """
+    run, (training, algorithm, model), course = callback.run, callback.learner, callback.course
+    if state is not None:
+        callback.restore(state)
+    elif training.begins is not None:
+        callback.notes.append(f"begins with {training.begins}")
+    callback.notes += notes
+    run.write_status("running", start=training.begins)
+    model.logger.output_formats = open_logs(run, state)
+    status: Ended = "finished"
+    reason: str | None = None
+    try:
+        model.learn(
+            training.recipe.total_steps - model.num_timesteps,
+            callback=[FiniteNumbers(), callback],
+            log_interval=None,  # type: ignore[arg-type]  # the callback writes the rows
+            reset_num_timesteps=state is None,
+        )
+    except StopRequested as stop:
+        status, reason = "interrupted", stop.args[0]
+    except BaseException as error:
+        cause = error  # torch's own when a distribution gets a NaN says little about a training
+        if isinstance(error, ValueError) and not weights_are_finite(model, algorithm):
+            cause = TrainingDiverged(
+                f"training: a weight or the exploration noise is not finite at step {model.num_timesteps};"
+                " try a smaller learning_rate"
+            )
+        ended: RunStatus = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+        save(callback, ended, f"{type(cause).__name__}: {cause}")
+        if cause is error:
+            raise
+        raise cause from error
+    finally:
+        model.logger.close()
+    save(callback, status, reason)
+    assert course.policy is not None and course.kept is not None  # taken before the first rollout
     return TrainResult(
         run.path, training, course.kept, course.policy, status, course.steps, course.updates, course.wall_s,
         tuple(course.evaluations),
     )  # fmt: skip
 
 
-def _newest(run: RunDirectory, training: str, other_versions: bool) -> tuple[TrainingState | None, list[str]]:
-    """The newest whole checkpoint, if there is one, and what was wrong with newer ones."""
+def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
+    """Save the best and the last good policy, and write how the run ended. A finished run needs no checkpoint."""
+    run, training, course = callback.run, callback.learner.training, callback.course
+    for policy, folder in ((course.kept, run.policy), (course.policy, run.last_policy)):
+        if policy is not None:
+            policy.save(folder, replace=True)
+    left_over = () if status == "finished" else run.checkpoints.glob("step_*")
+    ending = {
+        "start": training.begins,
+        "reason": reason,
+        "wall_s": round(course.wall_s, 3),
+        "cpu_s": {str(steps): round(spent, 3) for steps, spent in course.cpu_s.items()},
+        "steps": course.steps,
+        "updates": course.updates,
+        "policy_steps": None if course.kept is None else course.kept.steps,
+        "policy": run.policy.name if run.policy.is_dir() else None,
+        "checkpoints": sorted(path.name for path in left_over),
+    }
+    run.write_status(status, **ending)
+    if status == "finished" and run.checkpoints.is_dir():
+        remove_folder(run.checkpoints)
+
+
+def _check_unfinished(run: RunDirectory, training: Training) -> None:
+    """Raise ``InvalidInput`` if the training has finished; its evaluation by ``ethbrake run`` may be incomplete."""
+    status = read_object(run.status)
+    resumable = any(run.checkpoints.glob("step_*"))
+    if status["status"] == "finished" or (status.get("stage") is not None and not resumable):
+        alone = len(training.drivers) == 1
+        agents = f"{training.recipe.algorithm}@{run.path}+episode" if alone else f"team@{run.path}"
+        raise InvalidInput(
+            f"{run.path}: this training has finished; measure what it has learned with: ethbrake evaluate --scenario"
+            f" {training.scenario.name} --agents {agents}"
+        )
+
+
+def _newest_checkpoint(
+    run: RunDirectory, training: Training, other_versions: bool
+) -> tuple[TrainingState | None, list[str]]:
+    """The newest checkpoint that is whole, if there is one, and what is wrong with newer ones.
+
+    Raises ``InvalidInput`` if it belongs to another training, or was written by other versions.
+    """
     remove_unfinished(run.path)
     if run.checkpoints.is_dir():
         remove_unfinished(run.checkpoints)
     state, damaged = newest_usable(run.checkpoints)
     if state is None:
         return None, damaged
-    if state.numbers.get("training") != training:
+    if state.numbers.get("training") != training.identity:
         name = run.checkpoint(state.steps).name
         raise InvalidInput(
             f"{run.config}: was changed after the checkpoint {name} of this training; put it back as it was, or"

@@ -44,7 +44,8 @@ from ethbrake_marl.extensions.search.templates import best_templates
 from ethbrake_marl.game.objectives import scored
 from ethbrake_marl.policies.actor import Actor
 from ethbrake_marl.policies.bundle import load_policy
-from ethbrake_marl.training.models import TrainingDiverged, make_environment, make_model
+from ethbrake_marl.training.finite import TrainingDiverged
+from ethbrake_marl.training.models import make_environment, make_model
 from ethbrake_marl.training.networks import ppo_arguments, tensors_of
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.training.sac import sac_arguments

@@ -42,7 +42,8 @@ from ethbrake_marl.training import (
     session as train_module,
 )
 from ethbrake_marl.training.checkpoint import ARRAYS, NUMBERS, TrainingState, read_checkpoint, write_checkpoint
-from ethbrake_marl.training.models import TrainingDiverged, open_logs
+from ethbrake_marl.training.finite import TrainingDiverged
+from ethbrake_marl.training.logs import open_logs
 from ethbrake_marl.training.progress import Course
 from ethbrake_marl.training.recipe import LearningRate, TrainingRecipe, load_recipe
 from ethbrake_marl.training.run_folder import RunDirectory

@@ -12,8 +12,8 @@ from ethbrake_marl.extensions.studies.trainings import TrainingJob
 from ethbrake_marl.files.store import remove_folder
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.teams import read_trained
+from ethbrake_marl.training.callback import StopAt
 from ethbrake_marl.training.run_folder import RunDirectory
-from ethbrake_marl.training.stretch import StopAt
 from ethbrake_marl.training.training import check_same_training
 
 _MEASURED = ("first_impact_harm", "total_harm", "collision_rate")

@@ -21,7 +21,7 @@ from ethbrake_marl.training.team import load_team
 from ethbrake_marl.training.training import Training, check_same_training
 
 if TYPE_CHECKING:
-    from ethbrake_marl.training.stretch import StopAt
+    from ethbrake_marl.training.callback import StopAt
 
 
 def train_all(trainings: Sequence[TrainingJob], jobs: int = 1, tell: OnProgress | None = None) -> bool:
