@@ -12,18 +12,18 @@ from typing import Any, Self
 
 import numpy as np
 import safetensors.numpy
-from numpy.typing import NDArray
 from pydantic import ValidationError
 from safetensors import SafetensorError
 
-from ethbrake_marl.errors import InvalidInput, naming_extras
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.arrays import ArrayRow, check_arrays, safetensors_headers
 from ethbrake_marl.files.store import new_folder, write_file
 from ethbrake_marl.files.yaml import first_mistake
 from ethbrake_marl.game.observations import ObservationSpec
 from ethbrake_marl.policies.actor import Actor
 from ethbrake_marl.policies.manifest import Manifest, ObservationSchema, content_sha256, installed_versions
-from ethbrake_marl.policies.network_spec import Activation, Float32s, NetworkSpec
+from ethbrake_marl.policies.network_spec import Float32s
+from ethbrake_marl.policies.onnx_model import onnx_model
 
 MANIFEST = "manifest.json"
 
@@ -135,84 +135,11 @@ class Policy:
     def to_onnx(self) -> bytes:
         """The ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
 
-        The acceleration is the action times the own braking (below 0) or driving capacity (above 0), which the
-        observation holds. Products are summed in another order than in our forward pass: results agree within rounding,
-        not to the bit. Raises ``MissingExtra`` where the package onnx is not installed.
+        The acceleration is the action times the own braking (below 0) or driving capacity (above 0), both read from the
+        observation. Results agree with ours within rounding, not to the bit: products are summed in another order.
+        Raises ``MissingExtra`` if the package onnx is not installed.
         """
-        with naming_extras():
-            import onnx  # only here: an extra
-        helper, float32, manifest, spec = onnx.helper, onnx.TensorProto.FLOAT, self.manifest, self.manifest.network
-        nodes: list[Any] = []
-        constants: list[Any] = []
-
-        def constant(name: str, array: NDArray[Any]) -> str:
-            constants.append(onnx.numpy_helper.from_array(np.ascontiguousarray(array), name))
-            return name
-
-        def node(operator: str, inputs: list[str], *, output: str = "", **attributes: Any) -> str:
-            name = output or f"{operator.lower()}_{len(nodes)}"
-            nodes.append(helper.make_node(operator, inputs, [name], **attributes))
-            return name
-
-        zero = constant("zero", np.zeros(1, np.float32))
-        bounds = [constant(name, np.array(at, np.float32)) for name, at in (("lowest", -1.0), ("highest", 1.0))]
-
-        def network(name: str, hidden: int, activation: Activation) -> str:
-            """One network of the policy, from the observation on."""
-            x = "observation"
-            for layer in [*(f"{name}.{k}" for k in range(hidden)), f"{name}.output"]:
-                weight, bias = (
-                    constant(f"{layer}.{part}", self.tensors[f"{layer}.{part}"]) for part in ("weight", "bias")
-                )
-                x = node("Gemm", [x, weight, bias], transB=1)
-                if not layer.endswith("output"):
-                    x = node("Relu" if activation == "relu" else "Tanh", [x])
-            return x
-
-        def actor(spec: NetworkSpec, prefix: str) -> str:
-            """The actions [n, 1] of a policy, or of one among which it chooses."""
-            outputs = [network(prefix + name, len(spec.policy_hidden), spec.activation) for name in spec.actors]
-            x = outputs[0]
-            if len(outputs) > 1:  # the one that the gate chooses
-                gate = network(f"{prefix}gate", len(spec.gate_hidden), spec.activation)
-                chosen = node("ArgMax", [gate], axis=1, keepdims=1)
-                x = node("GatherElements", [node("Concat", outputs, axis=1), chosen], axis=1)
-            if spec.output == "tanh":
-                return node("Tanh", [x])
-            if spec.choices is None:
-                return node("Clip", [x, *bounds])
-            members = [actor(each, f"{prefix}among_{m}.") for m, each in enumerate(spec.among, 1)]
-            nothing = node("Mul", [node("ReduceMax", [x], axes=[1], keepdims=1), zero])  # [n, 1]
-            actions = node("Add", [nothing, constant(f"{prefix}choices", spec.actions[np.newaxis])])
-            chosen = node("ArgMax", [x], axis=1, keepdims=1)
-            return node("GatherElements", [node("Concat", [*members, actions], axis=1), chosen], axis=1)
-
-        action = node("Identity", [actor(spec, "")], output="action")
-        capacities = []  # in m/s2, [n, 1]
-        features = [f.name for f in self.observation.features]
-        for name in ("own.braking_capacity", "own.driving_capacity"):
-            column = features.index(name)
-            index = constant(f"{name}.column", np.array([column], np.int64))
-            unit = constant(f"{name}.scale", np.array([self.observation.features[column].scale], np.float32))
-            capacities.append(node("Mul", [node("Gather", ["observation", index], axis=1), unit]))
-        below = node("Mul", [node("Min", [action, zero]), capacities[0]])
-        above = node("Mul", [node("Max", [action, zero]), capacities[1]])
-        node("Add", [below, above], output="acceleration_mps2")
-
-        given = [helper.make_tensor_value_info("observation", float32, ["n", spec.observation_size])]
-        found = [helper.make_tensor_value_info(name, float32, ["n", 1]) for name in ("action", "acceleration_mps2")]
-        graph = helper.make_graph(nodes, "policy", given, found, constants)
-        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], producer_name="ethbrake-marl")
-        model.ir_version = 8  # old enough for every runtime since 2022
-        told = {
-            "algorithm": manifest.algorithm,
-            "manifest_sha256": manifest.manifest_sha256,
-            "features": ",".join(manifest.observation.features),
-        }
-        helper.set_model_props(model, told)
-        onnx.checker.check_model(model)
-        data: bytes = model.SerializeToString()
-        return data
+        return onnx_model(self.manifest, self.observation, self.tensors)
 
 
 def _serialise(tensors: Mapping[str, Float32s]) -> bytes:
