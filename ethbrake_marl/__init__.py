@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.scenario.catalogue import list_scenarios as list_scenarios, load_scenario as load_scenario
     from ethbrake_marl.scenario.sample import Sample as Sample
     from ethbrake_marl.scenario.schema import Scenario as Scenario
+    from ethbrake_marl.scenario.tables import read_worlds as read_worlds, worlds_from_table as worlds_from_table
     from ethbrake_marl.physics.advance import advance as advance
     from ethbrake_marl.physics.state import Worlds as Worlds, make_worlds as make_worlds
 

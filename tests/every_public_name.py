@@ -87,6 +87,8 @@ def learn(folder: Path) -> eb.TrainResult:
 
 def measure(folder: Path) -> list[eb.SummaryRow]:
     scenario = eb.load_scenario(eb.list_scenarios()[0].name)
+    eb.read_worlds(scenario, "mine.csv")
+    eb.worlds_from_table(scenario, {"gap_1_m": [7.0], "gap_2_m": [7.0]})
     policies = [eb.load_policy(folder), eb.load_shipped("ppo")]
     team: eb.Team = eb.Team({1: eb.LearnedAgent(policies[0])}, "learned")
     agents = {"full_brake": eb.make_agent("full_brake"), "learned": team}

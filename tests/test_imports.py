@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from ethbrake_marl.errors import _EXTRA_OF, MissingExtra, naming_extras
+from tests.docs import layout
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -53,18 +54,18 @@ def tree_of(path: Path) -> ast.Module:
     return ast.parse(path.read_text("utf-8"))
 
 
-def test_page_of_the_layout__shows_the_levels_from_the_top_down() -> None:
-    text = (ROOT / "docs" / "layout.md").read_text("utf-8")
-    rows = text[text.index("| in `ethbrake_marl/` |") :].split("\n\n")[0].splitlines()[2:]
-    shown = [name.strip("`/").removesuffix(".py") for row in rows for name in row.split("|")[1].strip().split(", ")]
-    levels = [LEVEL[name] for name in shown]
-    assert levels == sorted(levels, reverse=True)
-    assert set(shown) == {room for room, _ in modules(ROOT / PACKAGE)} - {"__init__", "__main__"}
+def test_page_of_the_layout__is_made_of_the_code() -> None:
+    assert layout.PAGE.read_text("utf-8") == layout.page()
 
 
-@pytest.mark.parametrize(("contract", "own"), [(CONTRACTS[2], "learning"), (CONTRACTS[3], "figures")])
-def test_contract__of_torch_and_matplotlib_holds_for_every_other_room(contract: dict[str, Any], own: str) -> None:
-    assert set(contract["source_modules"]) == {f"{PACKAGE}.{room}" for room in LEVEL if room != own}
+@pytest.mark.parametrize(
+    ("contract", "elsewhere"),
+    [(CONTRACTS[3], {"extensions", "training", "agents", "envs"}), (CONTRACTS[4], {"extensions"})],
+)
+def test_contract__of_torch_and_matplotlib_holds_for_every_other_room(
+    contract: dict[str, Any], elsewhere: set[str]
+) -> None:
+    assert set(contract["source_modules"]) == {f"{PACKAGE}.{room}" for room in LEVEL if room not in elsewhere}
 
 
 def test_package__imports_no_module_of_its_own_by_a_text() -> None:
@@ -161,7 +162,7 @@ for name in {absent}:
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import MissingExtra
-from ethbrake_marl import figures
+from ethbrake_marl.extensions import report
 
 for name in eb.__all__:
     getattr(eb, name)

@@ -146,13 +146,13 @@ def digest_in(package: Path, name: str) -> str:
 @pytest.mark.parametrize(
     ("kernel", "edited", "moves"),
     [
-        ("physics/batch.py", "physics/batch.py", True),  # its own file
-        ("physics/batch.py", "physics/kernel.py", True),  # what it calls
-        ("shield/step_shield.py", "physics/kernel.py", True),  # through several files
-        ("search.py", "errors.py", False),  # a file without kernels or constants
-        ("physics/batch.py", "search.py", False),  # kernels that it does not call
-        ("physics/kernel.py", "physics/batch.py", False),  # its callers
-        ("physics/batch.py", "physics/worlds.py", False),  # types
+        ("physics/advance.py", "physics/advance.py", True),  # its own file
+        ("physics/advance.py", "physics/impact.py", True),  # what it calls
+        ("shield/members.py", "physics/impact.py", True),  # through several files
+        ("extensions/search/problem.py", "errors.py", False),  # a file without kernels or constants
+        ("physics/advance.py", "extensions/search/problem.py", False),  # kernels that it does not call
+        ("physics/impact.py", "physics/advance.py", False),  # its callers
+        ("physics/advance.py", "physics/state.py", False),  # types
     ],
 )
 def test_digest_of_sources__changes_with_what_its_kernels_are_made_of(copied, monkeypatch, kernel, edited, moves):
@@ -166,20 +166,20 @@ def test_digest_of_sources__changes_with_what_its_kernels_are_made_of(copied, mo
 
 def test_digest_of_sources__is_not_known_of_code_in_no_file_edited_since_or_from_the_future_which_is_told(copied):
     assert digest_of_sources(Path("<stdin>")) == ""
-    assert digest_in(copied, "physics/batch.py")
+    assert digest_in(copied, "physics/advance.py")
     now = time.time()
     for date in ((jit._IMPORTED_S + now) / 2, now + 3600.0):
-        os.utime(copied / "physics" / "kernel.py", (date, date))
+        os.utime(copied / "physics" / "impact.py", (date, date))
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
-            assert digest_in(copied, "physics/batch.py") == ""
+            assert digest_in(copied, "physics/advance.py") == ""
         expected = [f"{copied}: dates of files lie in the future"] * (date > now)
         assert [str(each.message)[: len(expected[0])] for each in told] == expected
 
 
 def kernel_files(package: Path) -> list[Path]:
     found = [source for source in sorted(package.rglob("*.py")) if "@compiled" in source.read_text("utf-8")]
-    return [source for source in found if source.name != "compiled.py"]
+    return [source for source in found if source.name != "jit.py"]
 
 
 @needs_compiler
@@ -201,16 +201,16 @@ def test_kernel_sources__are_found_behind_front_doors(copied):
     """A folder offers names of several files; only the files of the names that are taken count."""
     (copied / "physics" / "__init__.py").write_text(
         "if TYPE_CHECKING:\n"
-        "    from ethbrake_marl.physics.kernel import pool as pool\n"
-        "    from ethbrake_marl.physics.batch import (\n        advance as advance,\n    )\n"
-        "    from ethbrake_marl.physics.worlds import Worlds as Worlds\n"
+        "    from ethbrake_marl.physics.impact import pool as pool\n"
+        "    from ethbrake_marl.physics.advance import (\n        advance as advance,\n    )\n"
+        "    from ethbrake_marl.physics.state import Worlds as Worlds\n"
     )
     kernel = copied / "kernel_of_mine.py"
     kernel.write_text("from ethbrake_marl.physics import Worlds, pool\n\n@compiled\ndef mine(): ...\n")
     forget()
     found = {source.relative_to(copied).as_posix() for source in kernel_sources(kernel)}
-    assert {"kernel_of_mine.py", "physics/kernel.py"} <= found
-    assert not {"physics/batch.py", "physics/worlds.py", "physics/__init__.py"} & found
+    assert {"kernel_of_mine.py", "physics/impact.py"} <= found
+    assert not {"physics/advance.py", "physics/state.py", "physics/__init__.py"} & found
 
 
 # ---------------------------------------------------------------- processes
@@ -302,7 +302,7 @@ def test_kernels__of_a_moved_package_are_at_hand_and_one_damaged_or_an_edited_ca
     for file in cache_folder().iterdir():
         file.write_bytes(file.read_bytes()[:-1])
     assert run(copied) == COMPILED
-    with (copied / "physics" / "kernel.py").open("a") as file:
+    with (copied / "physics" / "impact.py").open("a") as file:
         file.write("# a change\n")
     assert run(copied) == COMPILED
     assert run(PACKAGE) == SAME

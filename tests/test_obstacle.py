@@ -21,6 +21,7 @@ from ethbrake_marl.game.harm import empty_ledger
 from ethbrake_marl.policies.manifest import ObservationSchema
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.tables import worlds_from_state
 from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield.drivers import ShieldedDriver
 from tests.refused import refused
@@ -130,14 +131,14 @@ REFUSED: dict[str, Callable[[], object]] = {
     "has nothing to brake for without an obstacle ahead; give obstacle_gap_m too": lambda: load_scenario(
         "cooperation-3-pair"
     ).with_learners([0, 1]),
-    "initial_state: obstacle_gap_m is missing, and random in scenario 'cooperation-4-all'": lambda: (
-        NEAR.worlds_from_state(STATE)
+    "initial_state: obstacle_gap_m is missing, and random in scenario 'cooperation-4-all'": lambda: worlds_from_state(
+        NEAR, STATE
     ),
     "initial_state: obstacle_gap_m is not of this scenario: 'paper-random' has no obstacle_gap_m": lambda: (
-        load_scenario("paper-random").worlds_from_state({**STATE, "obstacle_gap_m": 30})
+        worlds_from_state(load_scenario("paper-random"), {**STATE, "obstacle_gap_m": 30})
     ),
-    "initial_state: obstacle_gap_m = 0: must be finite and in (0, 10000] m (metres)": lambda: ALL.worlds_from_state(
-        {**STATE, "obstacle_gap_m": 0}
+    "initial_state: obstacle_gap_m = 0: must be finite and in (0, 10000] m (metres)": lambda: worlds_from_state(
+        ALL, {**STATE, "obstacle_gap_m": 0}
     ),
     "avoidability: obstacle_gap_m[0] = 33.6372: must be beyond full braking of vehicle_1": lambda: avoidability(
         NEAR.sample(200, 7).worlds

@@ -22,7 +22,8 @@ import numpy as np
 from ethbrake_marl.agents.registry import split_specs
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.identity import result_identity
-from ethbrake_marl.evaluation.named_worlds import load_runnable, make_agents
+from ethbrake_marl.evaluation.lineup import make_agents
+from ethbrake_marl.evaluation.trial import load_runnable
 from ethbrake_marl.extensions.search.best_harm import fold_episodes, search_list, task_problem
 from ethbrake_marl.extensions.search.limits import Unproven, prove, unproven_because
 from ethbrake_marl.extensions.search.regret import Between

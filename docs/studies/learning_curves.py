@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 from ethbrake_marl.errors import Progress
-from ethbrake_marl.evaluation.named_worlds import load_runnable
+from ethbrake_marl.evaluation.trial import load_runnable
 from ethbrake_marl.extensions.reproduction.learning_curves import AXES, LearningCurves
 from ethbrake_marl.training.settings import read_settings
 

@@ -12,7 +12,7 @@ import time
 import numpy as np
 
 from ethbrake_marl.agents.driving import episode_engine
-from ethbrake_marl.evaluation.named_worlds import make_agents
+from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.shield.drivers import ShieldedDriver

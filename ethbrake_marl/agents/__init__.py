@@ -1,1 +1,1 @@
-"""Who drives: scripts, E-V2X-BM, trained policies, and the registry of names."""
+"""Agents that drive a vehicle: scripts, E-V2X-BM, trained policies, and the registry of their names."""

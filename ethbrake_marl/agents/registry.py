@@ -9,9 +9,9 @@ from __future__ import annotations
 import inspect
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -190,7 +190,7 @@ class AgentSettings:
     harm_count: HarmCount = "first"  # which harm an optimising agent minimises
     horizon_s: float = HORIZON_S  # until when it looks ahead
     most_candidates: int | None = None  # of a search, whatever its argument says; None: what that says
-    uncertainty: object = None  # what a robust shield does not know, as ``shield.uncertainty`` reads it
+    uncertainty: object = None  # what a shield does not know; read and checked by the shield that takes it
     time_step_s: float = 0.1  # between two decisions
     believes: bool = False  # ``:believed`` stood behind the argument: it decides on what was received
     role: int | None = None  # index of the vehicle whose role it is; None: a driver, whichever vehicles it drives
@@ -221,6 +221,7 @@ class Entry:
     make: Factory | Wrapper
     inner: bool = False  # of what goes around an agent: directly, inside a shield
     teams: bool = False  # likewise: around a team, too
+    needs: Mapping[str, object] = field(default_factory=dict)  # settings that it cannot do without -> an example
 
     @property
     def is_ours(self) -> bool:
@@ -343,9 +344,9 @@ def find_entry(spec: AgentSpec | str) -> Entry:
     if written.file is not None:
         return Entry(f"{written.name}[:ARGUMENT][@POLICY]", "your own", Source.UNSTATED, make_from_file)
     if written.name not in _AGENTS:
-        if written.name in _SEVERAL:
+        if written.name in group_names():
             raise InvalidInput(f"agent {written.core!r}: stands for several agents in --agents; here one is needed")
-        raise _AGENTS.unknown(written.name, {*agent_names(), *_SEVERAL})
+        raise _AGENTS.unknown(written.name, {*agent_names(), *group_names()})
     entry = _AGENTS[written.name]
     if written.argument is not None and ":" not in entry.form:
         raise InvalidInput(f"agent {written.core!r}: {written.name} takes no argument")
@@ -387,6 +388,26 @@ def shield_forms() -> tuple[str, ...]:
     return tuple(each for each in around_forms() if not (_around(each).inner or each.endswith(":believed")))
 
 
+def settings_needed(shield: str | None) -> Mapping[str, object]:
+    """Settings that a shield cannot do without, each with an example. One that estimates the world needs none."""
+    return {} if shield is None or shield.endswith(":believed") else _around(shield).needs
+
+
+def shields_with(setting: str) -> tuple[str, ...]:
+    """The installed shields that cannot do without a setting."""
+    return tuple(entry.words[0] for entry in _SHIELDS.usable().values() if setting in entry.needs)
+
+
+def group_names() -> tuple[str, ...]:
+    """Names that stand for several agents in ``--agents``."""
+    return tuple(dict.fromkeys(name.partition(".")[0] for name in _GROUPS))
+
+
+def agents_of_group(group: str) -> tuple[str, ...]:
+    """The agents for which a group's name stands; its own come first, then those of ``GROUP.MORE``, by name."""
+    return tuple(spec for name in sorted(_GROUPS) if name.partition(".")[0] == group for spec in _GROUPS[name])
+
+
 def register_agent(
     name: str,
     factory: Factory,
@@ -416,7 +437,7 @@ def register_agent(
     """
     if parse_spec(name) != AgentSpec(name, None, None, ()):
         raise InvalidInput(f"agent name {name!r}: must be a plain name without argument")
-    if name in _SEVERAL:
+    if name in group_names():
         raise AlreadyExists(f"agent {name!r}: stands for several agents in --agents; give another name")
     form = f"{name}[:ARGUMENT]{'[@POLICY]' * takes_policy}" if form is None else form
     _AGENTS.add(name, Entry(form, about, knows, factory), lambda entry: entry.make is factory)
@@ -431,6 +452,7 @@ def register_shield(
     form: str | None = None,
     inner: bool = False,
     teams: bool = False,
+    needs: Mapping[str, object] | None = None,
 ) -> None:
     """Make ``+name`` known behind every agent.
 
@@ -446,13 +468,14 @@ def register_shield(
         form: how it is written, ``+name[:WORD]`` with every word that it takes; None: with any argument.
         inner: it is no shield, and goes around the agent before one.
         teams: it also goes around a team.
+        needs: settings of ``AgentSettings`` that it cannot do without, each with an example.
 
     Raises ``AlreadyExists`` for a name that another one has, ``InvalidInput`` for one that is not plain.
 
     """
     if not isinstance(name, str) or not _PLAIN.fullmatch(name):
         raise InvalidInput(f"shield name {name!r}: must be a plain name without argument")
-    entry = Entry(f"+{name}[:ARGUMENT]" if form is None else form, about, knows, wrapper, inner, teams)
+    entry = Entry(f"+{name}[:ARGUMENT]" if form is None else form, about, knows, wrapper, inner, teams, needs or {})
     _SHIELDS.add(name, entry, lambda entry: entry.make is wrapper)
 
 
@@ -460,11 +483,16 @@ _PLAIN = re.compile(r"[a-z][a-z0-9_.-]*")
 
 _PROFILE = "profile"  # a role of scenarios alone
 
-_SEVERAL = ("ladder", "field")  # stand for several agents in ``--agents``
-
 _AGENTS: Registry[Entry] = Registry("agent", "agents", register_agent)
 
 _SHIELDS: Registry[Entry] = Registry("shield or search", "shields", register_shield)
+
+
+def _register_group(name: str, specs: tuple[str, ...]) -> None:
+    _GROUPS.add(name, specs, lambda other: other == specs)
+
+
+_GROUPS: Registry[tuple[str, ...]] = Registry("group of agents", "agent_groups", _register_group)
 
 
 def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: Driver) -> Driver:

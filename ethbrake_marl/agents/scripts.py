@@ -62,3 +62,6 @@ E_V2X_BM = Part(
     " believed: on what was received, and the scenario's ranges for the rest",
     knows=Source.MODEL,
 )
+
+# Behind ``--agents ladder``, from no decision at all upwards; extensions add their rungs as ``ladder.NAME``.
+LADDER = ("coast", "full_brake", "e_v2x_bm:pairwise", "e_v2x_bm")

@@ -353,7 +353,7 @@ def scenario_sample(
 ) -> None:
     """Draw worlds of a list, as a table or a picture.
 
-    The table has a column for each quantity that the scenario does not fix; `Scenario.read_worlds` reads it. The
+    The table has a column for each quantity that the scenario does not fix; `eb.read_worlds` reads it. The
     picture shows distributions, pairs of quantities, and three worlds. The same list, seed and number are the same
     worlds on every machine.
     """

@@ -274,6 +274,7 @@ def falsify_command(
         import numpy as np
 
         from ethbrake_marl.extensions.studies.machine import this_machine
+        from ethbrake_marl.extensions.studies.named_worlds import NamedWorlds
         from ethbrake_marl.extensions.studies.weakness import Measure
 
         if again is not None:
@@ -317,7 +318,7 @@ def falsify_command(
             " The search looks for bad worlds: shares of it say nothing about a list."
         )
         if worlds:
-            kept = evaluation.NamedWorlds.of(
+            kept = NamedWorlds.of(
                 measured_by.scenario,
                 scenario=scenario,
                 settings=[each.text for each in training.read_settings(settings, of_agents=("harm_count",)).scenario],
@@ -362,10 +363,11 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
     import numpy as np
 
     from ethbrake_marl.agents.registry import parse_spec
+    from ethbrake_marl.extensions.studies.named_worlds import NamedWorlds
     from ethbrake_marl.extensions.studies.weakness import Measure
     from ethbrake_marl.scenario.sample import Sample
 
-    kept = evaluation.NamedWorlds.read(file)
+    kept = NamedWorlds.read(file)
     for spec in (*([kept.agent] if agent is None else []), *([kept.against] if kept.against else [])):
         if (code := parse_spec(spec).file) is not None:
             raise InvalidInput(

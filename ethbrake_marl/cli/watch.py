@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from ethbrake_marl import evaluation
 from ethbrake_marl.cli.command import AgentsOption, ForceOption, Out, ScenarioOption, SeedOption, SettingsOption
 from ethbrake_marl.cli.evaluate import make_drivers, read_task
 
@@ -25,11 +24,14 @@ def watch_command(
 
     It shows the road to scale, commands, impacts and harm.
     """
+    # matplotlib takes a second to load, and the other commands draw nothing
+    from ethbrake_marl.extensions.report.film import check_film, film
+
     with Out(force=force) as out:
         out.check(output)
-        evaluation.check_film(output.suffix.lower())
+        check_film(output.suffix.lower())
         task = read_task(scenario, settings)
         worlds = task.scenario.sample(1, seed, first=world).worlds
         named = make_drivers(agents, task).items()
         titled = {f"{name}: world {world} of {task.scenario.name}": agent for name, agent in named}
-        out.write(output, evaluation.film(worlds, titled, output.suffix.lower(), scenario=task.scenario), what="film")
+        out.write(output, film(worlds, titled, output.suffix.lower(), scenario=task.scenario), what="film")

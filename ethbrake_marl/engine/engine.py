@@ -31,20 +31,20 @@ from ethbrake_marl.engine.memory import (
     checked_memory,
     flat,
     is_state_free,
-    map_memory,
     renew_memory,
     take_memory,
     unflat,
     within_capacity,
 )
 from ethbrake_marl.engine.scripts import Script
-from ethbrake_marl.engine.stream import NO_ROWS, RUNNING, Roster, Start, Stream, check_alert, packed_with
+from ethbrake_marl.engine.state import State
+from ethbrake_marl.engine.stream import NO_ROWS, Roster, Start, Stream, check_alert, packed_with
+from ethbrake_marl.engine.terms import Terms
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep, renumbered
 from ethbrake_marl.game.actions import checked_action
 from ethbrake_marl.game.harm import Ledger, empty_ledger
-from ethbrake_marl.game.objectives import objective_harm
 from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec, Plan
-from ethbrake_marl.game.rewards import Reward, StepOutcome, reward_params
+from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.physics.messages import hear_rows
@@ -53,80 +53,7 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.observed import common_observation, observations_of
 from ethbrake_marl.scenario.schema import Scenario
 
-
-class Terms:
-    """The reward of a batch, resolved: what is added to every step beside the terms that all vehicles share.
-
-    Args:
-        reward: a name, a mapping of settings, or ``RewardParams``.
-        scenario: whose objective holds where the reward names none.
-        learners: indices of the vehicles (0 = front) that learn.
-
-    """
-
-    def __init__(self, reward: Reward, scenario: Scenario, learners: Sequence[int]) -> None:
-        self.params, self._objectives = reward_params(reward).settled(scenario.objective, scenario.vehicles)
-        self._learners, self._learner_index = tuple(learners), np.array(learners, np.int64)
-        self._moving, self._own = self.params.moving, self.params.registered
-        self.by_objective = bool(self._objectives)  # each vehicle's harm by an objective
-        self.are_foreign = bool(self._own)  # one is code that somebody registered, and so may fail
-        self.add_something = bool(self._moving or self._own) or self.params.shaping > 0.0 or self.by_objective
-
-    @property
-    def shared_harm(self) -> float:
-        """Weight of the harm of the whole line, which the compiled step counts: 0 where each has its objective."""
-        return 0.0 if self._objectives else self.params.harm
-
-    def objective_harm(self, running: Engine) -> Floats:
-        """What the objective of each vehicle makes of the harm so far, [n, N]; only where there are objectives."""
-        return objective_harm(running.ledger, self.params.harm_count, self._objectives)
-
-    def add(self, step: Step, running: Engine, before: Floats | None) -> None:
-        """Add what a step has brought to its reward; nothing for rows that stood still.
-
-        ``before``: ``objective_harm`` before the step, None without objectives.
-        """
-        if before is not None and self.params.harm > 0.0:
-            step.further["harm"] = before - self.objective_harm(running)
-        standing = running.ended & ~step.ended
-        if self._moving or self._own:
-            (state, params), column = running.packed, running.packed.column
-            outcome = StepOutcome(
-                step.first_impact_harm,
-                step.total_harm,
-                step.safe_end,
-                state[:, column.gap : column.hit],
-                state[:, column.speed : column.command],
-                state[:, column.command : column.previous],
-                state[:, column.previous : column.gap],
-                running.scenario.time_step_s,
-                state[:, column.time],
-                params[:, column.braking : column.driving],
-                params[:, column.driving : column.latency],
-                params[:, column.latency : column.mass],
-                params[:, column.mass : column.limit],
-                self._learner_index.view(),
-            )
-            step.further.update(outcome.built_in(self._moving, self.params))
-            if self._own:
-                counts = ~standing & (step.failed == 0)
-                step.further.update(outcome.registered(self._own, counts, running.steps))
-        if self.params.shaping > 0.0:  # potentials are 0 where an episode terminated
-            old = running._potential
-            running._potential = self.potentials(running.worlds, running.scenario)
-            running._potential[step.terminated] = 0.0
-            step.further["shaping"] = self.params.shaping_discount * running._potential - old
-        extra = self.params.weighted_sum(step.further, step.reward.shape)
-        extra[standing] = 0.0
-        step.reward[:] += extra
-
-    def potentials(self, worlds: Worlds, scenario: Scenario) -> Floats:
-        """Potential of every learner, 0 for other vehicles, [n, N]."""
-        potentials = np.zeros(worlds.speeds_mps.shape)
-        shared = self.params.potential(worlds, self._learners, scenario.horizon_s)
-        potentials[:, self._learner_index] = shared[:, np.newaxis]
-        return potentials
-
+SNAPSHOT = ("state", "params", "clock", "wanted", "potential")  # names of the arrays of a state in a snapshot
 
 ROUNDING = 1e-9  # of a time step: moments that are so close are one
 
@@ -189,28 +116,27 @@ class Guard(Protocol):
         """What infos say of each vehicle, by name, each [n, N]: of its last step, or of the alert before the first."""
 
 
-class Moment(NamedTuple):
-    """Running worlds between two steps, row by row."""
+class Now(NamedTuple):
+    """Everything of an engine that a reset or a step changes; replaced in one assignment."""
 
-    state: Floats  # as rows of ``physics.batch``
-    params: Floats
-    clock: Floats
-    wanted: Floats
-    memories: dict[int, Memory]  # by vehicle, of the scripts that remember
-    guarded: Any = None  # what the engine's guard remembers; None without one
+    state: State
+    roster: Roster  # who runs in which row, and which worlds failed
+    stream: Stream
+    obstacle: bool  # the rows have columns of an obstacle
+    by_link: bool  # ... of news by link
+    builds_up: bool  # brakes of some world may build up, or come in pieces
+    pieces: Floats  # [N, 2 K] of all worlds, as in ``Vehicles``
+    watched: dict[Watcher, Any]  # what each watcher remembers
+    ruling: Ruling | None = None  # of the last step
+    stops: tuple[tuple[Floats, Floats], ...] = ()  # within the last step: the motion there, and the commands up to it
 
-    def take(self, rows: Ints) -> Moment:
-        """Some of the rows, or one of them several times."""
-        guarded = None if self.guarded is None else self.guarded.take(rows)
-        state, params, clock, wanted, memories = take_memory(self[:5], rows)
-        return Moment(state, params, clock, wanted, memories, guarded)
+    def apart(self) -> Now:
+        """The same, in arrays of its own."""
+        return self._replace(state=self.state.copy(), roster=self.roster.apart(), stream=copy.copy(self.stream))
 
-    @staticmethod
-    def join(moments: list[Moment]) -> Moment:
-        """The rows of all of them, one after the other; all are of one engine without a guard."""
-        if moments[0].guarded is not None:
-            raise InvalidInput("moments: a shield stands in their engine; what it remembers is not joined")
-        return Moment(*map_memory(lambda *parts: np.concatenate(parts), *(moment[:5] for moment in moments)))
+    def kept(self, packed: Packed) -> Packed:
+        """Rows as wide as they are kept: with columns of an obstacle, and of news by link, if the first had such."""
+        return packed.widened(self.obstacle, self.by_link)
 
 
 class Engine:
@@ -239,19 +165,6 @@ class Engine:
     (4, (1,), array([0.5, 0.5, 0.5, 0.5]))
 
     """
-
-    roster: Roster  # who runs in which row, and which worlds failed
-    _state: Floats  # of the running episodes, as rows of ``physics.batch``
-    _params: Floats
-    _clock: Floats  # [n, CLOCK_WIDTH]
-    _wanted: Floats  # [n, N] m/s2
-    _potential: Floats  # [n, N]
-    _obstacle: bool  # the rows have columns of an obstacle
-    _by_link: bool  # ... of news by link
-    _builds_up: bool  # brakes of some world may build up, or come in pieces
-    _pieces: Floats  # [N, 2 K] of all worlds, as in ``Vehicles``
-    _plans: tuple[Plan, ...]  # of what each vehicle observes
-    _alike: bool  # all observe the same features
 
     def __init__(
         self,
@@ -286,20 +199,17 @@ class Engine:
         self.observations = observations_of(scenario, observation)  # of each vehicle
         self._plans = tuple(each.plan for each in self.observations)
         self._alike = len(set(self.observations)) == 1
-        self._watched: dict[Watcher, Any] = {}
-        self.memories: dict[int, Memory] = {}  # by vehicle, of the scripts that remember; never changed in place
         self._remembering = {i: s for i, s in self.scripts.items() if not is_state_free(s)}
         self._on_own_grid = {i: s for i, s in self._remembering.items() if i not in self.deciders}
-        self._stops: list[tuple[Floats, Floats]] = []  # of the last step: the states there, and what led to them
         self._learner_index = np.array(self.learners, np.int64)
         total = float(self.reward.harm_count == "total")
         times = scenario.time_step_s, scenario.horizon_s
         self._settings = np.array([*times, self._terms.shared_harm, total, self.reward.terminal])
         self.reward_terms = self.reward.counted  # names of those whose values each step tells
         self.check_time_step(self.scripts)
-        self._stream = Stream(scenario, self.deciders, self.scripts, seed)
-        self.protect(None if guard is None else guard(self))
-        self.reset(worlds=worlds)
+        self.guard: Guard | None = None if guard is None else guard(self)
+        stream = Stream(scenario, self.deciders, self.scripts, seed)
+        self._now = self._started(stream, None, worlds, {})
 
     def check_time_step(self, drivers: Mapping[int, Script]) -> None:
         """Raise ``InvalidInput`` for one that was made for decisions at another distance in time (``time_step_s``)."""
@@ -319,17 +229,42 @@ class Engine:
     @property
     def seed(self) -> int:
         """Seed of the training stream."""
-        return self._stream.seed
+        return self._now.stream.seed
+
+    @property
+    def state(self) -> State:
+        """The running episodes as they are now: to be read, not to be changed."""
+        return self._now.state
+
+    @property
+    def roster(self) -> Roster:
+        """Who runs in which row, and which worlds failed."""
+        return self._now.roster
+
+    @property
+    def memories(self) -> dict[int, Memory]:
+        """What the scripts remember, by vehicle."""
+        return self._now.state.memories
+
+    @property
+    def guarded(self) -> Any:
+        """What the guard remembers; None without one, or before its first episode."""
+        return self._now.state.guarded
+
+    @property
+    def ruling(self) -> Ruling | None:
+        """What the guard ruled in the last step."""
+        return self._now.ruling
 
     @property
     def packed(self) -> Packed:
         """The running worlds themselves, as rows of ``physics.batch``: for kernels to read, not to be changed."""
-        return Packed(self._state, self._params)
+        return self._now.state.packed
 
     @property
     def wanted_mps2(self) -> Floats:
         """What each vehicle wanted in the last step, [n, N]: for kernels to read, not to be changed."""
-        return self._wanted
+        return self._now.state.wanted
 
     @property
     def worlds(self) -> Worlds:
@@ -339,31 +274,29 @@ class Engine:
     @property
     def in_pieces(self) -> bool:
         """Whether some script brakes in pieces."""
-        return bool(self._pieces.shape[1] > 0)
+        return bool(self._now.pieces.shape[1] > 0)
 
     def _unpacked(self, packed: Packed) -> Worlds:
         worlds = packed.worlds()
         if not self.in_pieces:
             return worlds
-        pieces = np.repeat(self._pieces[np.newaxis], worlds.n, axis=0)
+        pieces = np.repeat(self._now.pieces[np.newaxis], worlds.n, axis=0)
         return replace(worlds, vehicles=replace(worlds.vehicles, pieces=pieces))
 
     @property
     def ledger(self) -> Ledger:
         """Harm of the running episodes so far, in its own memory."""
-        packed, column = self.packed, self.packed.column
-        of_worlds = packed.params[:, column.mass : column.limit], packed.params[:, column.restitution]
-        return Ledger(*packed.ledger(), *(each.copy() for each in of_worlds))
+        return self._now.state.ledger
 
     @property
     def ended(self) -> Bools:
         """Episodes that have ended, [n]."""
-        return np.asarray(self._clock[:, ENDED] == 1.0, np.bool_)
+        return self._now.state.ended
 
     @property
     def steps(self) -> Ints:
         """Steps that the running episodes have taken, [n]."""
-        return self._clock[:, STEP].astype(np.int64)
+        return self._now.state.steps
 
     def observe(self, vehicle: int) -> Observations:
         """Current observation of one vehicle, [n, F]."""
@@ -380,58 +313,63 @@ class Engine:
         if not self._alike and len({self.observations[i] for i in vehicles.tolist()}) > 1:
             names = ", ".join(self.scenario.vehicle_names[i] for i in vehicles.tolist())
             raise InvalidInput(f"observe_all: {names} observe different features; use observe for each")
-        state, params = self._state, self._params
+        motion, params, clock, *_ = self._now.state
         plan: Plan = self._plans[0 if self._alike else int(vehicles[0])]
         if rows is not None:
-            state, params = state.take(rows, axis=0), params.take(rows, axis=0)
+            motion, params = motion.take(rows, axis=0), params.take(rows, axis=0)
         if not plan.extras:
-            return plan.observe(state, params, vehicles)
-        steps = self._clock[:, STEP] if rows is None else self._clock[rows, STEP]
-        return plan.observe(state, params, vehicles, steps)
-
-    def _kept(self, packed: Packed) -> Packed:
-        """Rows as wide as they are kept: with columns of an obstacle, and of news by link, if the first had such."""
-        return packed.widened(self._obstacle, self._by_link)
+            return plan.observe(motion, params, vehicles)
+        return plan.observe(motion, params, vehicles, clock[:, STEP] if rows is None else clock[rows, STEP])
 
     def memory(self, watcher: Watcher) -> Any:
         """What a watcher remembers of the running episodes."""
-        return self._watched[watcher]
+        return self._now.watched[watcher]
 
     def watch(self, watcher: Watcher, memory: Any) -> None:
         """Let a watcher follow, from ``memory`` on."""
-        self._watched = {**self._watched, watcher: memory}
+        self._now = self._now._replace(watched={**self._now.watched, watcher: memory})
 
     def protect(self, guard: Guard | None) -> None:
         """Let a guard stand between what is proposed and what is applied, from the next reset on; None: nobody does."""
-        self.guard, self.guarded, self.ruling = guard, None, None
+        self.guard = guard
+        self._now = self._now._replace(state=self._now.state._replace(guarded=None), ruling=None)
+
+    def remember(self, guarded: Any) -> None:
+        """Replace what the guard remembers, for who decides in the place of a step (``place``)."""
+        self._now = self._now._replace(state=self._now.state._replace(guarded=guarded))
 
     def reset(self, *, seed: int | None = None, worlds: Worlds | None = None) -> None:
         """Start new episodes in all rows: the given worlds (at t = 0), or the next ones of the training stream.
 
         With ``seed`` the stream starts again from its beginning. Whatever fails, the running episodes go on.
         """
-        if worlds is not None:
-            check_alert(worlds, self.n, self.scenario.vehicles)
-        stream = copy.copy(self._stream)
+        stream = copy.copy(self._now.stream)
         if seed is not None:
             stream.restart(seed)
+        self._now = self._started(stream, self._now.state.guarded, worlds, self._now.watched)
+
+    def _started(self, stream: Stream, guarded: Any, worlds: Worlds | None, watched: dict[Watcher, Any]) -> Now:
+        """New episodes in all rows: the given worlds, or the next ones of the ``stream``."""
+        if worlds is not None:
+            check_alert(worlds, self.n, self.scenario.vehicles)
         first = None if worlds is not None else stream.position
         start = stream.take(self.n) if worlds is None else stream.prepare(worlds)
-        new = copy.copy(self)
-        new._stream, new.roster = stream, Roster(self.n, stream.seed, first, worlds)
-        new._obstacle = self.scenario.has_obstacle or start.packed.has_obstacle
-        new._by_link = self.scenario.by_link or start.packed.has_news
-        new._pieces = start.origin.vehicles.pieces[0].copy()
-        new._builds_up = new._may_build_up(start.packed)
-        new._state, new._params = (array.copy() for array in new._kept(start.packed))
-        new._clock, new._wanted = start.clock.copy(), start.wanted.copy()
-        new._potential = np.zeros(start.wanted.shape)
-        new._stops, new.ruling, new.memories = [], None, {}
+        roster, pieces = Roster(self.n, stream.seed, first, worlds), start.origin.vehicles.pieces[0].copy()
+        packed, scenario = start.packed, self.scenario
+        obstacle, by_link = scenario.has_obstacle or packed.has_obstacle, scenario.by_link or packed.has_news
+        builds_up = scenario.builds_up or packed.builds_up or pieces.shape[1] > 0
+        motion, params = (array.copy() for array in packed.widened(obstacle, by_link))
+        clock, wanted = start.clock.copy(), start.wanted.copy()
+        state = State(motion, params, clock, wanted, np.zeros(wanted.shape), {}, guarded)
+        new = self._at(Now(state, roster, stream, obstacle, by_link, builds_up, pieces, watched))
         new._begin(np.arange(self.n), start)
-        self.__dict__.update(new.__dict__)  # in one piece: not even an interrupt comes between
+        return new._now
 
-    def _may_build_up(self, packed: Packed) -> bool:
-        return self.scenario.builds_up or packed.builds_up or self.in_pieces
+    def _at(self, now: Now) -> Engine:
+        """The same engine at another moment."""
+        new = copy.copy(self)
+        new._now = now
+        return new
 
     def renew(self, rows: Ints) -> None:
         """Start new episodes of the training stream in these rows (autoreset). Whatever fails, nothing is changed."""
@@ -439,33 +377,25 @@ class Engine:
             return
         if not 0 <= np.min(rows) <= np.max(rows) < self.n or np.bincount(rows).max() > 1:
             raise InvalidInput(f"renew: rows {rows}; must be different numbers from 0 to {self.n - 1}")
-        if not (self._watched or self._remembering or self.guard):
-            self._renew(rows)
-            return
-        new = self._apart()
-        new._stream = copy.copy(self._stream)
-        new._renew(rows)
-        self.__dict__.update(new.__dict__)
+        new = self if self._nobody_refuses_episodes else self._at(self._now.apart())
+        (state, roster, stream, *_), now = new._now, new._now
+        position = stream.position
+        start = stream.take(len(rows))
+        roster.renew(rows, position)
+        state.motion[rows], state.params[rows] = now.kept(start.packed)
+        state.clock[rows], state.wanted[rows] = start.clock, start.wanted
+        new._begin(rows, start)
+        self._now = new._now
+
+    @property
+    def _nobody_refuses_episodes(self) -> bool:
+        """Whether nothing can fail when episodes begin: then they begin in the arrays that are there."""
+        return not (self._now.watched or self._remembering or self.guard)
 
     def cut(self, step: Step, most_steps: int) -> None:
         """Truncate the episodes that have taken ``most_steps`` with the last ``step``, here and in what that tells."""
         cut = (self.steps >= most_steps) & (step.ended | ~self.ended)
-        step.outcome[TRUNCATED, cut] = self._clock[cut, ENDED] = 1.0
-
-    def _apart(self) -> Engine:
-        """An engine that goes on from here without changing this one."""
-        new = copy.copy(self)
-        new.__dict__.update({name: getattr(new, name).copy() for name in RUNNING})
-        new.roster = new.roster.apart()
-        return new
-
-    def _renew(self, rows: Ints) -> None:
-        position = self._stream.position
-        start = self._stream.take(len(rows))
-        self.roster.renew(rows, position)
-        self._state[rows], self._params[rows] = self._kept(start.packed)
-        self._clock[rows], self._wanted[rows] = start.clock, start.wanted
-        self._begin(rows, start)
+        step.outcome[TRUNCATED, cut] = self._now.state.clock[cut, ENDED] = 1.0
 
     def step(self, actions: Actions) -> Step:
         """Advance every running episode by one time step.
@@ -475,53 +405,78 @@ class Engine:
         ``renew`` or ``reset``. What the guard refuses does not happen: the worlds stay as they are.
         """
         columns = self._columns(actions)
-        if not (self.guard or self._watched or self._terms.are_foreign or self._on_own_grid):  # nobody can refuse it
+        if self._nobody_refuses_steps:
             return self._advance(columns)
-        before = copy.copy(self)  # of one moment, whatever another thread does meanwhile
-        new = before._apart()
+        before, new = self._at(self._now), self._at(self._now.apart())
+        ruling = None
         if self.guard is not None:
-            if before.guarded is None:
-                raise UncertifiedStep("shield: this episode began before the shield was put around it; reset first")
-            proposed = columns if isinstance(actions, Mapping) else self._in_range(columns)  # those of one are checked
-            ruling = self.guard.decide(before, before.guarded, proposed)
+            ruling = self._ruled(before, columns, checked=isinstance(actions, Mapping))
             columns = np.ascontiguousarray(ruling.applied)
         step = new._advance(columns)
-        if self.guard is not None:
-            new.ruling, new.guarded = ruling, self.guard.check(ruling, new)
-        new._watched = {w: w.stepped(memory, before, new) for w, memory in self._watched.items()}
-        self.__dict__.update(new.__dict__)  # in one piece: not even an interrupt comes between
+        if self.guard is not None and ruling is not None:
+            new.remember(self.guard.check(ruling, new))
+            new._now = new._now._replace(ruling=ruling)
+        watched = {watcher: watcher.stepped(memory, before, new) for watcher, memory in new._now.watched.items()}
+        self._now = new._now._replace(watched=watched)
         return step
 
+    @property
+    def _nobody_refuses_steps(self) -> bool:
+        """Whether nothing can fail within a step: then it is made in the arrays that are there."""
+        return not (self.guard or self._now.watched or self._terms.are_foreign or self._on_own_grid)
+
+    def _ruled(self, before: Engine, columns: Floats, *, checked: bool) -> Ruling:
+        """What the guard makes of the actions [n, L]; they are in range if they are ``checked``."""
+        assert self.guard is not None
+        if before.guarded is None:
+            raise UncertifiedStep("shield: this episode began before the shield was put around it; reset first")
+        return self.guard.decide(before, before.guarded, columns if checked else self._in_range(columns))
+
     def _advance(self, columns: Floats) -> Step:
-        """Advance every running episode by one time step, in place."""
+        """Advance every running episode by one time step, in the arrays that are there."""
+        asked = self._ask_scripts()
+        harm_before = self._terms.objective_harm(self.state) if self._terms.by_objective else None
+        step = self._move(columns)
+        self._change(memories=self.memories | asked)
+        if step.outcome[FAILED].any():
+            times = self.state.motion[:, 0]
+            self.roster.mark(step.failed, times, np.minimum(times + self.scenario.time_step_s, self.scenario.horizon_s))
+        if self._terms.add_something:
+            worlds = self.worlds if self.reward.shaping > 0.0 else None
+            self._now = self._now._replace(state=self._terms.add(step, self.state, self.scenario, harm_before, worlds))
+        return step
+
+    def _change(self, **fields: Any) -> None:
+        """Replace fields of the state."""
+        self._now = self._now._replace(state=self._now.state._replace(**fields))
+
+    def _ask_scripts(self) -> dict[int, Memory]:
+        """What the scripts that decide in every step want now; and what they remember once the step is made."""
         asked: dict[int, Memory] = {}
         if len(self._remembering) > len(self._on_own_grid):
-            worlds = self.worlds
+            worlds, wanted = self.worlds, self.state.wanted
             for vehicle in self._remembering.keys() - self._on_own_grid.keys():
                 script = self._remembering[vehicle]
                 command, asked[vehicle] = ask_script(script, worlds, self.memories[vehicle], vehicle)
-                self._wanted[:, vehicle] = within_capacity(command, worlds, vehicle, script)
-        before = self._terms.objective_harm(self) if self._terms.by_objective else None
-        self._stops = []
+                wanted[:, vehicle] = within_capacity(command, worlds, vehicle, script)
+        return asked
+
+    def _move(self, columns: Floats) -> Step:
+        """Move the worlds under the actions [n, L], and hear what messages bring."""
+        self._now = self._now._replace(stops=())
         way = self._start_on_own_grid(columns) if self._on_own_grid else None
-        was = self._state.copy() if self.packed.has_messages else None
-        reward, outcome = np.empty(self._wanted.shape), np.empty((OUTCOME_ROWS, self.n))
-        status = self._step_worlds(columns, reward, outcome)
-        if status == BAD_ACTION:  # nothing was moved
-            status = self._step_worlds(self._in_range(columns), reward, outcome)
-        self.memories = self.memories | asked
+        state = self.state
+        was = state.motion.copy() if state.packed.has_messages else None
+        reward, outcome = np.empty(state.wanted.shape), np.empty((OUTCOME_ROWS, self.n))
+        if self._step_worlds(columns, reward, outcome) == BAD_ACTION:  # nothing was moved
+            self._step_worlds(self._in_range(columns), reward, outcome)
         if was is not None:
-            until_s = self._state[:, self.packed.column.time]
-            hear_rows(was, self._params, self._wanted, until_s, until_s, self.scenario.time_step_s, self._pieces)
+            hear_rows(
+                was, state.params, state.wanted, state.time_s, state.time_s, self.scenario.time_step_s, self._now.pieces
+            )
         if way is not None:
-            status = self._add_way(way, reward, outcome, status)
-        step = Step(reward, outcome, self.reward, {})
-        if status != FLAG.DONE:
-            times = self._state[:, 0]
-            self.roster.mark(step.failed, times, np.minimum(times + self.scenario.time_step_s, self.scenario.horizon_s))
-        if self._terms.add_something:
-            self._terms.add(step, self, before)
-        return step
+            self._add_way(way, reward, outcome)
+        return Step(reward, outcome, self.reward, {})
 
     def _columns(self, actions: Actions) -> Floats:
         """The learners' actions as [n, L]; their range is checked where they are used."""
@@ -546,9 +501,11 @@ class Engine:
         return columns
 
     def _step_worlds(self, columns: Floats, reward: Floats, outcome: Floats) -> int:
+        """The compiled step, in place. Returns a status."""
+        motion, params, clock, wanted, *_ = self.state
         _, status = step_worlds(
-            self._state, self._params, self._clock, columns, self._learner_index, self._settings, NO_ROWS,
-            self._builds_up, self._pieces, self._wanted, reward, outcome,
+            motion, params, clock, columns, self._learner_index, self._settings, NO_ROWS, self._now.builds_up,
+            self._now.pieces, wanted, reward, outcome,
         )  # fmt: skip
         return status
 
@@ -559,58 +516,57 @@ class Engine:
 
     def _begin(self, rows: Ints, start: Start) -> None:
         """Tell those who must know that episodes start in ``rows``, and move what depends on them."""
-        if self.guard or self._watched or self._remembering:
-            alert = start.alert
+        if not self._nobody_refuses_episodes:
+            alert, memories = start.alert, self.memories
             with renumbered(rows):
                 if self.guard is not None:
-                    self.guarded = self.guard.begin(self.guarded, alert, rows)
-                self._watched = {w: w.begun(memory, alert, rows) for w, memory in self._watched.items()}
-                begun = {i: begin_script(s, alert, i, self._stream.known) for i, s in self._remembering.items()}
-            self.memories = renew_memory(self.memories, rows, begun) if self.memories else begun
+                    self.remember(self.guard.begin(self.guarded, alert, rows))
+                watched = {w: w.begun(memory, alert, rows) for w, memory in self._now.watched.items()}
+                self._now = self._now._replace(watched=watched)
+                begun = {i: begin_script(s, alert, i, self._now.stream.known) for i, s in self._remembering.items()}
+            self._change(memories=renew_memory(memories, rows, begun) if memories else begun)
+        motion, params, _, wanted, potential, *_ = self.state
         if self._on_own_grid:
             self._begin_on_own_grid(rows, start.alert, start.clock[:, START])
         elif self.packed.has_messages:
-            moving, params, start_s = (
-                self._kept(Packed.of(start.alert)).state,
-                self._params[rows],
-                self._state[rows, self.packed.column.time],
-            )
-            hear_rows(moving, params, self._wanted[rows], start_s, start_s, self.scenario.time_step_s, self._pieces)
-            self._params[rows] = params
+            at_alert, heard = self._now.kept(Packed.of(start.alert)).state, params[rows]
+            start_s = self.state.time_s[rows]
+            hear_rows(at_alert, heard, wanted[rows], start_s, start_s, self.scenario.time_step_s, self._now.pieces)
+            params[rows] = heard
         if self.reward.shaping > 0.0:
-            worlds = self._unpacked(Packed(self._state[rows], self._params[rows]))
-            self._potential[rows] = self._terms.potentials(worlds, self.scenario)
+            worlds = self._unpacked(Packed(motion[rows], params[rows]))
+            potential[rows] = self._terms.potentials(worlds, self.scenario)
 
     def _start_on_own_grid(self, columns: Floats) -> Way:
         """Let the scripts on their own grids decide within the step that begins; what comes of the way there."""
-        column = self.packed.column
-        in_force = self._state[:, column.command : column.previous].copy()
-        steps, last, start_s = (self._clock[:, at] for at in (STEP, LAST_STEP, START))
+        state, column = self.state, self.packed.column
+        in_force = state.motion[:, column.command : column.previous].copy()
+        steps, last, start_s = (state.clock[:, at] for at in (STEP, LAST_STEP, START))
         until_s = Decisions(start_s, self.scenario.time_step_s).at(steps + 1.0)
         until_s = np.where(steps + 1.0 >= last, self.scenario.horizon_s, until_s)
         way = self._decide_on_the_way(~self.ended, until_s, self._in_range(columns))
-        self._clock[way.failed != 0, ENDED] = 1.0
+        state.clock[way.failed != 0, ENDED] = 1.0
         return way._replace(in_force=in_force)
 
-    def _add_way(self, way: Way, reward: Floats, outcome: Floats, status: int) -> int:
-        """Add the way to the last stop to what came after it, in place; the status of both."""
+    def _add_way(self, way: Way, reward: Floats, outcome: Floats) -> None:
+        """Add the way to the last stop to what came after it, in place."""
         reward += way.reward
         outcome[: len(way.harm)] += way.harm
         column = self.packed.column
-        self._state[way.stopped, column.previous : column.gap] = way.in_force[way.stopped]
+        self.state.motion[way.stopped, column.previous : column.gap] = way.in_force[way.stopped]
         lost = way.failed != 0
         outcome[TRUNCATED, lost], outcome[FAILED, lost] = 1.0, way.failed[lost]
-        return int(way.failed[lost][0]) if lost.any() else status
 
     def _decide_on_the_way(self, running: Bools, until_s: Floats, columns: Floats) -> Way:
         """Let the scripts on their own grids make all decisions before ``until_s`` [n] in the ``running`` worlds.
 
         A world is moved to a decision only where that changes a command: the bits depend on where motion changes.
         """
-        (n, N), column = self._wanted.shape, self.packed.column
+        motion, params, _, wanted_so_far, *_ = self.state
+        (n, N), column = wanted_so_far.shape, self.packed.column
         vehicles, step_s = list(self._on_own_grid), self.scenario.time_step_s
-        first_s = self._params[:, column.latency : column.mass][:, vehicles].T
-        made = np.maximum(Decisions(first_s, step_s).before(self._state[:, column.time]), 0.0)
+        first_s = params[:, column.latency : column.mass][:, vehicles].T
+        made = np.maximum(Decisions(first_s, step_s).before(motion[:, column.time]), 0.0)
         due = np.where(running, np.maximum(Decisions(first_s, step_s).before(until_s), 0.0), made)
         way = Way(np.zeros((n, N)), np.zeros((2, n)), np.zeros(n, np.bool_), np.zeros(n, np.int64), np.empty(0))
         while (made < due).any():
@@ -618,18 +574,21 @@ class Engine:
             moment = next_s.min(axis=0)
             asked = next_s <= moment + ROUNDING * step_s
             asked &= made < due
-            now = self._state[:, column.time]
+            now = motion[:, column.time]
             moment = np.where((moment < np.inf) & (moment > now + ROUNDING * step_s), moment, now)
             ahead, reward, outcome = self._look_ahead(moment, until_s, columns)
-            worlds, wanted = self._unpacked(ahead), self._wanted.copy()
+            worlds, wanted = self._unpacked(ahead), wanted_so_far.copy()
             for (vehicle, script), here in zip(self._on_own_grid.items(), asked, strict=True):
                 if here.any():
                     before, idle = self.memories[vehicle], np.flatnonzero(~here)
                     command, after = ask_script(script, worlds, before, vehicle)
                     command = np.where(here, command, 0.0)
                     wanted[here, vehicle] = within_capacity(command, worlds, vehicle, script, here)[here]
-                    self.memories = self.memories | {vehicle: renew_memory(after, idle, take_memory(before, idle))}
-            changed = (wanted != self._wanted)[:, vehicles] & (made > 0.0).T  # a first one waits for the latency anyway
+                    renewed = renew_memory(after, idle, take_memory(before, idle))
+                    self._change(memories=self.memories | {vehicle: renewed})
+            changed = (wanted != wanted_so_far)[:, vehicles] & (
+                made > 0.0
+            ).T  # a first one waits for the latency anyway
             stops = (moment > now) & changed.any(axis=1) & (outcome[FAILED] == 0.0)
             way.failed[:] = np.where(outcome[FAILED] != 0.0, outcome[FAILED], way.failed)
             if stops.any():
@@ -637,7 +596,7 @@ class Engine:
                 way.reward[stops] += reward[stops]
                 way.harm[:, stops] += outcome[: len(way.harm), stops]
                 way.stopped[stops] = True
-            self._wanted[:] = wanted
+            wanted_so_far[:] = wanted
             made += asked
             made = np.where(way.failed != 0, due, made)
         return way
@@ -645,39 +604,41 @@ class Engine:
     def _look_ahead(self, until_s: Floats, decision_s: Floats, columns: Floats) -> tuple[Packed, Floats, Floats]:
         """The worlds at ``until_s`` [n], and reward [n, N] and outcome of the way there; ``decision_s``: the next one.
 
-        Only the learners' commands in ``_wanted`` are changed, by ``columns`` [n, L]; none without any.
+        Only the learners' commands in ``state.wanted`` are changed, by ``columns`` [n, L]; none without any.
         """
-        clock, settings = np.zeros(self._clock.shape), self._settings.copy()
+        now, wanted = self.state, self.state.wanted
+        clock, settings = np.zeros(now.clock.shape), self._settings.copy()
         clock[:, START], clock[:, STEP], clock[:, LAST_STEP] = until_s, -1.0, np.inf  # a step from -1 to 0 ends there
-        clock[:, ENDED] = ~(until_s > self._state[:, self.packed.column.time])
+        clock[:, ENDED] = ~(until_s > now.time_s)
         settings[TERMINAL_WEIGHT] = 0.0
-        reward, outcome = np.empty(self._wanted.shape), np.empty((OUTCOME_ROWS, self.n))
-        state, params = self._state.copy(), self._params.copy()
+        reward, outcome = np.empty(wanted.shape), np.empty((OUTCOME_ROWS, self.n))
+        ahead = Packed(now.motion.copy(), now.params.copy())
         step_worlds(
-            state, params, clock, columns, self._learner_index[: columns.shape[1]], settings, NO_ROWS,
-            self._builds_up, self._pieces, self._wanted, reward, outcome,
+            *ahead, clock, columns, self._learner_index[: columns.shape[1]], settings, NO_ROWS,
+            self._now.builds_up, self._now.pieces, wanted, reward, outcome,
         )  # fmt: skip
         if self.packed.has_messages:
-            time_s = state[:, self.packed.column.time]
-            step_s = self.scenario.time_step_s
-            hear_rows(self._state.copy(), params, self._wanted, time_s, decision_s, step_s, self._pieces)
-        return Packed(state, params), reward, outcome
+            time_s, step_s = ahead.state[:, ahead.column.time], self.scenario.time_step_s
+            hear_rows(now.motion.copy(), ahead.params, wanted, time_s, decision_s, step_s, self._now.pieces)
+        return ahead, reward, outcome
 
     def _stop(self, rows: Bools, ahead: Packed) -> None:
         """Move these rows to where the look ahead found them."""
-        self._state[rows], self._params[rows] = ahead.state[rows], ahead.params[rows]
-        self._stops.append((self._state.copy(), self._wanted.copy()))
+        motion, params, _, wanted, *_ = self.state
+        motion[rows], params[rows] = ahead.state[rows], ahead.params[rows]
+        self._now = self._now._replace(stops=(*self._now.stops, (motion.copy(), wanted.copy())))
 
     def _begin_on_own_grid(self, rows: Ints, alert: Worlds, start_s: Floats) -> None:
         """From the alert on scripts with a memory decide on their own grids; then the first decision is near.
 
         Deciders do not: like a learner they coast, and are seen to coast, until their first decision.
         """
-        began = self._kept(Packed.of(alert)).state
-        self._stops = [(state.copy(), wanted) for state, wanted in self._stops]  # of who goes on; the others did not
-        for state in (self._state, *(state for state, _ in self._stops)):
-            state[rows] = began
-        time_s = self._state[:, self.packed.column.time]
+        motion, params = self.packed
+        stops = tuple((there.copy(), wanted) for there, wanted in self._now.stops)  # of who goes on; the others did not
+        for there in (motion, *(there for there, _ in stops)):
+            there[rows] = self._now.kept(Packed.of(alert)).state
+        self._now = self._now._replace(stops=stops)
+        time_s = self.state.time_s
         running, until_s, none = np.zeros(self.n, np.bool_), time_s.copy(), np.empty((self.n, 0))
         running[rows], until_s[rows] = True, start_s
         way = self._decide_on_the_way(running, until_s, none)
@@ -685,26 +646,26 @@ class Engine:
         failed = np.where(way.failed != 0, way.failed, outcome[FAILED].astype(np.int64))
         if failed.any():
             raise FLAG.failure(np.where(failed == 0, FLAG.DONE, failed), time_s, until_s)
-        self._state[rows], self._params[rows] = ahead.state[rows], ahead.params[rows]
+        motion[rows], params[rows] = ahead.state[rows], ahead.params[rows]
 
     def segments(self, before: Worlds, last_mps2: Floats) -> Iterator[tuple[Worlds, Floats, Floats]]:
         """The last step, made from ``before`` (after a reset: the alert), in parts within which nobody decides.
 
         Each is worlds, the commands [n, N] that they followed, ``last_mps2`` in the last part, and until when [n].
         """
-        for state, wanted in self._stops:
-            then = Packed(state, self._params).worlds(before.vehicles)
+        for motion, wanted in self._now.stops:
+            then = Packed(motion, self.state.params).worlds(before.vehicles)
             yield before, wanted, then.time_s
             before = then
-        yield before, last_mps2, self._state[:, self.packed.column.time].copy()
+        yield before, last_mps2, self.state.time_s.copy()
 
     def snapshot(self) -> Arrays:
         """Copies of everything that changes while it runs: its rows, its place in the stream, the scripts' memories.
 
         The stream is one number: worlds are pure functions of the seed and of where they stand in it.
         """
-        arrays: Arrays = {name.lstrip("_"): getattr(self, name).copy() for name in RUNNING}
-        arrays["stream"] = np.array([self.seed, self._stream.position], np.uint64)
+        arrays: Arrays = {name: array.copy() for name, array in zip(SNAPSHOT, self.state, strict=False)}
+        arrays["stream"] = np.array([self.seed, self._now.stream.position], np.uint64)
         arrays["numbers"] = self.roster.numbers.copy()
         return arrays | {f"script.{name}": array for name, array in flat(self.memories).items()}
 
@@ -718,21 +679,25 @@ class Engine:
             raise InvalidInput(
                 "engine snapshot: a shield stands in this engine; restore first, then put the shield around"
             )
-        wanted = {name.lstrip("_"): getattr(self, name).shape for name in RUNNING} | {"numbers": (self.n,)}
+        wanted = {name: array.shape for name, array in zip(SNAPSHOT, self.state, strict=False)} | {"numbers": (self.n,)}
         for name, needed in wanted.items():
             have = arrays.get(name)
             if have is None or have.shape != needed:
                 shape = "nothing" if have is None else have.shape
                 raise InvalidInput(f"engine snapshot: {name} is {shape}; {needed} is needed")
         memories = {vehicle: checked_memory(unflat(arrays, f"script.{vehicle}"), self.n) for vehicle in self.memories}
-        for name in RUNNING:
-            setattr(self, name, np.array(arrays[name.lstrip("_")], np.float64))
-        self._builds_up = self._may_build_up(self.packed)
+        motion, params, clock, moving, potential = (np.array(arrays[name], np.float64) for name in SNAPSHOT)
+        state = State(motion, params, clock, moving, potential, memories, self.guarded)
         seed, taken = (int(number) for number in arrays["stream"])
-        self._stream.restart(seed, taken)
-        self.roster = Roster(self.n, seed, None)
-        self.roster.numbers = np.array(arrays["numbers"], np.int64)
-        self.memories = memories
+        stream, roster = copy.copy(self._now.stream), Roster(self.n, seed, None)
+        stream.restart(seed, taken)
+        roster.numbers = np.array(arrays["numbers"], np.int64)
+        self._now = self._now._replace(
+            state=state, stream=stream, roster=roster, builds_up=self._may_build_up(state.packed)
+        )
+
+    def _may_build_up(self, packed: Packed) -> bool:
+        return self.scenario.builds_up or packed.builds_up or self.in_pieces
 
     def place(self, worlds: Worlds, ledger: Ledger | None = None, *, ended: Bools | None = None) -> None:
         """Put the running worlds in all rows as somebody else has moved them, with their ``ledger`` so far.
@@ -741,47 +706,47 @@ class Engine:
         decision after the worlds' time. ``ended`` [n]: those that no step moves; None: those at the horizon. Raises
         ``InvalidInput`` for another number of worlds or vehicles.
         """
-        if worlds.speeds_mps.shape != self._wanted.shape:
-            n, N = self._wanted.shape
+        state = self.state
+        if worlds.speeds_mps.shape != state.wanted.shape:
+            n, N = state.wanted.shape
             raise InvalidInput(f"place: {worlds.n} worlds of {worlds.N} vehicles; {n} of {N} needed")
-        state = self._kept(packed_with(worlds, empty_ledger(worlds) if ledger is None else ledger)).state
-        made = Decisions(self._clock[:, START], self.scenario.time_step_s).latest(worlds.time_s)
-        self._state, self._clock, self.ruling = state, self._clock.copy(), None
-        self._clock[:, STEP] = np.maximum(made, 0)
-        self._clock[:, ENDED] = worlds.time_s >= self.scenario.horizon_s if ended is None else ended
+        ledger = empty_ledger(worlds) if ledger is None else ledger
+        motion, clock = self._now.kept(packed_with(worlds, ledger)).state, state.clock.copy()
+        made = Decisions(clock[:, START], self.scenario.time_step_s).latest(worlds.time_s)
+        clock[:, STEP] = np.maximum(made, 0)
+        clock[:, ENDED] = worlds.time_s >= self.scenario.horizon_s if ended is None else ended
+        self._now = self._now._replace(state=state._replace(motion=motion, clock=clock), ruling=None)
 
-    def moment(self) -> Moment:
-        """The present moment of all rows, in its own memory."""
-        rows = [array.copy() for array in (self._state, self._params, self._clock, self._wanted)]
-        return Moment(rows[0], rows[1], rows[2], rows[3], self.memories, self.guarded)
+    def moment(self) -> State:
+        """The present state of all rows, in arrays of its own."""
+        return self.state.copy()
 
-    def first_moments(self, count: int) -> tuple[Worlds, Moment]:
+    def first_moments(self, count: int) -> tuple[Worlds, State]:
         """The first ``count`` worlds of the training stream, at the alert, and at their first decision."""
-        stream = copy.copy(self._stream)
+        stream = copy.copy(self._now.stream)
         stream.restart(self.seed)
-        alert, new = stream.take(count).alert, self._unwatched(count)
+        alert, new = stream.take(count).alert, self._unwatched(count, self._now)
         new.protect(None)
         new.reset(worlds=alert)
         return alert, new.moment()
 
-    def branch(self, moment: Moment) -> Engine:
-        """An engine of the same scenario whose rows go on from ``moment``, under the same guard; this one stays.
+    def branch(self, state: State) -> Engine:
+        """An engine of the same scenario whose rows go on from ``state``, under the same guard; this one stays.
 
         Raises ``InvalidInput`` for an engine with a reward that is shaped, which tells of more than what happens.
         """
         if self.reward.shaping > 0.0:
             raise InvalidInput(f"branches: reward: shaping = {self.reward.shaping:g}: must be 0; a branch has an end")
-        new = self._unwatched(len(moment.state))
-        new.memories, new.guarded, new.ruling = moment.memories, moment.guarded, None
-        new.roster = Roster(new.n, self.seed, None)
-        new.roster.warns = False
-        new._state, new._params, new._clock, new._wanted = (array.copy() for array in moment[:4])
-        new._builds_up = new._may_build_up(new.packed)
-        new._potential = np.zeros(moment.wanted.shape)
-        return new
+        n = len(state.motion)
+        roster = Roster(n, self.seed, None)
+        roster.warns = False
+        builds_up = self._may_build_up(state.packed)
+        return self._unwatched(
+            n, self._now._replace(state=state.copy(), roster=roster, ruling=None, builds_up=builds_up)
+        )
 
-    def _unwatched(self, n: int) -> Engine:
-        """An engine of the same scenario for ``n`` worlds, which nobody watches; its rows are still to be set."""
-        new = copy.copy(self)
-        new.n, new._watched = n, {}
+    def _unwatched(self, n: int, now: Now) -> Engine:
+        """An engine of the same scenario for ``n`` worlds, at that moment, which nobody watches."""
+        new = self._at(now._replace(watched={}))
+        new.n = n
         return new

@@ -1,4 +1,4 @@
-"""Who drives: scripts, and what they remember."""
+"""Scripts: what drives a vehicle that does not learn, and what it remembers."""
 
 from __future__ import annotations
 

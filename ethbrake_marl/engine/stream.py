@@ -188,5 +188,3 @@ def packed_with(worlds: Worlds, harm: Impacts | Ledger) -> Packed:
 
 
 NO_ROWS = np.empty((0, LISTED.WIDTH))  # no list of impacts is kept
-
-RUNNING = ("_state", "_params", "_clock", "_wanted", "_potential")  # arrays of an engine that every step changes

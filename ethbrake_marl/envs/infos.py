@@ -247,7 +247,7 @@ class Begun:
     def _restart(self, seed: int | None, options: Mapping[str, Any] | None) -> None:
         """Start new episodes in all worlds: the stream of ``seed`` from its start, or where the stream stands.
 
-        ``options["initial_state"]`` (see ``Scenario.worlds_from_state``) is the start of every world instead;
+        ``options["initial_state"]`` (see ``scenario.tables.worlds_from_state``) is the start of every world instead;
         ``options["listed_world"] = {"seed": 7, "number": 3}`` starts in that world of the list on which agents are
         evaluated, a batch in that one and those after it. With autoreset, later episodes come from the stream. Other
         options warn with ``UnknownResetOption`` and are ignored. Raises ``InvalidInput``, with nothing changed, for a

@@ -32,6 +32,7 @@ from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.state import Bools, Ints, Worlds
 from ethbrake_marl.scenario.observed import Appended, full_state, row_features
+from ethbrake_marl.scenario.tables import worlds_from_state
 
 Rewards = NDArray[np.float32]
 
@@ -299,7 +300,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
             return None
         width, starts = len(self.engine.learners), list[Worlds]()
         for k, row in enumerate(options):
-            start = self.engine.scenario.worlds_from_state(row[INITIAL_STATE]) if INITIAL_STATE in row else None
+            start = worlds_from_state(self.engine.scenario, row[INITIAL_STATE]) if INITIAL_STATE in row else None
             if start is None or (k % width and bytes_of(start) != bytes_of(starts[-1])):
                 raise InvalidInput(
                     f"set_options: row {k} has {row!r}; if one row has an {INITIAL_STATE}, every row needs one, and the"

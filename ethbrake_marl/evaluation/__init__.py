@@ -25,18 +25,18 @@ if TYPE_CHECKING:
         result_versions as result_versions,
         worlds_sha256 as worlds_sha256,
     )
-    from ethbrake_marl.evaluation.motion import EpisodeMotion as EpisodeMotion, follow_episodes as follow_episodes
-    from ethbrake_marl.evaluation.named_worlds import (
-        NamedWorld as NamedWorld,
-        NamedWorlds as NamedWorlds,
+    from ethbrake_marl.evaluation.lineup import (
         check_agents as check_agents,
-        drawn_alike as drawn_alike,
-        load_runnable as load_runnable,
         make_agents as make_agents,
         make_lineup as make_lineup,
-        states_of as states_of,
-        try_scenario as try_scenario,
     )
+    from ethbrake_marl.evaluation.measures import (
+        Measure as Measure,
+        MeasureSet as MeasureSet,
+        Silent as Silent,
+        register_measure_set as register_measure_set,
+    )
+    from ethbrake_marl.evaluation.motion import EpisodeMotion as EpisodeMotion, follow_episodes as follow_episodes
     from ethbrake_marl.evaluation.outcome import LeftOut as LeftOut, Outcome as Outcome
     from ethbrake_marl.evaluation.own_measures import (
         MEASURES as MEASURES,
@@ -66,23 +66,13 @@ if TYPE_CHECKING:
         unpaired_difference as unpaired_difference,
     )
     from ethbrake_marl.evaluation.summary import (
+        RowsBeside as RowsBeside,
         SummaryRow as SummaryRow,
         SummaryTable as SummaryTable,
         summarise as summarise,
     )
     from ethbrake_marl.evaluation.tally import Tally as Tally
-    from ethbrake_marl.extensions.datasets.minari import check_dataset as check_dataset, write_dataset as write_dataset
-    from ethbrake_marl.extensions.report.deceleration import (
-        DecelerationCurve as DecelerationCurve,
-        deceleration_curve as deceleration_curve,
-    )
-    from ethbrake_marl.extensions.report.film import check_film as check_film, film as film
-    from ethbrake_marl.extensions.report.tests import (
-        PAPER_ROWS as PAPER_ROWS,
-        TESTS as TESTS,
-        PaperRow as PaperRow,
-        is_papers_test as is_papers_test,
-        other_tests as other_tests,
-    )
+    from ethbrake_marl.evaluation.trial import load_runnable as load_runnable, try_scenario as try_scenario
+    from ethbrake_marl.evaluation.varying import drawn_alike as drawn_alike, states_of as states_of
 else:
     __getattr__ = front_door(__name__, __file__)

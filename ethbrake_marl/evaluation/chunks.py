@@ -19,13 +19,14 @@ from ethbrake_marl.agents.registry import parse_spec
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.identity import CHUNK, HELD, own_versions, policies_of, result_versions, scenario_sha256
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.identity import CHUNK, own_versions, policies_of, result_versions, scenario_sha256
+from ethbrake_marl.evaluation.lineup import make_lineup
+from ethbrake_marl.evaluation.measures import silent_in_long_lists
+from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.own_measures import LOADED, REGISTERED, load_measures
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk
 from ethbrake_marl.evaluation.summary import SummaryTable
 from ethbrake_marl.evaluation.tally import Tally
-from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.files.python_file import file_sha256
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.parallel import Call, run_each
@@ -49,7 +50,7 @@ class Lineup:
         agents: specs, as on the command line.
         scenario: whose learners they drive.
         harm_count: harm that agents minimise.
-        uncertainty: what agents behind ``+robust`` do not know, as ``parse_uncertainty`` reads it.
+        uncertainty: what shields do not know that take one, as text.
         measures: that evaluations tell, too, as ``load_measures`` takes them; with those that it was given before.
         told: names of all measures that evaluations tell, whatever is registered later.
         same: what must be the same in every process; see ``Lineup.of``.
@@ -96,8 +97,7 @@ class Lineup:
         return _MADE[self.same]
 
     def _make_anew(self) -> Mapping[str, Driver]:
-        intervals = None if self.uncertainty is None else parse_uncertainty(self.uncertainty)
-        return make_lineup(self.agents, self.scenario, harm_count=self.harm_count, uncertainty=intervals)
+        return make_lineup(self.agents, self.scenario, harm_count=self.harm_count, uncertainty=self.uncertainty)
 
     def _same(self, made: Mapping[str, Driver]) -> str:
         policies = {name: policies_of(Team.of(agent, self.scenario.learners).drivers) for name, agent in made.items()}
@@ -139,7 +139,13 @@ def evaluate_held(
 
 def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evaluation:
     found = drive_chunk(part, lineup.make(), lineup.scenario, seed, lineup.scenario.learners, first)
-    return found.telling(lineup.told)
+    return replace(found, outcomes={agent: _only(each, lineup.told) for agent, each in found.outcomes.items()})
+
+
+def _only(outcome: Outcome, names: Sequence[str]) -> Outcome:
+    """The outcome with these registered measures alone."""
+    kept = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
+    return replace(outcome, metrics=kept)
 
 
 def tally_list(
@@ -154,8 +160,7 @@ def tally_list(
 ) -> Tally:
     """The statistics of the worlds 0 to ``episodes - 1`` of a list of any length; no world is kept.
 
-    Nothing of what is known whoever drives is in them: proofs take longer than driving. ``jobs`` and ``ray`` as in
-    ``run_each``.
+    Sets of measures that take longer than driving are not in them. ``jobs`` and ``ray`` as in ``run_each``.
     """
     check_whole_number("episodes", episodes, 1, MOST_EPISODES)
     check_whole_number("seed", seed, 0)
@@ -186,11 +191,10 @@ def summarise_tally(lineup: Lineup, tally: Tally, seed: int) -> SummaryTable:
     scenario = lineup.scenario
     task = Task(scenario, scenario.learners, lineup.harm_count)
     teams = {name: Team.of(agent, scenario.learners) for name, agent in lineup.make().items()}
-    because = f"a list of more than {HELD:,} worlds is driven without proofs"
     return SummaryTable.of_tallies(
         {name: tally.agents[name] for name in teams},
-        Conditions.of_test(task, seed, tally.worlds, because, Conditions.of_ranges(tally.ranges)),
-        task,
+        Conditions.of_test(task, seed, tally.worlds, tally.silent, Conditions.of_ranges(tally.ranges)),
+        silent_in_long_lists(),
         {name: Knowledge.of(team) for name, team in teams.items()},
         {name: policies_of(team.drivers) for name, team in teams.items()},
         left_out=tally.left_out,

@@ -42,7 +42,7 @@ class Conditions(dict[str, Any]):
 
     @classmethod
     def of_ranges(cls, ranges: Mapping[str, Iterable[Any]]) -> Conditions:
-        """Those whose entries have these values, or these least and largest ones."""
+        """The conditions of quantities with these values, or these least and largest values."""
         found = {
             key: [(float(np.nanmin(each)), float(np.nanmax(each))) for each in entries]
             for key, entries in ranges.items()
@@ -52,16 +52,16 @@ class Conditions(dict[str, Any]):
 
     @classmethod
     def of_test(
-        cls, task: Task, seed: int | None, count: int, because: str | None, found: Mapping[str, Any]
+        cls, task: Task, seed: int | None, count: int, because: Mapping[str, str | None], quantities: Mapping[str, Any]
     ) -> Conditions:
-        """Those of a test.
+        """Conditions of a test.
 
         Args:
             task: scenario, and who was driven.
             seed: of the list; None for worlds that were given.
             count: number of worlds.
-            because: why nothing is proven for these worlds; None where it is.
-            found: the quantities of the worlds.
+            because: why sets of measures say nothing of these worlds, by key; None where they do.
+            quantities: of the worlds.
 
         """
         scenario = task.scenario
@@ -75,8 +75,8 @@ class Conditions(dict[str, Any]):
             scripts={name: script for name, script in scripts.items() if name not in driven},
             time_step_s=scenario.time_step_s,
             horizon_s=scenario.horizon_s,
-            no_limits_because=because,
-            **found,
+            **because,
+            **quantities,
         )
 
     @property

@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 import sys
-import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, unknown_name
-from ethbrake_marl.evaluation.agent_tally import AgentTally
 from ethbrake_marl.evaluation.conditions import Conditions
-from ethbrake_marl.evaluation.measures import BASELINE, COUNTED, measures
-from ethbrake_marl.evaluation.outcome import IncompleteTable, LeftOut, Outcome, none_for_nan
+from ethbrake_marl.evaluation.measures import MEASURE_SETS, Silent, contexts_of, silent_because
+from ethbrake_marl.evaluation.outcome import LeftOut, Outcome, none_for_nan
 from ethbrake_marl.evaluation.rescores import Rescored, Rescores
-from ethbrake_marl.evaluation.statistics import Moments, exact_sum, mean, rate
-from ethbrake_marl.extensions.search.limits import Limits, Unproven, known_limits
-from ethbrake_marl.extensions.search.regret import KNOWN_OF_WORLDS, Regrets
+from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.game.objectives import Declared, scored
@@ -36,15 +31,14 @@ _SHOWN_AGENTS = 5  # by name, in ``repr``
 
 Columns = dict[str, list[Any]]  # of one row per world
 
-_TEXT_COLUMNS = {"agent", "scenario", "unavoidable_reason", "best_known_source", "ended", "knows"}
+_TEXTS = {"agent", "scenario", "ended", "knows"}  # columns of texts, beside those of sets of measures
 
-_ALWAYS_TOLD = (
-    "gaps_m",
-    "speeds_mps",
-    "obstacle_gap_m",
-)  # quantities of those files that may be the same in all worlds
+_ALWAYS_SHOWN = ("gaps_m", "speeds_mps", "obstacle_gap_m")  # quantities in those files even if all worlds agree
 
 _LIBRARIES = ("pandas", "polars", "columns")  # of a frame, in the order of preference
+
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -68,7 +62,8 @@ class Evaluation:
     outcomes: dict[str, Outcome]  # by the agent's name
     left_out: tuple[LeftOut, ...] = ()  # worlds of the list that are in none of the arrays, the same for all agents
     kinds: Mapping[str, NDArray[np.str_]] = field(default_factory=dict)  # ``scenario``, ``vehicle_2_type``: each [n]
-    host: str = ""  # that moved the worlds; else the physics here, of which something is proven
+    host: str = ""  # a simulator that moved the worlds; "": the physics of this package
+    _computed: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # see ``once``
 
     def __repr__(self) -> str:
         drivers = [f"{agent!r:.42}" for agent in list(self.outcomes)[:_SHOWN_AGENTS]]
@@ -80,14 +75,6 @@ class Evaluation:
             f" by {', '.join(drivers)})"
         )
 
-    def telling(self, names: Collection[str]) -> Evaluation:
-        """The same, of registered measures with these alone."""
-        outcomes = {}
-        for agent, outcome in self.outcomes.items():
-            kept = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
-            outcomes[agent] = replace(outcome, metrics=kept)
-        return replace(self, outcomes=outcomes)
-
     @property
     def vehicle(self) -> int:
         """The vehicle that was driven; raises ``InvalidInput`` if it is not exactly one."""
@@ -98,17 +85,11 @@ class Evaluation:
         """What was asked of the agents."""
         return Task(self.scenario, self.vehicles)
 
-    @cached_property
-    def limits(self) -> Limits | Unproven:
-        """What is known of each world whoever drives: found once, for everything that tells of this evaluation.
-
-        Warns (``IncompleteTable``) where a table of best known harm holds some of the worlds, and not the others.
-        """
-        if self.host:
-            return Unproven(f"{self.host} moved these worlds, and what is proven is of the physics here")
-        found = known_limits(self.worlds, self.task)
-        if isinstance(found, Limits) and found.warning:
-            warnings.warn(found.warning, IncompleteTable, stacklevel=2)
+    def once(self, compute: Callable[[Evaluation], T]) -> T:
+        """``compute(self)``, computed once for everybody who asks for it."""
+        if compute not in self._computed:
+            self._computed[compute] = compute(self)
+        found: T = self._computed[compute]
         return found
 
     @classmethod
@@ -137,48 +118,6 @@ class Evaluation:
             self, worlds=self.worlds.take(rows), index=self.index[rows], outcomes=outcomes, left_out=(), kinds=kinds
         )
 
-    def tally(
-        self, *, baseline: str = "full_brake", limits: bool = True, objectives: Sequence[str] | None = None
-    ) -> dict[str, AgentTally]:
-        """The tally of every agent.
-
-        Args:
-            baseline: what is compared with, but for regrets, which are compared with full braking.
-            limits: with what needs the best known harm of each world.
-            objectives: also sum up what each vehicle bears, and these of it; None: neither.
-
-        """
-        regrets, values = self.regrets if limits else None, {}
-        for agent, outcome in self.outcomes.items():
-            told = ((m.name, m.values(outcome, regrets)) for m in (*measures(outcome.metrics), *COUNTED))
-            values[agent] = {name: column for name, column in told if column is not None}
-            values[agent] |= {} if objectives is None else outcome.borne(objectives)
-        paired = {str(m.of): BASELINE if m.limits else baseline for m in measures() if m.against}
-        found = {}
-        for agent, own in values.items():
-            truths = {name: column for name, column in own.items() if column.dtype == np.bool_}
-            found[agent] = AgentTally(
-                {name: (int(column.sum()), len(column)) for name, column in truths.items()},
-                {name: Moments.of(column) for name, column in own.items() if name not in truths},
-                {
-                    name: exact_sum(own[name], values[other][name])
-                    for name, other in paired.items()
-                    if name in own and other in values
-                },
-            )
-        return found
-
-    @staticmethod
-    def check_group(kinds: Collection[str], by: str) -> None:
-        """Raise what ``summarise_by`` would for worlds with these columns of ``kinds``."""
-        if not kinds:
-            raise InvalidInput(
-                f"by {by!r}: these worlds have no groups; those of a mixture have scenario, those with vehicle_types"
-                " have vehicle_1_type and so on"
-            )
-        if by not in kinds:
-            raise unknown_name("group", by, kinds)
-
     @property
     def hidden(self) -> Bools:
         """Worlds in which the channel hides something of the line from a driven vehicle, [n]; see ``v2x``."""
@@ -186,26 +125,10 @@ class Evaluation:
         hidden: Bools = np.logical_or.reduce([np.zeros(self.worlds.n, np.bool_), *from_each])
         return hidden
 
-    @cached_property
-    def regrets(self) -> Regrets | None:
-        """Best known harm of every world, the agents of this evaluation included; None where nothing is proven."""
-        limits = self.limits
-        if isinstance(limits, Unproven):
-            return None
-        outcomes = self.outcomes.values()
-        first = np.fmin.reduce([limits.first_impact_harm, *(outcome.first_impact_harm for outcome in outcomes)])
-        total = np.fmin.reduce([limits.total_harm, *(outcome.total_harm for outcome in outcomes)])
-        regrets = Regrets(limits, first, total, np.zeros(0, np.str_))
-        below = np.logical_or.reduce([regrets.below(outcome) for outcome in outcomes])
-        avoidable = limits.proof.avoidable
-        witness = np.zeros(below.shape, np.bool_) if avoidable is None else avoidable
-        source = np.select([witness, ~limits.known, below], ["witness", "agents", "below_table"], "table")
-        return replace(regrets, source=source)
-
     @property
     def conditions(self) -> Conditions:
         """Under which these are the results, with all quantities of the worlds."""
-        because = self.limits.because if isinstance(self.limits, Unproven) else None
+        because = silent_because(contexts_of(self))
         return Conditions.of_test(self.task, self.seed, self.worlds.n, because, Conditions.of(self.worlds))
 
     def per_world(self, objectives: Sequence[Declared] = ()) -> Columns:
@@ -214,18 +137,20 @@ class Evaluation:
         Initial quantities are named as in a table of initial states: ``gap_1_m``, ``speed_1_mps``, ``latency_2_s``,
         ``restitution``.
         """
-        n, regrets = self.worlds.n, self.regrets
+        n, contexts = self.worlds.n, contexts_of(self)
         initial: Columns = {"world": self.index.tolist()}
         initial |= {name: column.tolist() for name, column in self.kinds.items()}
         for key, rule in QUANTITY.of(self.worlds).items():
             values = rule.of(self.worlds)
-            if key in _ALWAYS_TOLD or np.ptp(values, axis=0).any():
+            if key in _ALWAYS_SHOWN or np.ptp(values, axis=0).any():
                 initial |= {rule.column_of(i): none_for_nan(values[:, i]) for i in range(values.shape[1])}
         found: Columns = {}
         for agent, outcome in self.outcomes.items():
             told = outcome.columns()
-            for name, of in KNOWN_OF_WORLDS.items():
-                told[name] = None if regrets is None else of(regrets, outcome)
+            for name, each in MEASURE_SETS.items():
+                context = contexts[name]
+                for column, of in each.per_world.items():
+                    told[column] = None if isinstance(context, Silent) else of(outcome, context)
             told |= {name: column for name, column in outcome.borne(objectives).items() if name not in told}
             columns: Columns = {
                 "agent": [agent] * n,
@@ -242,9 +167,9 @@ class Evaluation:
 
     def arrays(self, objectives: Sequence[Declared] = ()) -> dict[str, NDArray[Any]]:
         """``per_world`` as arrays: NaN for no number, the empty text for no text."""
-        found = {}
+        found, of_sets = {}, [each.texts for each in MEASURE_SETS.values()]
         for name, values in self.per_world(objectives).items():
-            texts = name in _TEXT_COLUMNS or (name.startswith("vehicle_") and name.endswith("_type"))
+            texts = name in _TEXTS.union(*of_sets) or (name.startswith("vehicle_") and name.endswith("_type"))
             found[name] = np.array([("" if texts else np.nan) if value is None else value for value in values])
         return found
 

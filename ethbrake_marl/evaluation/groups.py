@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.measures import BASELINE
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
@@ -29,7 +30,13 @@ def summarise_by(evaluation: Evaluation, by: str, *, baseline: str = BASELINE) -
     {'paper-delay-high': 11, 'paper-delay-low': 8, 'paper-delay-middle': 11}
 
     """
-    Evaluation.check_group(evaluation.kinds, by)
+    if not evaluation.kinds:
+        raise InvalidInput(
+            f"by {by!r}: these worlds have no groups; those of a mixture have scenario, those with vehicle_types"
+            " have vehicle_1_type and so on"
+        )
+    if by not in evaluation.kinds:
+        raise unknown_name("group", by, evaluation.kinds)
     column = evaluation.kinds[by]
     return {
         name or NO_TYPE: summarise(evaluation.take(column == name), baseline=baseline)

@@ -39,8 +39,6 @@ CHUNK = 2_500  # worlds advanced together: bounds memory; of results only ``worl
 
 EPISODES, LIST_SEED = 10_000, 7  # of the list on which everything is measured; a training has a seed of its own
 
-MOST_NAMED_WORLDS = 1000  # of a file
-
 HELD = 100_000  # worlds of a list that is held in memory as a whole, unless each of its worlds is asked for
 
 HASHES = 1 << 256  # sums of hashes are kept modulo this

@@ -27,10 +27,6 @@ UNSTATED = Knowledge((Source.UNSTATED,))
 _COLUMNS = ("at_rest", "predicted_harm", "chosen_policy", "shoved_m", "sampled_harm")  # of an outcome, [n]
 
 
-class IncompleteTable(UserWarning):
-    """A table of best known harm holds some of the worlds asked about, and not the others."""
-
-
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """What one agent achieved, world by world.

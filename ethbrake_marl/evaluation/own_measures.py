@@ -5,48 +5,19 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
-from typing import Literal
 
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, describe_error
+from ethbrake_marl.evaluation.impacts import EpisodeImpacts
 from ethbrake_marl.evaluation.outcome import Values
 from ethbrake_marl.files.python_file import load_from_file
-from ethbrake_marl.game.harm import INJURY_CURVES, injury_probability
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.left_out import ImpactRows
 from ethbrake_marl.physics.state import Floats, Worlds, make_worlds
 from ethbrake_marl.registry import Part, Registry
 
 _NAME = re.compile(r"(?!.*_([0-9]+|interval|low|high)\Z)[a-z][a-z0-9_]{0,63}")  # x_2 is that of the second vehicle
-
-
-@dataclass(frozen=True, slots=True)
-class EpisodeImpacts:
-    """What a registered measure is computed from, for n episodes of N vehicles; its arrays cannot be written to."""
-
-    worlds: Worlds  # [n] at the alert
-    rows: ImpactRows  # every impact, by world and then by time, arrays [k]
-
-    @classmethod
-    def unwritable(cls, worlds: Worlds, rows: ImpactRows) -> EpisodeImpacts:
-        """Those of these episodes; the arrays of ``rows`` cannot be written to from now on."""
-        for column in fields(rows):
-            getattr(rows, column.name).flags.writeable = False
-        return cls(worlds.read_only(), rows)
-
-    @property
-    def largest_speed_change_mps(self) -> Floats:
-        """The largest change of speed of each vehicle in one impact (delta-v), [n, N]; 0 without one.
-
-        One that is pushed by a vehicle that touches it already has no impact of its own, and so no change from it.
-        """
-        rows, change = self.rows, np.zeros(self.worlds.speeds_mps.shape)
-        np.maximum.at(change, (rows.world, rows.pair + 1), np.abs(rows.rear_speed_change_mps))
-        pairs = rows.pair >= 0  # an obstacle ahead is no vehicle
-        np.maximum.at(change, (rows.world[pairs], rows.pair[pairs]), np.abs(rows.front_speed_change_mps[pairs]))
-        return change
-
 
 EpisodeFunction = Callable[[EpisodeImpacts], Values]
 
@@ -115,47 +86,6 @@ def load_measures(names: Iterable[str]) -> None:
         else:
             MEASURES.load(name)
         LOADED[name] = None
-
-
-def _injury(curve: str, rule: Literal["", "_vehicle", "_every"]) -> EpisodeFunction:
-    def told(episodes: EpisodeImpacts) -> Values:
-        rows, found = episodes.rows, np.zeros(episodes.worlds.speeds_mps.shape)
-        struck = rows.pair >= 0  # an obstacle ahead is no vehicle
-        world = np.concatenate([rows.world, rows.world[struck]])
-        vehicle = np.concatenate([rows.pair + 1, rows.pair[struck]])
-        front, rear = np.abs(rows.rear_speed_change_mps), np.abs(rows.front_speed_change_mps[struck])
-        p = np.concatenate([injury_probability(front, "front", curve), injury_probability(rear, "rear", curve)])
-        if rule == "_every":
-            np.add.at(found, (world, vehicle), p)
-        else:  # of several entries for one vehicle the last one stays, which is that of the largest change
-            order = np.argsort(np.concatenate([front, rear]), kind="stable")
-            found[world[order], vehicle[order]] = p[order]
-        return 1_000.0 * (found if rule == "_vehicle" else found.sum(axis=1))
-
-    each = {
-        "": "summed over the vehicles, each by its largest change of speed",
-        "_vehicle": "by its largest change of speed",
-        "_every": "summed over every impact, as if each met other people",
-    }
-    about = INJURY_CURVES[curve]
-    told.__doc__ = (
-        f"Injuries of {about.injury} in 1,000 lines, {each[rule]}: {about.formula}; dv in m/s ({about.source})."
-    )
-    return told
-
-
-_RULES: tuple[Literal["", "_vehicle", "_every"], ...] = ("", "_vehicle", "_every")
-
-# The injuries in 1,000 lines, by each of ``harm.INJURY_CURVES``, under one name of the entry points (pyproject.toml).
-#
-# ``injury_CURVE`` is the sum over the vehicles of a line, each by its largest change of speed, as the literature takes
-# it; ``injury_CURVE_vehicle`` tells it of each; ``injury_CURVE_every`` sums over every impact, as if each met other
-# people. A vehicle that was not hit has none, nor has one pushed by a vehicle that touches it already.
-INJURY = {
-    f"injury_{curve}{rule}": Part(_injury(curve, rule), unit="per 1,000 lines")
-    for curve in INJURY_CURVES
-    for rule in _RULES
-}
 
 
 def heading_of(column: str) -> str:

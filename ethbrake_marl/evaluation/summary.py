@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ethbrake_marl.agents.protocol import Knowledge, Source
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.agent_tally import AgentTally, estimate_all
+from ethbrake_marl.evaluation.agent_tally import AgentTally, estimate_all, lower_bounds, tally_agents
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.exploits import MARK, Exploits
 from ethbrake_marl.evaluation.identity import result_versions, scenario_sha256, worlds_sha256
-from ethbrake_marl.evaluation.measures import BASELINE, BELOW, CHOSEN, HORIZON, KNOWN, measures
+from ethbrake_marl.evaluation.measures import (
+    BASELINE,
+    EPISODE,
+    MEASURE_SETS,
+    MeasureSet,
+    RegisteredMeasures,
+    contexts_of,
+    every_set,
+    measures,
+)
 from ethbrake_marl.evaluation.outcome import COLUMN, UNSTATED, LeftOut
 from ethbrake_marl.evaluation.own_measures import heading_of, registered_measure
-from ethbrake_marl.extensions.report.tests import PAPER_NOTE, PAPER_PARAMETERS, PAPER_ROWS, TESTS, check_papers_test
-from ethbrake_marl.extensions.search.limits import Limits
-from ethbrake_marl.extensions.search.regret import Between
-from ethbrake_marl.files.sheet import DASH, Column, Estimate, Row, Sheet, Shown, terminal_text
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.files.sheet import Column, Estimate, Row, Sheet, Shown, terminal_text
 
 SEES_THROUGH = "† "  # before what an agent knows that no channel brought
 
@@ -35,17 +40,13 @@ _HEAD = {
     " something here.",
 }
 
-_ALWAYS_SHOWN = ("collision_rate", "first_impact_harm", "total_harm", "sampled_harm", "vehicle_1_shoved_m")
-
-_NARROW = (  # in a narrow terminal too, where there is no regret to show, and where there is
-    ("harm_decrease_first", "harm_decrease_total"),
-    ("mean_regret_first", "share_of_possible_reduction_first"),
-)
-
-_IN_NOTEBOOKS = (
-    *("Agent", "Knows", "collision_rate", "first_impact_harm", "total_harm"),
-    *("mean_regret_first", "harm_decrease_first", "share_of_possible_reduction_first"),
-)
+_ALWAYS_SHOWN = (
+    "collision_rate",
+    "first_impact_harm",
+    "total_harm",
+    "sampled_harm",
+    "vehicle_1_shoved_m",
+)  # narrow too
 
 _BELOW = ("collision_rate", "first_impact_harm", "total_harm")  # a terminal shows their intervals; JSON has all
 
@@ -72,12 +73,9 @@ class SummaryRow:
     horizon_ends: int  # worlds that the horizon cut off before the line stood
     parameters: Conditions  # of the test
     policy_share: float | None = None  # share of worlds in which a hybrid drove by its policy
-    known_best_share: float | None = None  # worlds whose best is known without the agents of this evaluation
-    below_best_known: int | None = None  # worlds in which the agent is below it
-    between: Between | None = None  # the worlds in which contact is proven and no impact
-    warning: str = ""  # a table of best known harm holds some of the worlds, and not the others
+    more: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # fields of sets of measures, by set
+    bounds: frozenset[str] = frozenset()  # measures whose means are lower bounds
     left_out: tuple[LeftOut, ...] = ()  # worlds of the list that no row counts: they could not be advanced
-    beside_paper: bool = False  # the paper's rows stand below
     knows: Knowledge = UNSTATED  # what the agent says it knows of the line
     hidden_share: float = 0.0  # worlds in which the channel hides something from a driven vehicle, whoever drives
     worlds_sha256: str = ""  # of the list; results on the same worlds have the same
@@ -91,7 +89,7 @@ class SummaryRow:
     @property
     def collision_rate(self) -> Estimate:
         """Share of worlds."""
-        return self.estimates["collision_rate"]  # type: ignore[return-value]  # all have it in all worlds
+        return self.estimates["collision_rate"]  # type: ignore[return-value]  # every agent has it in every world
 
     @property
     def first_impact_harm(self) -> Estimate:
@@ -127,9 +125,10 @@ class SummaryRow:
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON; what does not exist is null, intervals are ``[low, high]``."""
-        of_limits = {measure.name for measure in measures() if measure.limits}
-        optional = {measure.name for measure in measures() if not measure.always}
-        told = {name: each for name, each in self.estimates.items() if each or name not in optional}
+        registered = RegisteredMeasures(n.removeprefix(COLUMN) for n in self.estimates if n.startswith(COLUMN))
+        more: dict[str, Any] = {}
+        for name, each in MEASURE_SETS.items():
+            more |= self._estimates_of(each) | self.more.get(name, {})
         return {
             "kind": "evaluate",
             "agent": self.agent,
@@ -140,13 +139,10 @@ class SummaryRow:
             "collisions": self.collisions,
             "horizon_ends": self.horizon_ends,
             "exploits": list(self.exploits.names),
-            **Estimate.side_by_side({name: each for name, each in told.items() if name not in of_limits}),
+            **self._estimates_of(EPISODE),
+            **self._estimates_of(registered),
             **({"policy_share": self.policy_share} if self.policy_share is not None else {}),
-            **Estimate.side_by_side({name: each for name, each in told.items() if name in of_limits}),
-            "known_best_share": self.known_best_share,
-            "best_known_warning": self.warning or None,
-            "below_best_known": self.below_best_known,
-            "impact_unproven": None if self.between is None else asdict(self.between),
+            **more,
             "left_out": [left._asdict() for left in self.left_out],
             "worlds_sha256": self.worlds_sha256,
             "scenario_sha256": self.scenario_sha256,
@@ -155,6 +151,23 @@ class SummaryRow:
             **({"metrics": {name: heading_of(name) for name in self.metrics}} if self.metrics else {}),
             "parameters": self.parameters,
         }
+
+    def _estimates_of(self, of: MeasureSet) -> dict[str, Any]:
+        """The estimates of one set, side by side."""
+        there = {m.name: self.estimates[m.name] for m in of.measures if m.name in self.estimates}
+        optional = {measure.name for measure in of.measures if not measure.always}
+        return Estimate.side_by_side({name: each for name, each in there.items() if each or name not in optional})
+
+
+@dataclass(frozen=True, slots=True)
+class RowsBeside:
+    """Printed rows of another source that stand below a table of ours, and what must be said of them.
+
+    A row is a name and texts by measure; a text alone begins a section.
+    """
+
+    rows: Sequence[str | tuple[str, Mapping[str, str]]]
+    notes: Sequence[tuple[str, str]]  # as ``SummaryTable.notes``
 
 
 class SummaryTable(list[SummaryRow]):
@@ -169,6 +182,10 @@ class SummaryTable(list[SummaryRow]):
 
     """
 
+    def __init__(self, rows: Iterable[SummaryRow] = (), beside: RowsBeside | None = None) -> None:
+        super().__init__(rows)
+        self.beside = beside
+
     def __repr__(self) -> str:
         return f"SummaryTable({', '.join(row.agent for row in self)})"
 
@@ -177,23 +194,22 @@ class SummaryTable(list[SummaryRow]):
 
     def _repr_html_(self) -> str:
         note = "Harm: means per world in m²/s². In brackets: 95 % intervals. Decrease: of full braking's harm."
-        note += f" WARNING: {self[0].warning}." if self and self[0].warning else ""
+        note += "".join(f" {warning}" for warning in self._warnings())
         worlds = f"{self[0].parameters['scenario']}, {count_of(self[0].episodes, 'world')}" if self else "no agent"
-        sheet = self.sheet()
-        ours = replace(sheet, title=worlds, rows=sheet.rows[: len(self)], note=note)
-        return ours.only(k for k, name in enumerate(sheet.names) if name in _IN_NOTEBOOKS).html()
+        sheet = replace(SummaryTable(self).sheet(), title=worlds, note=note)
+        shown = {"Agent", "Knows"}.union(*(each.notebook for _, each in every_set()))
+        return sheet.only(k for k, name in enumerate(sheet.names) if name in shown).html()
 
     @classmethod
     def of_tallies(
         cls,
         tallies: Mapping[str, AgentTally],
         conditions: Conditions,
-        task: Task,
+        contexts: Mapping[str, Any],
         knows: Mapping[str, Knowledge],
         policies: Mapping[str, Mapping[str, str]],
         *,
         baseline: str = BASELINE,
-        paper: bool = False,
         **shared: Any,
     ) -> SummaryTable:
         """One row per agent, from what was counted in the worlds of a list.
@@ -201,33 +217,27 @@ class SummaryTable(list[SummaryRow]):
         Args:
             tallies: of every agent.
             conditions: of the test.
-            task: who is driven where.
+            contexts: what each set of measures knows of the worlds.
             knows: by agent.
             policies: by agent: vehicle's name -> SHA-256 of its policy.
             baseline: what is compared with.
-            paper: show the paper's rows below.
-            shared: what all rows say alike.
-
-        Raises ``InvalidInput`` for ``paper`` where its rows are about something else.
+            shared: what is the same in all rows.
 
         """
         worlds = conditions["count"]
-        if paper:
-            check_papers_test(task, conditions["seed"])
         return cls(
             SummaryRow(
                 agent=agent,
                 episodes=worlds,
                 estimates=estimate_all(tallies, agent, worlds, baseline=baseline),
                 collisions=tally.count("collision_rate"),
-                horizon_ends=tally.count(HORIZON),
-                policy_share=tally.share(CHOSEN, worlds),
-                known_best_share=tally.share(KNOWN, worlds),
-                below_best_known=tally.count(BELOW) if BELOW in tally.counts else None,
+                horizon_ends=tally.count("horizon_ends"),
+                policy_share=tally.share("policy_share", worlds),
+                more={name: each.row(tally, worlds, contexts.get(name)) for name, each in MEASURE_SETS.items()},
+                bounds=lower_bounds(tally, worlds),
                 knows=knows[agent],
                 policy_sha256=policies[agent],
                 parameters=conditions,
-                beside_paper=paper,
                 **shared,
             )
             for agent, tally in tallies.items()
@@ -240,35 +250,35 @@ class SummaryTable(list[SummaryRow]):
         return _HEAD | about | {metric.name: metric.about for metric in own if metric is not None}
 
     def sheet(self) -> Sheet:
-        """The table: agent, what it knows, and every measure that has a heading, those of registered ones last.
+        """The table: agent, what it knows, and every measure that has a heading, registered measures last.
 
-        A regret is marked as a lower bound where the best of some world is not known beforehand. Below it stand the
-        paper's rows, if they were asked for.
+        Where a set of measures holds in some of the worlds alone, its means are marked as lower bounds. Rows of other
+        sources stand below.
         """
         columns = [each.column() for each in measures() if each.heading]
         columns += [Column(heading_of(name), COLUMN + name) for name in (self[0].metrics if self else ())]
+        bounded = {m.name for _, each in every_set() if each.whole for m in each.measures if not m.against}
         lines: list[Row] = []
         for row in self:
-            cells: dict[str, Any] = {column.name: row[column.name] for column in columns}
-            value, interval = Column("").show(row["mean_regret_first"])
-            bound = row.known_best_share is not None and row.known_best_share < 1.0
-            cells["mean_regret_first"] = Shown(f"≥ {value}" if bound else value, interval)
-            lines.append((row.marked, SEES_THROUGH * row.sees_through + row.knows.text, *cells.values()))
-        for paper in PAPER_ROWS if self and self[0].beside_paper else ():
-            printed = {
-                "collision_rate": f"{100 * paper.collision_rate:.4g} %",
-                "first_impact_harm": f"{paper.average_harm:.6g}",
-            }
-            if paper.harm_decrease is not None:
-                printed["harm_decrease_first"] = f"{100 * paper.harm_decrease:.4g} %"
-            section = f"paper, {paper.table}"
-            lines += [] if section in lines else [section]
-            lines.append((paper.agent, None, *(printed.get(column.name) for column in columns)))
+            cells: list[Any] = []
+            for column in columns:
+                cell: Any = row[column.name]
+                if column.name in bounded:
+                    value, interval = column.show(cell)
+                    cell = Shown(f"≥ {value}" if column.name in row.bounds else value, interval)
+                cells.append(cell)
+            lines.append((row.marked, SEES_THROUGH * row.sees_through + row.knows.text, *cells))
+        for other in self.beside.rows if self and self.beside else ():
+            if isinstance(other, str):
+                lines.append(other)
+            else:
+                name, texts = other
+                lines.append((name, None, *(texts.get(column.name) for column in columns)))
         return Sheet("", ["Agent", "Knows", *columns], lines)
 
     def terminal(self) -> Sheet:
-        """The table for a terminal of 80 columns or more: ours, then the paper's rows, then the conditions of each."""
-        narrow = (*_ALWAYS_SHOWN, *_NARROW[bool(self.limit_line())])
+        """The table for a terminal of 80 columns or more: our rows, rows beside them, then the conditions of each."""
+        narrow = self._narrow()
         columns = [
             replace(each, wide=each.name not in narrow, interval="below" if each.name in _BELOW else "hidden")
             for each in (measure.column() for measure in measures() if measure.heading)
@@ -280,34 +290,22 @@ class SummaryTable(list[SummaryRow]):
             lines.append(row)
         return Sheet("", [Column("Agent,\nwhat it knows", text=True), *columns], lines, self._conditions(), gap=1)
 
+    def _narrow(self) -> tuple[str, ...]:
+        """Columns of a narrow terminal: the usual ones, and those of the last set that has values for them."""
+        last = EPISODE.narrow
+        for _, each in every_set():
+            if self and any(self[0].estimates.get(name) is not None for name in each.narrow):
+                last = each.narrow
+        return (*_ALWAYS_SHOWN, *last)
+
     def tables(self) -> list[Sheet]:
         """``terminal``, and below it the registered measures: a line per agent, the mean per world, its interval."""
         lines = [(row.agent, heading_of(column), value) for row in self for column, value in row.metrics.items()]
         own = Sheet("Measures", ["Agent", Column("Measure", text=True), Column("Mean or rate")], lines)
         return [self.terminal(), own] if lines else [self.terminal()]
 
-    def brief(self, beside: Mapping[str, SummaryTable]) -> Sheet:
-        """The table on one screen: collisions and both harms, also in the tests ``beside``, and what must be told.
-
-        The paper's rows, and the other measures, are not in it.
-        """
-        ours = SummaryTable(replace(row, beside_paper=False) for row in self)
-        sheet = ours.terminal()
-        kept = sheet.only(k for k, name in enumerate(sheet.names) if k == 0 or name in _BELOW)
-        columns, rows = list(kept.columns), [list(row) for row in kept.rows]
-        note = f"{ours[0].parameters.line}. Harm: mean per world in m²/s², below it the 95 % interval."
-        notes = [note, *(text for _, text in ours.notes())]
-        for test, table in beside.items():
-            drove = {row.agent: row for row in table}
-            columns.append(Column(f"{TESTS[test].partition(' test')[0]}:\nfirst, total"))
-            for row, each in zip(rows, (drove.get(row.agent) for row in self), strict=True):
-                row.append(each and f"{each.first_impact_harm.value:.2f}, {each.total_harm.value:.2f}")
-            must = [text for kind, text in table.notes() if kind == "note"]
-            notes.append(" ".join([TESTS[test], f"{count_of(table[0].episodes, 'world')}.", *must]))
-        return replace(kept, columns=columns, rows=rows, note="\n".join(notes))
-
     def markdown(self) -> str:
-        """The table for a document, with the conditions of ours and of the paper's below it."""
+        """The table for a document, with the conditions of our rows and of those beside them below it."""
         return f"{self.sheet().markdown()}\n\n{self._conditions()}\n"
 
     def _conditions(self) -> str:
@@ -320,11 +318,10 @@ class SummaryTable(list[SummaryRow]):
         return "\n\n".join([ours, *(text for _, text in self.notes())])
 
     def notes(self) -> list[tuple[str, str]]:
-        """What must be told beside the table: ``quiet`` or ``note`` (it must not be overlooked), and the sentences.
+        """What must be said beside the table: ``quiet`` or ``note`` (it must not be overlooked), and the sentences.
 
-        Which worlds no row counts, that a table of best known harm lacks some of these worlds, where the horizon cut a
-        motion off, who exploits what harm does not count, who met no impact at all, the limits, who knows what, and the
-        conditions of the paper's rows.
+        Which worlds no row counts, warnings of sets of measures, where the horizon cut a motion off, who exploits what
+        harm does not count, who met no impact at all, the notes of sets, who knows what, and notes on rows beside.
         """
         if not self:
             return []
@@ -335,56 +332,25 @@ class SummaryTable(list[SummaryRow]):
             f"At the horizon ({row.parameters['horizon_s']:g} s) something still moved; harm after it is not counted."
             f" Worlds, of {row.episodes:,}: {moving}."
         )
-        paper = [("quiet", f"Paper, {name}: {told}.") for name, told in PAPER_PARAMETERS.items()]
-        told = [
+        notes = [
             ("note", left_out if row.left_out else ""),
-            ("note", f"WARNING: {row.warning}." if row.warning else ""),
+            *(("note", warning) for warning in self._warnings()),
             ("note", cut_off if moving else ""),
             ("note", Exploits.sentence({each.agent: each.exploits for each in self})),
             ("note", self._nothing_seen_line()),
-            ("quiet", self.limit_line()),
+            *(("quiet", text) for _, each in self._sets() for text in each.notes(self)),
             ("note", self._knowledge_line()),
-            *([*paper, ("note", PAPER_NOTE)] if row.beside_paper else []),
+            *(self.beside.notes if self.beside else ()),
         ]
-        return [(kind, text) for kind, text in told if text]
+        return [(kind, text) for kind, text in notes if text]
 
-    def limit_line(self) -> str:
-        """What nobody could avoid here and the best known harm, as sentences; empty where nothing is proven."""
-        first, total = (
-            (self[0][f"best_known_{name}_harm"] for name in ("first_impact", "total")) if self else (None, None)
-        )
-        if first is None or total is None:
-            return ""
-        row = self[0]
-        driven = row.parameters.get("controlled_vehicle")
-        command = f"command of {str(driven).replace('vehicle_', 'Vehicle ')}" if driven else "joint command"
-        share = Column("", digits=1, scale=100.0, unit=" %")
-        contact, impact = (share.show(row[name]).in_words for name in ("unavoidable_rate", "impact_proven_rate"))
-        if row["unavoidable_rate"] is None:
-            text = f"In {impact} of these worlds no {command} avoids an impact (proven)."
-        else:
-            text = f"In {contact} of these worlds no {command} avoids contact, in {impact} none avoids an impact (both"
-            text += f" proven).{row.between.text if row.between else ''}"
-        proven = row["proven_harm"]
-        least = 0.0 if proven is None else proven.value
-        gaps = []
-        for best in (first.value, total.value):
-            part = f"{100 * (best - least) / best:.1f} %" if best > 0.0 else DASH
-            gaps.append(f"{best - least:.2f} ({part})")
-        text += (
-            f" Best known harm: {first.value:.2f} first-impact, {total.value:.2f} total; proven: no less than"
-            f" {least:.2f}; gap: {' and '.join(gaps)}."
-        )
-        known = row.known_best_share
-        if known is not None and known < 1.0:
-            text += (
-                f" Found beforehand in {100 * known:.1f} % of the worlds; in the others it is the best of"
-                " the agents above, so that regrets are lower bounds and no share of the possible reduction is stated."
-            )
-        below = [
-            f"{each.agent} in {count_of(each.below_best_known, 'world')}" for each in self if each.below_best_known
-        ]
-        return text + (f" Less harm than the best known before: {', '.join(below)}." if below else "")
+    def _sets(self) -> list[tuple[str, MeasureSet]]:
+        """The sets of measures that are in these rows."""
+        return [(name, each) for name, each in MEASURE_SETS.items() if self and name in self[0].more]
+
+    def _warnings(self) -> list[str]:
+        """What sets of measures warn of, as sentences."""
+        return [f"WARNING: {warning}." for _, each in self._sets() for warning in each.warnings(self)]
 
     def _nothing_seen_line(self) -> str:
         """What may be said of agents that met no impact in any world, as a sentence; empty without one."""
@@ -425,26 +391,22 @@ class SummaryTable(list[SummaryRow]):
         return text + (f" Not stated what it knows: {silent}." if silent else "")
 
 
-def summarise(evaluation: Evaluation, *, baseline: str = BASELINE, paper: bool = False) -> SummaryTable:
+def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTable:
     """One row per agent, in the order of the evaluation.
 
     Args:
         evaluation: of the agents.
         baseline: agent to compare with, where it was evaluated.
-        paper: print the rows of the paper's tables below; ``InvalidInput`` where they are about another test.
 
     """
-    limits, regrets = evaluation.limits, evaluation.regrets
+    contexts = contexts_of(evaluation)
     return SummaryTable.of_tallies(
-        evaluation.tally(baseline=baseline),
+        tally_agents(evaluation.outcomes, contexts, baseline=baseline),
         evaluation.conditions,
-        evaluation.task,
+        contexts,
         {name: outcome.knows for name, outcome in evaluation.outcomes.items()},
         {name: outcome.policies for name, outcome in evaluation.outcomes.items()},
         baseline=baseline,
-        paper=paper,
-        between=None if regrets is None else regrets.between,
-        warning=limits.warning if isinstance(limits, Limits) else "",
         left_out=evaluation.left_out,
         hidden_share=float(evaluation.hidden.mean()),
         worlds_sha256=worlds_sha256(evaluation.worlds, evaluation.index),

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ethbrake_marl.evaluation.agent_tally import AgentTally
+from ethbrake_marl.evaluation.agent_tally import AgentTally, tally_agents
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import HASHES, hash_of_chunks
+from ethbrake_marl.evaluation.measures import contexts_of, silent_because
 from ethbrake_marl.evaluation.outcome import LeftOut
 from ethbrake_marl.evaluation.rescores import Rescored, Rescores
 from ethbrake_marl.game.harm import HARM_COUNTS
@@ -28,10 +29,14 @@ class Tally:
     ranges: Mapping[str, tuple[Range, ...]] = field(default_factory=dict)  # least and largest of every quantity
     left_out: tuple[LeftOut, ...] = ()
     agents: Mapping[str, AgentTally] = field(default_factory=dict)
+    silent: Mapping[str, str | None] = field(default_factory=dict)  # why sets of measures say nothing, by key
 
     @classmethod
-    def of(cls, part: Evaluation, objectives: Sequence[str] | None = None, *, limits: bool = False) -> Tally:
-        """Those of a part of a list; ``objectives`` and ``limits`` as in ``Evaluation.tally``."""
+    def of(cls, part: Evaluation, objectives: Sequence[str] | None = None, *, long_list: bool = True) -> Tally:
+        """The statistics of a part of a list.
+
+        ``objectives`` as in ``tally_agents``; ``long_list`` as in ``contexts_of``.
+        """
         worlds = part.worlds
         if not worlds.n:
             return cls(left_out=part.left_out)
@@ -39,9 +44,16 @@ class Tally:
             name: tuple((float(np.nanmin(c)), float(np.nanmax(c))) for c in rule.of(worlds).T)
             for name, rule in QUANTITY.of(worlds).items()
         }
-        agents = part.tally(limits=limits, objectives=objectives)
-        hashed = hash_of_chunks(worlds, part.index)
-        return cls(worlds.n, int(part.hidden.sum()), hashed, ranges, part.left_out, agents)
+        contexts = contexts_of(part, long_list=long_list)
+        return cls(
+            worlds.n,
+            int(part.hidden.sum()),
+            hash_of_chunks(worlds, part.index),
+            ranges,
+            part.left_out,
+            tally_agents(part.outcomes, contexts, objectives=objectives),
+            silent_because(contexts),
+        )
 
     def __add__(self, other: Tally) -> Tally:
         ranges, agents = dict(self.ranges), dict(self.agents)
@@ -55,6 +67,7 @@ class Tally:
             ranges,
             tuple(sorted((*self.left_out, *other.left_out))),
             agents | {name: agents.get(name, AgentTally()) + each for name, each in other.agents.items()},
+            {**self.silent, **{key: why or self.silent.get(key) for key, why in other.silent.items()}},
         )
 
     def rescore(self, objectives: Sequence[str], vehicles: int) -> Rescores:

@@ -1,1 +1,1 @@
-"""What can be deleted: each folder registers itself by entry points, and no core module names one."""
+"""Extensions: folders that can be deleted. Each registers itself by entry points; no core module names one."""

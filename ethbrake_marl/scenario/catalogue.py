@@ -13,8 +13,8 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName, unkno
 from ethbrake_marl.files.yaml import NAME_PATTERN, Document, YamlPath, flow_text, read_yaml, schema_lines
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.mixtures import member_content
-from ethbrake_marl.scenario.sampling import ScenarioFields
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.tables import read_rows
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -206,7 +206,7 @@ def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> 
     if path.is_absolute() or ".." in path.parts:
         raise InvalidInput(f"{where}: table.file = {table['file']}: must be a path from the scenario's folder on")
     with document.refusing_at((*at, "table", "file")):
-        rows = ScenarioFields.read_rows(folder / path, table.get("columns"), table.get("weights"))
+        rows = read_rows(folder / path, table.get("columns"), table.get("weights"))
         kept = {key: value for key, value in table.items() if key != "file"}  # the rows are the scenario, not the file
         return {**content, "table": {**kept, **rows}}
 

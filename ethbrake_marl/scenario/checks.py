@@ -11,10 +11,10 @@ import numpy as np
 from pydantic_core import PydanticCustomError
 
 from ethbrake_marl.files.yaml import UNSHOWN, YamlPath, flow_text, refuse, require
+from ethbrake_marl.scenario.declared import ScenarioFields
 from ethbrake_marl.scenario.distributions import support
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.roles import LEARNER, ScriptSpec
-from ethbrake_marl.scenario.sampling import ScenarioFields
 
 MOST_SAMPLES = 1_000  # that a message may be older than the newest one
 

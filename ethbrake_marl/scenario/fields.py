@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -245,3 +246,19 @@ ALSO = (
 )  # what is drawn where it is declared, and needs nothing else
 
 MEANING = {key: rule.meaning for key, rule in QUANTITY.declared.items()}
+
+Entry = tuple[str, int]  # quantity and index (from 0) of the vehicle or pair
+
+
+def columns_of_table(rules: Mapping[str, QuantityRule], vehicles: int) -> dict[str, Entry]:
+    """The columns of a table with these quantities, and the entry of each."""
+    named = {key: rule for key, rule in rules.items() if rule.column}
+    return {rule.column_of(i): (key, i) for key, rule in named.items() for i in range(rule.count(vehicles))}
+
+
+def is_tabled(data: Mapping[str, Any], key: str) -> bool:
+    """Whether the table of fields of a scenario has every entry of a quantity."""
+    table, rule = data.get("table"), QUANTITY.declared[key]
+    if table is None or "vehicles" not in data or not rule.column:
+        return False
+    return all(rule.column_of(i) in table.columns for i in range(rule.count(data["vehicles"])))

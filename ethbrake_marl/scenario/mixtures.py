@@ -7,8 +7,8 @@ from typing import Any, TypeVar
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import Document, flow_text
+from ethbrake_marl.scenario.declared import ScenarioFields
 from ethbrake_marl.scenario.fields import QUANTITY
-from ethbrake_marl.scenario.sampling import ScenarioFields
 from ethbrake_marl.scenario.vehicle_types import Member
 
 WORDS = ("title", "description", "source")

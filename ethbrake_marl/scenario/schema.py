@@ -13,11 +13,13 @@ from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.files.yaml import Document, FileSchema, Wording, YamlPath, flow_text, suggestion
 from ethbrake_marl.scenario.checks import check_whole
+from ethbrake_marl.scenario.declared import ScenarioFields
 from ethbrake_marl.scenario.distributions import DISTRIBUTIONS
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.mixtures import WORDS, build_members, changed_content
 from ethbrake_marl.scenario.roles import LEARNER
-from ethbrake_marl.scenario.sampling import ScenarioFields
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.sampling import Channel, sample
 
 _DISTRIBUTION = (
     "{uniform: [low, high]}, {loguniform: [low, high]}, {normal: {mean, sd, low, high}},"
@@ -133,6 +135,10 @@ class Scenario(ScenarioFields):
             told["mixture"] = ", ".join(f"{e.weight:g} x {e.scenario['name']}" for e in self.mixture)
         rows = [(key, value if isinstance(value, str) else flow_text(value)) for key, value in told.items()]
         return Sheet(f"Scenario {self.name}: {self.title or 'no title'}", ("Key", "Value"), rows).html()
+
+    def sample(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
+        """Worlds ``first`` to ``first + n - 1`` of the endless list of ``seed``; ``sampling.sample`` says more."""
+        return sample(self, n, seed, first=first, channel=channel)
 
     def declared(self) -> dict[str, Any]:
         """What was given, as plain data: ``Scenario(**scenario.declared())`` is the same scenario."""

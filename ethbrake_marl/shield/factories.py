@@ -11,6 +11,7 @@ from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.enclosure import CORNERS, checked_robust
 from ethbrake_marl.extensions.certified.estimating_agents import Believing
+from ethbrake_marl.extensions.certified.uncertainty import UNCERTAINTY_EXAMPLE
 from ethbrake_marl.physics.state import Vehicles, Worlds
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shield.drivers import ShieldedDriver, shielded
@@ -96,4 +97,5 @@ ROBUST = Part(
     about="as +step where not everything is known: in the corners of an uncertainty, interior: in all of it;"
     " believed: against all that was not received",
     knows=Source.MODEL,
+    needs={"uncertainty": UNCERTAINTY_EXAMPLE},
 )

@@ -227,4 +227,5 @@ class Attached:
         ruling = self.engine.ruling
         if ruling is None:
             return np.zeros((self.engine.n, len(self.engine.learners)))
-        return self.options.intervention_penalty * (self.guard.intervened(ruling) & ruling.asked[:, np.newaxis])
+        intervened = self.guard.intervened(ruling) & ruling.asked[:, np.newaxis]
+        return np.asarray(self.options.intervention_penalty * intervened, np.float64)

@@ -16,7 +16,7 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import OnProgress, Progress, check_one_learner
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import EPISODES, LIST_SEED
-from ethbrake_marl.evaluation.named_worlds import make_agents
+from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.evaluation.per_world import results_to_json, write_per_world
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import SummaryRow, SummaryTable, summarise
@@ -146,7 +146,7 @@ def run_experiment(
     return ExperimentResult(
         trained,
         results,
-        tables or (rows.brief({}), *rows.tables()[1:]),
+        tables or (*rows.tables(),),
         notes or (f"results, with every measure: {run.path / 'results.json'}",),
     )
 

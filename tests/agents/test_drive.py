@@ -18,10 +18,10 @@ from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.identity import worlds_sha256
 from ethbrake_marl.evaluation.motion import follow_episodes
-from ethbrake_marl.evaluation.named_worlds import FIELD
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.extensions.datasets.recording import Task, record_episodes
+from ethbrake_marl.extensions.field.controllers import FIELD
 from ethbrake_marl.extensions.report.film import film_scenes
 from ethbrake_marl.extensions.search.around import Searched
 from ethbrake_marl.physics.state import Floats, Worlds

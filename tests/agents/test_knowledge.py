@@ -14,7 +14,7 @@ from ethbrake_marl.agents.protocol import Knowledge, Source
 from ethbrake_marl.agents.registry import agent_entries, find_entry, make_agent, parse_spec
 from ethbrake_marl.engine.memory import Memory, ask_script, begin_script
 from ethbrake_marl.engine.scripts import Script
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.certified.estimated import Ranges, Told
 from ethbrake_marl.extensions.certified.estimating_agents import Odometer
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty

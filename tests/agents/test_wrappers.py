@@ -133,9 +133,7 @@ def rescaled(env):
 CHANGING = {
     "RescaleAction": rescaled,
     "TransformAction": lambda env: wrappers.TransformAction(env, lambda action: -action, UNIT),
-    "DiscretizeAction": lambda env: wrappers.DiscretizeAction(env, 3),
     "StickyAction": lambda env: wrappers.StickyAction(env, 0.5),
-    "RepeatAction": lambda env: wrappers.RepeatAction(env, 2),
     "TransformObservation": lambda env: wrappers.TransformObservation(env, lambda seen: seen * 0.5, None),
     "RescaleObservation": lambda env: wrappers.RescaleObservation(env, np.float32(0), np.float32(1)),
     "NormalizeObservation": wrappers.NormalizeObservation,
@@ -151,6 +149,9 @@ CHANGING = {
     "OwnMonitor": OwnMonitor,
     "OwnRewardAndStep": OwnRewardAndStep,
 }
+if hasattr(wrappers, "RepeatAction"):  # from Gymnasium 1.2 on
+    CHANGING["DiscretizeAction"] = lambda env: wrappers.DiscretizeAction(env, 3)
+    CHANGING["RepeatAction"] = lambda env: wrappers.RepeatAction(env, 2)
 HARMLESS = {
     "OrderEnforcing": wrappers.OrderEnforcing,
     "PassiveEnvChecker": wrappers.PassiveEnvChecker,

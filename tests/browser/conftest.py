@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.report.page import Part
 from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap

@@ -9,7 +9,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.learned import TRAINED_POLICY
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.extensions.reproduction.folder import Reproduction
 from ethbrake_marl.scenario.catalogue import load_scenario

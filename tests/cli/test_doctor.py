@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from packaging.requirements import Requirement
 
-from ethbrake_marl.agents.e_v2x_bm import coupled, pairwise
+from ethbrake_marl.agents.e_v2x_bm import pairwise
 from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.doctor import Check, diagnose
 from ethbrake_marl.envs.making import make_engine
@@ -74,7 +74,7 @@ def test_checks__other_physics_another_optimum_and_a_damaged_folder_are_findings
         best = optimum(worlds, vehicle)
         return best._replace(deceleration_mps2=best.deceleration_mps2 + 1e-4)
 
-    monkeypatch.setattr(coupled, "optimise_pairwise", shifted)
+    monkeypatch.setattr(pairwise, "optimise_pairwise", shifted)
     assert not found("baseline")[0]
     monkeypatch.setattr(advance_module, "advance", doubled)
     ok, told = found("physics")

@@ -12,13 +12,14 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli import scenario as module
-from ethbrake_marl.evaluation.named_worlds import load_runnable
+from ethbrake_marl.evaluation.trial import load_runnable
 from ethbrake_marl.extensions.search import best_harm, planner
 from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.files.yaml import flow_text, parse_yaml
 from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.tables import read_worlds
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
 from tests.cli.conftest import Answer, Command, check_refused, rows_of, told_json
 
@@ -72,7 +73,7 @@ def test_validate__drives_scripts_and_tells_what_refuses_them(ethbrake: Command,
 
     calm = told_json(tried("own_calm", "--json"))
     assert calm["not_state_free"] == {"vehicle_3": "own_calm"} and not calm["commands_out_of_range"]
-    assert {"e_v2x_bm", "best_harm", "+step", "search_list"} < calm["refused_by"].keys()
+    assert {"e_v2x_bm", "best_harm", "+step"} < calm["refused_by"].keys()
     assert "command is not fixed at the alert" in calm["refused_by"]["+step"]
     assert told_json(tried("own_fixed", "--json"))["refused_by"].keys() == {"+robust:interior", "early_impacts: reject"}
     greedy = tried("own_greedy")
@@ -131,7 +132,7 @@ def test_sample__draws_the_worlds_that_evaluate_draws(ethbrake: Command, tmp_pat
     table.write_text(ethbrake("scenario", "sample", "paper-random", *drawn).out)
     (one,) = told_json(ethbrake("evaluate", "--agents", "full_brake", "--json", *drawn))
     paper = eb.load_scenario("paper-random")
-    (row,) = eb.summarise(eb.evaluate(paper.read_worlds(table), "full_brake", scenario=paper))
+    (row,) = eb.summarise(eb.evaluate(read_worlds(paper, table), "full_brake", scenario=paper))
     other = row.to_json()
     assert all(one[name] == other[name] for name in ("first_impact_harm", "worlds_sha256"))
 
@@ -224,7 +225,7 @@ def test_how_to_own_data__its_table_is_read_and_its_distributions_are_valid(tmp_
     paper = load_runnable("paper-random")
     table = re.search(r"```text\n(gap_1_m.*?)```", OWN_DATA, re.DOTALL)
     (tmp_path / "mine.csv").write_text(table[1])
-    vehicles = paper.read_worlds(tmp_path / "mine.csv").vehicles
+    vehicles = read_worlds(paper, tmp_path / "mine.csv").vehicles
     assert (vehicles.mass_t[:, 1].tolist(), vehicles.braking_capacity_mps2[:, 1].tolist()) == ([1.4, 12], [7.5, 5.5])
     blocks = (parse_yaml(text, "page").content for text in re.findall(r"```yaml\n(.*?)```", OWN_DATA, re.DOTALL))
     drawn, typed, rows = blocks

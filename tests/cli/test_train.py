@@ -21,7 +21,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.cli.command import Out
 from ethbrake_marl.errors import InvalidInput, Progress
 from ethbrake_marl.evaluation.identity import scenario_sha256, worlds_sha256
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.report import experiment
 from ethbrake_marl.extensions.report.experiment import telling_world, write_figures
 from ethbrake_marl.extensions.report.run_figures import learning_curve

@@ -20,14 +20,16 @@ from ethbrake_marl.agents.registry import Entry, make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.comparison import compare_results
-from ethbrake_marl.evaluation.named_worlds import NamedWorlds, check_agents, make_lineup
+from ethbrake_marl.evaluation.lineup import check_agents, make_lineup
 from ethbrake_marl.evaluation.per_world import read_result, write_per_world
 from ethbrake_marl.evaluation.statistics import mean, paired_difference, unpaired_difference
+from ethbrake_marl.extensions.studies.named_worlds import NamedWorlds
 from ethbrake_marl.files import python_file
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.policies.shipped import shipped_policies
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.tables import read_worlds
 from tests.cli.conftest import Command, check_refused, rows_of, told_json
 from tests.failing_worlds import plant
 
@@ -48,7 +50,7 @@ def test_evaluate__a_world_computed_by_hand(tmp_path: Path) -> None:
     # closing speed squared 10^2 - 2 * 7 * 3 = 58. Vehicle 3 stands 5 km behind. In the second world nobody moves.
     own, out = tmp_path / "mine.csv", tmp_path / "worlds.csv"
     own.write_text("gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps,restitution\n8,5000,0,10,0,0\n8,5000,0,0,0,0\n")
-    found = eb.evaluate(SCENARIO.read_worlds(own), "full_brake", scenario=SCENARIO)
+    found = eb.evaluate(read_worlds(SCENARIO, own), "full_brake", scenario=SCENARIO)
     (row,) = eb.summarise(found)
     told = row.episodes, row.collision_rate.value, row.first_impact_harm.value
     assert told == (2, 0.5, pytest.approx(29.0, rel=1e-12))

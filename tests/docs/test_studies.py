@@ -16,9 +16,9 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.lineup import make_lineup
+from ethbrake_marl.extensions.report.paper_rows import PAPER_NOTE, PAPER_ROWS
 from ethbrake_marl.extensions.report.style import picture_bytes
-from ethbrake_marl.extensions.report.tests import PAPER_NOTE, PAPER_ROWS
 from ethbrake_marl.extensions.reproduction import pages, strategies, tables as tables_module, verdicts
 from ethbrake_marl.extensions.reproduction.folder import Reproduction, Result, checked_result
 from ethbrake_marl.extensions.reproduction.items import ITEMS
@@ -28,6 +28,7 @@ from ethbrake_marl.extensions.reproduction.strategies import FULL_BRAKE, NAMES
 from ethbrake_marl.extensions.search.shipped import best_known
 from ethbrake_marl.game.objectives import OBJECTIVES, scored
 from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.tables import worlds_from_table
 from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.training.recipe import Scheme
 from tests.docs.site import DOCS, load
@@ -204,7 +205,7 @@ def test_paper__harms_at_three_delays_are_as_committed(spec: str, name: str) -> 
     state = {"gap_1_m": [7], "gap_2_m": [7], "speed_1_mps": [20], "speed_2_mps": [18], "speed_3_mps": [20]}
     for told, delay in zip(row[1:], ("low", "middle", "high"), strict=True):
         scenario = load_scenario(f"paper-delay-{delay}")
-        worlds = scenario.worlds_from_table(state)
+        worlds = worlds_from_table(scenario, state)
         outcome = eb.evaluate(worlds, make_lineup([spec], scenario), scenario=scenario).outcome(spec)
         assert told.value == f"{outcome.first_impact_harm.mean():.2f}"
 

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.engine.engine import Engine, Moment
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine.state import State
 from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.learners import branches
 from ethbrake_marl.extensions.learners.branches import Offsets, play_to_the_end
 from ethbrake_marl.game.harm import HARM_COUNTS
+from ethbrake_marl.scenario.tables import worlds_from_state
 from tests.physics.random_worlds import line
 
 PAPER = eb.load_scenario("paper-random").replace(early_impacts="keep")
@@ -49,7 +51,7 @@ class Refusing:
 # ---------------------------------------------------------------- what fails changes nothing
 
 # Vehicle 3 of these worlds cannot brake with 5 m/s2.
-WEAK = PAPER.worlds_from_state({"gaps_m": 3, "braking_capacity_mps2": 4, "speeds_mps": 20}).take([0, 0])
+WEAK = worlds_from_state(PAPER, {"gaps_m": 3, "braking_capacity_mps2": 4, "speeds_mps": 20}).take([0, 0])
 
 
 @pytest.mark.parametrize("who", ["script", "watcher", "constant:5"])
@@ -338,7 +340,7 @@ def test_branch__without_an_offset_is_what_the_engine_does(learners: list[str]) 
         moments.append(engine.moment())
         rewards.append(step_by_policy(engine).reward[:, engine.learners[last]])
     before = engine.moment()
-    gained, moved = play_to_the_end(engine.branch(Moment.join(moments[:5])), act, no_offsets(30, last), 1.0)
+    gained, moved = play_to_the_end(engine.branch(State.join(moments[:5])), act, no_offsets(30, last), 1.0)
     np.testing.assert_allclose(gained, np.concatenate([np.sum(rewards[k:], axis=0) for k in range(5)]), rtol=1e-12)
     assert (moved == 0.0).all() and gained.min() < 0.0
     assert all((a == b).all() for a, b in zip(before[:4], engine.moment()[:4], strict=True))  # untouched

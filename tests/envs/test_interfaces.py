@@ -293,7 +293,8 @@ def test_import__stays_light_until_a_name_is_used_and_lets_gymnasium_make_it_by_
         "import gymnasium; e = gymnasium.make('ethbrake_marl:EthBrake-v0'); print(type(e.unwrapped).__name__)\n"
         "e.reset(seed=0); e.step(e.action_space.sample())\n"
         "a = eb.EthBrakeEnv(render_mode='ansi'); a.reset(seed=0); a.render()\n"
-        "print(e.unwrapped.engine._watched, p.engine._watched, *{'PIL', 'pygame', 'matplotlib'} & set(sys.modules))"
+        "watched = e.unwrapped.engine._now.watched, p.engine._now.watched\n"
+        "print(*watched, *{'PIL', 'pygame', 'matplotlib'} & set(sys.modules))"
     )
     command = [sys.executable, "-W", "error", "-c", program]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -711,7 +712,7 @@ def test_shares_of_the_steps__add_up_to_those_of_the_episode() -> None:
 def test_branch__tells_nothing_of_a_row_that_cannot_be_advanced() -> None:
     engine = make_engine("paper-random", 3, seed=3)
     moment = engine.moment()
-    moment.state[1, -1 - 5] = np.nan
+    moment.motion[1, -1 - 5] = np.nan
     new = engine.branch(moment)
     new.roster.failed[1] = "a contact was missed"
     gained, _ = play_to_the_end(new, act, no_offsets(3), 1.0)

@@ -22,8 +22,8 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.motion import EpisodeMotion, follow_episodes, state_at
-from ethbrake_marl.evaluation.named_worlds import make_lineup
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.extensions.datasets import minari as minari_module, recording
 from ethbrake_marl.extensions.datasets.minari import env_spec, write_dataset
@@ -32,6 +32,7 @@ from ethbrake_marl.extensions.datasets.recording import Recording, Task, record_
 from ethbrake_marl.extensions.report.film import film_bytes, film_scenes
 from ethbrake_marl.game.rewards import reward_params
 from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.scenario.tables import worlds_from_state
 from ethbrake_marl.shield.drivers import ShieldedDriver
 from tests.contract.interfaces import CRASH, FIVE, PAPER
 
@@ -99,7 +100,7 @@ def test_record__samples_are_as_fine_as_asked_and_never_change_the_motion(
 
 def test_record__an_impact_at_the_very_alert_is_there(pair: eb.Scenario) -> None:
     at_once = pair.replace(latency_s=[0.0, 0.0])
-    world = at_once.worlds_from_state({"gaps_m": [0.0], "speeds_mps": [18.0, 20.0]})
+    world = worlds_from_state(at_once, {"gaps_m": [0.0], "speeds_mps": [18.0, 20.0]})
     record = record_episode(world, BRAKE, scenario=at_once)
     assert (record.impacts.time_s[0], record.impacts.closing_speed_mps[0], record.time_s[0]) == (0.0, 2.0, 0.0)
     assert (np.diff(record.time_s) > 0.0).all() and len(record.impacts.time_s) == record.ledger.count.sum()

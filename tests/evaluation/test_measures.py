@@ -19,17 +19,17 @@ import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.exploits import Exploits
-from ethbrake_marl.evaluation.named_worlds import make_lineup
-from ethbrake_marl.evaluation.outcome import IncompleteTable, Outcome
+from ethbrake_marl.evaluation.lineup import make_lineup
+from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.own_measures import load_measures
 from ethbrake_marl.evaluation.per_world import read_harms, write_per_world
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
+from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS, is_papers_test, summarise_beside_paper
 from ethbrake_marl.extensions.report.report import Report
-from ethbrake_marl.extensions.report.tests import PAPER_ROWS, is_papers_test
-from ethbrake_marl.extensions.search import limits, shipped
-from ethbrake_marl.extensions.search.limits import Unproven, known_limits, unproven_because
-from ethbrake_marl.extensions.search.regret import KNOWN_OF_WORLDS, Between
+from ethbrake_marl.extensions.search import limits
+from ethbrake_marl.extensions.search.limits import IncompleteTable, Unproven, known_limits, unproven_because
+from ethbrake_marl.extensions.search.regret import KNOWN_OF_WORLDS, Between, limits_of, regrets_of
 from ethbrake_marl.extensions.search.shipped import shipped_tables
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.files.sheet import Estimate
@@ -38,12 +38,13 @@ from ethbrake_marl.game.objectives import STANDARD, declared_objectives, parse_o
 from ethbrake_marl.physics.left_out import Impacts
 from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.tables import worlds_from_table
 from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.training.experiment import results_csv
 from tests.contract.interfaces import CRASH
 from tests.docs.site import load
 
-SILENT = pytest.mark.filterwarnings("ignore::ethbrake_marl.evaluation.outcome.IncompleteTable")
+SILENT = pytest.mark.filterwarnings("ignore::ethbrake_marl.extensions.search.limits.IncompleteTable")
 BRAKE = {"full_brake": eb.make_agent("full_brake")}
 
 # ---------------------------------------------------------------- the summary
@@ -137,7 +138,7 @@ def test_parameters__say_under_which_conditions(evaluation: Evaluation) -> None:
 
 def test_table__has_every_figure_and_the_papers_rows_in_80_columns_and_in_markdown(evaluation: Evaluation) -> None:
     """What it looks like in 120 columns stands in tests/cli/printed."""
-    rows = summarise(evaluation, paper=True)
+    rows = summarise_beside_paper(evaluation)
     narrow, markdown = printed(rows), rows.markdown()
     for row in rows:
         low, high = row.total_harm.interval
@@ -246,7 +247,7 @@ def beside_paper(scenario: Scenario, *, vehicle: int = 1, seed: int | None = 7) 
     found = evaluate(driven.sample(2, 7), BRAKE, scenario=driven, seed=seed, aftermath=False)
     fits = is_papers_test(found.task, seed)
     with nullcontext() if fits else pytest.raises(InvalidInput, match="leave paper out"):
-        assert "paper, " in summarise(found, paper=True).markdown()
+        assert "paper, " in summarise_beside_paper(found).markdown()
     return fits
 
 
@@ -391,7 +392,7 @@ def test_per_world__every_number_reads_back_as_the_same_bits(tmp_path: Path, eva
     assert set(columns["ended"]) == {"at_rest"}
     assert set(rows[0]) == {"agent", "knows", "world", "hidden", "ended", *expected, *KNOWN_OF_WORLDS}
     names = ("gap_1_m", "gap_2_m", "speed_1_mps", "speed_2_mps", "speed_3_mps")
-    again = evaluation.scenario.worlds_from_table({name: columns[name].astype(float) for name in names})
+    again = worlds_from_table(evaluation.scenario, {name: columns[name].astype(float) for name in names})
     assert (
         again.gaps_m.tobytes() == worlds.gaps_m.tobytes() and again.speeds_mps.tobytes() == worlds.speeds_mps.tobytes()
     )
@@ -399,7 +400,7 @@ def test_per_world__every_number_reads_back_as_the_same_bits(tmp_path: Path, eva
 
 def test_per_world__a_quantity_that_differs_between_worlds_has_its_columns(tmp_path: Path, pair: Scenario) -> None:
     columns = {"gap_1_m": [1.0, 1.0], "speed_1_mps": [20.0, 20.0], "speed_2_mps": [20.0, 20.0]}
-    worlds = pair.worlds_from_table({**columns, "latency_2_s": [0.5, 0.25], "mass_1_t": [4.5, 4.5]})
+    worlds = worlds_from_table(pair, {**columns, "latency_2_s": [0.5, 0.25], "mass_1_t": [4.5, 4.5]})
     rows = per_world(evaluate(worlds, BRAKE, scenario=pair), tmp_path)
     told = [(row["latency_2_s"], row["latency_1_s"], row["predicted_harm"], row["chosen_policy"]) for row in rows]
     assert told == [("0.5", "0.0", "", ""), ("0.25", "0.0", "", "")] and "mass_1_t" not in rows[0]
@@ -498,7 +499,7 @@ def columns_of(result: Evaluation, folder: Path) -> dict[str, list[str]]:
 
 @SILENT
 def test_best_known__is_the_witness_the_table_or_an_agent(four: Evaluation, tmp_path: Path) -> None:
-    found, agent, full = four.regrets, four.outcome("a"), four.outcome("full_brake")
+    found, agent, full = regrets_of(four), four.outcome("a"), four.outcome("full_brake")
     assert found.limits.known.tolist() == [True, True, True, False]
     assert found.regret(full, "total").tolist() == [12.0, 9.0, 7.0, 5.0]
     assert found.below(agent).tolist() == [False, False, True, False]
@@ -520,7 +521,7 @@ def test_best_known__is_the_witness_the_table_or_an_agent(four: Evaluation, tmp_
 @SILENT
 def test_best_known__rounding_below_the_table_is_not_below_it(four: Evaluation) -> None:
     close = first_worlds(four, 4, a=([1.0, 2.0 - 9e-7, 4.0 - 2e-6, 6.0], [1.0, 4.0, 6.0, 7.0]))
-    found = close.regrets
+    found = regrets_of(close)
     assert found.below(close.outcome("a")).tolist() == [False, False, True, False]
     assert found.source.tolist() == ["witness", "table", "below_table", "agents"]
     assert (found.regret(close.outcome("a"), "first") >= 0.0).all()
@@ -541,7 +542,7 @@ def test_distance__by_hand(four: Evaluation) -> None:
         "best_known_minus_proven_total": (0.0 + 1.5 + 5.0) / 3.0,
     }
     assert {name: found[name].value for name in expected} == pytest.approx(expected, rel=1e-12)
-    assert (found.known_best_share, found.below_best_known) == (1.0, 1)
+    assert (found.more["limits"]["known_best_share"], found.more["limits"]["below_best_known"]) == (1.0, 1)
     (alone,) = summarise(first_worlds(four, 3, a=AGENT))  # without full braking nothing is realised
     assert alone["share_of_possible_reduction_first"] is alone["share_of_possible_reduction_total"] is None
     assert alone["mean_regret_first"].value == 1.0
@@ -575,8 +576,8 @@ def test_limits__of_a_list_longer_than_its_table_are_told_in_a_warning_and_of_no
     found = evaluate(worlds, BRAKE, scenario=paper_random, aftermath=False)
     with pytest.warns(IncompleteTable) if partly else nullcontext():
         (row,) = summarise(found)
-    assert (row.known_best_share == 1.0) == (share == 1.0)
-    assert (row.to_json()["best_known_warning"] is not None) == (row.warning != "") == partly
+    assert (row.more["limits"]["known_best_share"] == 1.0) == (share == 1.0)
+    assert (row.to_json()["best_known_warning"] is not None) == partly
     for text in (SummaryTable([row]).markdown(), SummaryTable([row])._repr_html_()):
         assert ("WARNING" in text) == partly
 
@@ -626,7 +627,7 @@ def test_limits__of_another_line_up_are_null_with_the_reason(pair: Scenario, tmp
     assert row["parameters"]["no_limits_because"] == "2 vehicles; avoidability is proven for 3"
     columns = columns_of(result, tmp_path)
     assert columns["avoidable"] == columns["regret_total_harm"] == columns["best_known_source"] == ["", ""]
-    assert result.regrets is None and "proven" not in summarise(result).markdown()
+    assert regrets_of(result) is None and "proven" not in summarise(result).markdown()
 
 
 @pytest.mark.parametrize(("name", "unavoidable"), [("paper-random", 309), ("paper-random-early", 272)])
@@ -634,7 +635,7 @@ def test_limits__of_the_first_500_worlds_of_the_papers_random_test(name: str, un
     scenario = load_scenario(name)
     agents = {spec: eb.make_agent(spec) for spec in ("full_brake", "e_v2x_bm")}
     result = evaluate(scenario.sample(500, 7), agents, scenario=scenario, seed=7, aftermath=False)
-    proof, rows = result.regrets.limits.proof, summarise(result)
+    proof, rows = limits_of(result).proof, summarise(result)
     assert [row["unavoidable_rate"].value for row in rows] == [unavoidable / 500] * 2
     for driven in result.outcomes.values():
         assert driven.collided[proof.impact].all()  # nobody avoids what is proven
@@ -762,7 +763,7 @@ def test_rows_of_the_paper__agree_with_themselves() -> None:
 
 
 def test_proven_of_table__leaves_out_what_cannot_be_advanced() -> None:
-    scenario, table = load_scenario("paper-delay-low"), shipped("paper-delay-low")
+    scenario, table = load_scenario("paper-delay-low"), shipped_table("paper-delay-low")
     worlds, task = scenario.sample(6, 7).worlds, Task(scenario, (1,))
     whole = STUDY.proven_of_table(worlds.take([0, 1, 3, 4, 5]), task, table)
     worlds.gaps_m[2], worlds.speeds_mps[2] = [0.2, -1.0], [10.0, 20.0, 16.0]

@@ -13,7 +13,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import AlreadyExists, UnknownName
 from ethbrake_marl.evaluation.comparison import compare_results
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.per_world import read_harms, read_result
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.seeds import interquartile_mean, mean_over_seeds, share_over_seeds

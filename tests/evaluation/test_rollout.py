@@ -20,21 +20,24 @@ from ethbrake_marl import registry
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput, PhysicsError, Unfamiliar
 from ethbrake_marl.evaluation import chunks, identity
+from ethbrake_marl.evaluation.aftermath import ShovedFront
 from ethbrake_marl.evaluation.chunks import Lineup, evaluate_held, summarise_tally, tally_list
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.exploits import FAR_M
 from ethbrake_marl.evaluation.identity import policy_sha256, scenario_sha256, worlds_sha256
+from ethbrake_marl.evaluation.lineup import make_agents, make_lineup
 from ethbrake_marl.evaluation.measures import measures
-from ethbrake_marl.evaluation.named_worlds import make_agents, make_lineup
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.own_measures import MEASURES, REGISTERED
 from ethbrake_marl.evaluation.per_world import write_per_world
 from ethbrake_marl.evaluation.record import record_episode
-from ethbrake_marl.evaluation.rollout import ShovedFront, chunks_of, drive_chunk, evaluate
+from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk, evaluate
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.evaluation.tally import Tally
 from ethbrake_marl.extensions.report.report import Report
-from ethbrake_marl.extensions.search.limits import Limits
+from ethbrake_marl.extensions.search.limit_measures import LIMITS
+from ethbrake_marl.extensions.search.limits import Unproven
+from ethbrake_marl.extensions.search.regret import limits_of
 from ethbrake_marl.files import python_file
 from ethbrake_marl.physics.paper_map import advance_sampled
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
@@ -458,8 +461,8 @@ def test_figures__of_a_list_that_is_not_held_are_those_of_evaluate(lineup, paper
     monkeypatch.setattr(identity, "HELD", LISTED - 1)
     evaluation = evaluate(paper_random.sample(LISTED, 11), lineup.make(), scenario=paper_random, seed=11, chunk=777)
     for one, other in zip(summarise_tally(lineup, tally, 11), summarise(evaluation), strict=True):
-        for measure in measures(()):
-            assert one[measure.name] == (None if measure.limits else other[measure.name]), measure.name
+        for measure in measures():
+            assert one[measure.name] == (None if measure in LIMITS.measures else other[measure.name]), measure.name
         told, expected = ({**each.to_json(), "parameters": None} for each in (one, other))
         proven = {name for name in told if told[name] is None}
         assert [expected[name] for name in told if name not in proven] == [
@@ -571,8 +574,8 @@ def test_tally__is_the_one_that_was_recorded(worlds: int, scenario: str, harm_co
     lineup, parts = Lineup.of(RECORDED_AGENTS, load_scenario(scenario), harm_count=harm_count), []
     for first, part in chunks_of(lineup.scenario.sample(worlds, 11), 1_000):
         driven = drive_chunk(part, lineup.make(), lineup.scenario, 11, lineup.scenario.learners, first)
-        limits = isinstance(driven.limits, Limits) and bool(driven.limits.known.all())
-        parts.append(Tally.of(driven, (), limits=limits))
+        limits = limits_of(driven)
+        parts.append(Tally.of(driven, (), long_list=isinstance(limits, Unproven) or not limits.known.all()))
     assert digest_of(sum(parts[1:], parts[0])) == digest
 
 

@@ -24,8 +24,10 @@ from ethbrake_marl.extensions.report.scenario_figures import worlds_figure
 from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
 from ethbrake_marl.extensions.report.style import ShownFigure, label_text, new_figure, picture_bytes, series_style
 from ethbrake_marl.extensions.search.limits import Limits, Proof
+from ethbrake_marl.extensions.search.regret import regrets_of
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.tables import worlds_from_table
 from ethbrake_marl.scenario.task import Task
 from tests.physics.random_worlds import line
 
@@ -49,7 +51,7 @@ def legend(figure: Figure) -> list[str]:
 def world(gap_1: float, gap_2: float) -> eb.Worlds:
     """A world of paper-distance."""
     columns = {"gap_1_m": [gap_1], "gap_2_m": [gap_2], "speed_1_mps": [20.0], "speed_2_mps": [18.0]}
-    return DISTANCE.worlds_from_table({**columns, "speed_3_mps": [20.0]})
+    return worlds_from_table(DISTANCE, {**columns, "speed_3_mps": [20.0]})
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +154,7 @@ def test_harm_in_parts__add_up_to_the_means(evaluation: Evaluation, figures: dic
 
 def test_regret_distribution__shares_are_those_of_the_worlds(evaluation: Evaluation, pair: Scenario) -> None:
     drawn = regret_distribution(evaluation).axes[0].lines[0]
-    values = evaluation.regrets.regret(evaluation.outcome("full_brake"), "first")
+    values = regrets_of(evaluation).regret(evaluation.outcome("full_brake"), "first")
     assert drawn.get_ydata() == pytest.approx([np.mean(values > x) for x in drawn.get_xdata()])
     assert regret_distribution(evaluate(pair.sample(3, 0), BRAKE, scenario=pair)).axes  # without limits
 

@@ -44,6 +44,7 @@ from ethbrake_marl.extensions.search.templates import best_templates
 from ethbrake_marl.game.objectives import scored
 from ethbrake_marl.policies.actor import Actor
 from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.scenario.sampling import members_of
 from ethbrake_marl.training.finite import TrainingDiverged
 from ethbrake_marl.training.models import make_environment, make_model
 from ethbrake_marl.training.networks import ppo_arguments, tensors_of
@@ -386,15 +387,15 @@ def test_own_worlds__are_those_within_the_margin() -> None:
     gained, _ = drive_from(engine, found.start, _coast, 1.0)
     own = own_worlds(engine, model.plan, found, _coast, 1.0)
     kept = (gained > found.gained - 5.0) & (found.harm > 0.0) & (np.abs(gained - found.gained) > 1e-2)
-    assert 0 < len(own.state) < 64 and np.array_equal(own.state, found.start.state[kept])
+    assert 0 < len(own.motion) < 64 and np.array_equal(own.motion, found.start.motion[kept])
 
 
 def test_visit__every_decision_of_every_episode() -> None:
     engine = new_model(TINY_MODES).engine
     _, start = engine.first_moments(20)
     seen, moments = visit(engine.branch(start), _full_brake)
-    assert seen.shape == (len(moments.state), 1, 27)
-    assert np.array_equal(moments.take(np.arange(20)).state, start.state)
+    assert seen.shape == (len(moments.motion), 1, 27)
+    assert np.array_equal(moments.take(np.arange(20)).motion, start.motion)
     first = engine.branch(moments.take(np.arange(20))).observe_all(np.array([1]))
     assert np.array_equal(first, seen[:20])
 
@@ -575,7 +576,7 @@ def test_options__among_policies_drive_as_alone_and_costs_are_beside_those_usual
     both = model._try_actions(model._last_obs[np.newaxis], start)[2]
     usual = model.policy.usual.numpy()
     assert (usual > 0.0).all() and usual[0] < usual[1]
-    member = line.members_of(8, model.engine.seed, channel="training")
+    member = members_of(line, 8, model.engine.seed, channel="training")
     least = both[order].min(axis=1)
     for m in range(2):  # the first time what is usual is the mean of these
         assert least[member[rows] == m].mean() == pytest.approx(1.0)

@@ -10,7 +10,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import script_agents
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, UnknownName
-from ethbrake_marl.evaluation.named_worlds import load_runnable
+from ethbrake_marl.evaluation.trial import load_runnable
 from ethbrake_marl.extensions.learners.start_weights import widened
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.files.store import hold_lock

@@ -24,10 +24,9 @@ from stable_baselines3.common.logger import Logger
 import ethbrake_marl as eb
 from ethbrake_marl.cli.train import run_folder
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, Progress
-from ethbrake_marl.evaluation import evaluation as evaluation_module
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import summarise
-from ethbrake_marl.extensions.search import limits
+from ethbrake_marl.extensions.search import limits, regret
 from ethbrake_marl.files.store import new_folder, write_file
 from ethbrake_marl.game.objectives import objective_harm, objectives_of
 from ethbrake_marl.policies.bundle import load_policy
@@ -164,7 +163,7 @@ def test_train__measures_what_an_evaluation_of_the_kept_policy_tells_and_proves_
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     prove = Mock(side_effect=limits.known_limits)
-    monkeypatch.setattr(evaluation_module, "known_limits", prove)
+    monkeypatch.setattr(regret, "known_limits", prove)
     result = train_module.train(TINY, SCENARIO, tmp_path / "run", steps=UPDATE, on_progress=None)
     prove.assert_not_called()
     worlds = result.training.scenario.sample(TINY.evaluation.worlds, TINY.evaluation.seed)

@@ -1,7 +1,7 @@
 """Settings KEY=VALUE of recipes and scenarios, and the YAML that they are written in."""
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.named_worlds import load_runnable
+from ethbrake_marl.evaluation.trial import load_runnable
 from ethbrake_marl.files.yaml import Override, flow_text, parse_yaml
 from ethbrake_marl.training.settings import read_settings
 

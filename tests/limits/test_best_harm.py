@@ -18,8 +18,8 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.cli.evaluate import GROUP_EPISODES
 from ethbrake_marl.engine.profiles import Profiles, profile_problem
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
-from ethbrake_marl.evaluation import chunks, evaluation
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation import chunks
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.per_world import write_per_world
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import summarise
@@ -29,13 +29,15 @@ from ethbrake_marl.extensions.proofs.ramped_meetings import onset_states
 from ethbrake_marl.extensions.proofs.team_bound import team_bound
 from ethbrake_marl.extensions.report.harm_figures import harm_in_parts
 from ethbrake_marl.extensions.report.report import avoidable_section, worst_section
-from ethbrake_marl.extensions.report.tests import TESTS
-from ethbrake_marl.extensions.search import shipped
+from ethbrake_marl.extensions.report.three_tests import TESTS
+from ethbrake_marl.extensions.search import limits, regret
 from ethbrake_marl.extensions.search.best_harm import best_harm, fold_episodes, search_list, task_problem
 from ethbrake_marl.extensions.search.extreme_profiles import KEPT, extreme_profiles
+from ethbrake_marl.extensions.search.limit_measures import LIMITS
 from ethbrake_marl.extensions.search.limits import Unproven, known_limits, prove
 from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.extensions.search.recall import BestHarm
+from ethbrake_marl.extensions.search.regret import limits_of, regrets_of
 from ethbrake_marl.extensions.search.shipped import TABLES, best_known, shipped_profiles, shipped_tables
 from ethbrake_marl.extensions.search.tables import LEFT_OUT, BestHarmTable
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
@@ -402,8 +404,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, Mock]:
     """What computes each part of the limits, and evaluates, and counts how often it did."""
     found: dict[str, Mock] = {}
     for place, name in (
-        (shipped, "avoidability"), (bounding, "avoidability"), (shipped, "lower_bound"), (shipped, "best_known"),
-        (evaluation, "known_limits"), (chunks, "drive_chunk"),
+        (limits, "avoidability"), (bounding, "avoidability"), (limits, "lower_bound"), (limits, "best_known"),
+        (regret, "known_limits"), (chunks, "drive_chunk"),
     ):  # fmt: skip
         monkeypatch.setattr(place, name, found.setdefault(name, Mock(wraps=getattr(place, name))))
     return found
@@ -421,9 +423,9 @@ def test_evaluate__whose_limits_nobody_asks_for_finds_none(
     found = evaluate(pair.sample(2, 0), {"coast": make_agent("coast")}, scenario=pair)
     calls["known_limits"].assert_not_called()
     write_per_world(tmp_path / "out.csv", found)
-    assert (len(summarise(found)), found.regrets) == (1, None) and found.conditions["no_limits_because"]
+    assert (len(summarise(found)), regrets_of(found)) == (1, None) and found.conditions["no_limits_because"]
     calls["known_limits"].assert_called_once()
-    assert found.limits is found.limits
+    assert limits_of(found) is limits_of(found)
 
 
 def test_known_limits__are_the_proof_and_the_best_known() -> None:
@@ -469,10 +471,14 @@ def test_evaluation__of_a_team_tells_the_proven_harm_where_contact_is_not_decide
     agents = {name: make_agent(name) for name in ("full_brake", "coast")}
     found = evaluate(scenario.sample(20, 7), agents, scenario=scenario)
     rows = summarise(found)
-    told, text = rows[0], rows.limit_line()
-    assert (told["unavoidable_rate"], told.between, told["avoidable_collision_rate"]) == (None, None, None)
+    told, text = rows[0], " ".join(LIMITS.notes(rows))
+    assert (told["unavoidable_rate"], told.more["limits"]["impact_unproven"], told["avoidable_collision_rate"]) == (
+        None,
+        None,
+        None,
+    )
     assert 0 < told["proven_harm"].value < told["best_known_first_impact_harm"].value
-    assert told["impact_proven_rate"] is not None and told.known_best_share == 0.0
+    assert told["impact_proven_rate"] is not None and told.more["limits"]["known_best_share"] == 0.0
     assert "no joint command avoids an impact (proven)" in text and "avoids contact" not in text
     write_per_world(tmp_path / "out.csv", found)
     with (tmp_path / "out.csv").open(newline="") as lines:

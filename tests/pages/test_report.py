@@ -12,13 +12,15 @@ from matplotlib.figure import Figure
 import ethbrake_marl as eb
 from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import AlreadyExists, plain_text
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.report import page as page_module
 from ethbrake_marl.extensions.report.page import Part, Section, read_file
+from ethbrake_marl.extensions.report.paper_rows import summarise_beside_paper
 from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.extensions.report.shown_worlds import choose_shown, worst_rows
 from ethbrake_marl.extensions.report.style import add_caption, new_figure
 from ethbrake_marl.extensions.report.svg import inline_svg
+from ethbrake_marl.extensions.search.regret import regrets_of
 from ethbrake_marl.files.sheet import Column, Sheet, Shown
 from ethbrake_marl.game.harm import HarmCount
 from tests.fixtures.pictures import draw_nothing
@@ -135,7 +137,7 @@ def report(evaluation: eb.Evaluation) -> Report:
     part = replace(evaluation, outcomes={name: evaluation.outcome(name) for name in agents})
     return Report(
         title="PPO on paper-random",
-        rows=eb.summarise(part, paper=True),
+        rows=summarise_beside_paper(part),
         evaluation=part,
         figures=[Part.drawing(new_figure(4.0, 3.0), "Learning curve", "Harm over steps.")],
         tests=[("paper-other", "Another test.", eb.summarise(evaluation))],
@@ -196,7 +198,7 @@ def test_report__begins_with_what_the_agent_does_against_full_braking_and_where_
     """By the first impacts it is worse in no world, by all of them in some."""
     mine = replace(summed_up(paper_random, "full_brake", "ppo@shipped"), harm_count=harm_count)
     after, before = (mine.evaluation.outcome(name).world_harm(harm_count) for name in ("ppo@shipped", "full_brake"))
-    best, worse = mine.evaluation.regrets.best(harm_count).mean(), after > before + 1e-6
+    best, worse = regrets_of(mine.evaluation).best(harm_count).mean(), after > before + 1e-6
     words = "first impacts" if harm_count == "first" else "all impacts"
     more = f"but more in {100 * worse.mean():.1f} % of these worlds, by {(after - before).max():.2f} at most"
     assert worse.any() == (harm_count == "total")

@@ -16,6 +16,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
+from ethbrake_marl.extensions.search.regret import limits_of
 from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.motion import stopping_distances
@@ -23,6 +24,7 @@ from ethbrake_marl.physics.state import Floats, Ints, Worlds, make_worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.tables import worlds_from_table
 from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield.drivers import ShieldedDriver
 from tests.physics.random_worlds import Draws, line
@@ -272,7 +274,7 @@ def test_search_and_shield__execute_what_they_foresee(slow: Scenario) -> None:
     assert harm["best_harm"].mean() < harm["e_v2x_bm"].mean() < harm["full_brake"].mean()
     assert (harm["constant:2+step"] <= harm["e_v2x_bm"] + 1e-9).all()  # its bound
     assert (harm["constant:2+step"] != harm["e_v2x_bm"]).any()
-    proof = result.limits.proof  # of harm, not of contact
+    proof = limits_of(result).proof  # of harm, not of contact
     assert proof.avoidable is None and (proof.harm <= harm["best_harm"] + 1e-9).all() and proof.harm.mean() > 5.0
 
 
@@ -323,7 +325,7 @@ def test_shield__of_several_learners_with_one_finite_rate_certifies_every_step(k
 def test_table__of_a_scenario_with_one_of_both_rates_is_read_again(key: str) -> None:
     one = load_scenario("paper-random").replace(**{key: 12})
     drawn = one.sample(3, seed=1).worlds
-    read = one.worlds_from_table(QUANTITY.columns(drawn))
+    read = worlds_from_table(one, QUANTITY.columns(drawn))
     assert np.array_equal(getattr(read.vehicles, key), getattr(drawn.vehicles, key))
 
 

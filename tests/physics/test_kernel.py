@@ -121,6 +121,7 @@ def test_profiles__step_by_step_realise_what_the_engine_does_to_the_bit(name, le
 
 def test_decisions__are_on_the_grid_in_spite_of_rounding_and_the_last_one_ends_at_the_horizon() -> None:
     numbers = [Decisions(np.array([0.5]), 0.1).before(horizon).tolist() for horizon in (8.0, 8.05, 0.55, 0.6)]
+    assert Decisions(0.2, 0.3).before(1.1) == 3.0  # 0.9 / 0.3 is a little more than 3
     assert numbers == [[75.0], [76.0], [1.0], [1.0]]
     steps = np.arange(2000)
     assert np.array_equal(Decisions(np.full(2000, 0.5), 0.1).latest(0.5 + steps * 0.1), steps)

@@ -7,10 +7,11 @@ import numpy as np
 import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine.profiles import profile_problem
-from ethbrake_marl.evaluation import named_worlds
+from ethbrake_marl.evaluation import trial
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.state import make_worlds
 from ethbrake_marl.physics.trace import segment_pieces
+from ethbrake_marl.scenario.tables import read_worlds
 from ethbrake_marl.training.settings import read_settings
 from tests.shield.attacks import line
 
@@ -97,7 +98,7 @@ def test_role__of_one_piece_is_that_constant_command() -> None:
     assert SOFT.roles["vehicle_1"] == "profile:0=3,1=5"
     assert SOFT.replace() == front("profile:0=3,1=5") == SOFT
     assert (
-        named_worlds.load_runnable("paper-random", read_settings(["roles.vehicle_1=profile:0=3,1=5"]).scenario).roles
+        trial.load_runnable("paper-random", read_settings(["roles.vehicle_1=profile:0=3,1=5"]).scenario).roles
         == SOFT.roles
     )
 
@@ -137,4 +138,4 @@ def test_roles__drive_worlds_of_another_list(empty_folder: Path) -> None:
     assert (harm(SOFT, "e_v2x_bm", PAPER.sample(30, 7)).first_impact_harm == bound).all()
     worlds = SOFT.sample(3, 7).worlds
     Path("rows.csv").write_text("gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps\n7,7,20,18,20\n")
-    assert SOFT.read_worlds("rows.csv").vehicles.pieces.tolist() == worlds.vehicles.pieces[:1].tolist()
+    assert read_worlds(SOFT, "rows.csv").vehicles.pieces.tolist() == worlds.vehicles.pieces[:1].tolist()

@@ -21,9 +21,9 @@ from torch import nn
 import ethbrake_marl as eb
 from ethbrake_marl.errors import CorruptBundle
 from ethbrake_marl.evaluation.identity import scenario_sha256
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.extensions.report.tests import TESTS
+from ethbrake_marl.extensions.report.three_tests import TESTS
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.game.observations import observe
 from ethbrake_marl.policies import shipped as shipped_module

@@ -11,7 +11,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, UnknownName
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.policies.actor import Actor
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.policy import Policy

@@ -32,6 +32,7 @@ from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.extensions.search.best_harm import search_list
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.tables import read_worlds
 
 CPU_LIMIT_S = 10  # of a case
 WALL_LIMIT_S = 90.0  # on a machine that does other things too
@@ -141,7 +142,7 @@ def read_states(file: Path) -> None:
     """A command of ours: drive in a table of initial states."""
     with Out():
         paper = load_scenario("paper-random")
-        evaluate(paper.read_worlds(file), "coast", scenario=paper)
+        evaluate(read_worlds(paper, file), "coast", scenario=paper)
 
 
 def read_table(file: Path) -> None:

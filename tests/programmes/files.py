@@ -24,7 +24,8 @@ from typing import Any, NamedTuple
 import yaml
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.named_worlds import NamedWorld, NamedWorlds, states_of
+from ethbrake_marl.evaluation.varying import states_of
+from ethbrake_marl.extensions.studies.named_worlds import NamedWorld, NamedWorlds
 from ethbrake_marl.extensions.studies.sweep import SweepPlan
 from ethbrake_marl.extensions.studies.tuning import TuningPlan
 from ethbrake_marl.policies.bundle import load_policy

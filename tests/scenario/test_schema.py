@@ -20,7 +20,7 @@ from pydantic import ValidationError
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.identity import scenario_sha256
-from ethbrake_marl.evaluation.named_worlds import load_runnable
+from ethbrake_marl.evaluation.trial import load_runnable
 from ethbrake_marl.files.yaml import flow_text, parse_yaml, read_yaml
 from ethbrake_marl.game.harm import HARM_COUNTS, empty_ledger
 from ethbrake_marl.scenario import catalogue

@@ -111,7 +111,7 @@ def test_ledger__harm_that_nobody_predicted_is_seen_before_the_next_decision(gro
     *_, info = env.step(DRIVE)
     assert info["shield_trusted"]
     engine = env.attached.engine
-    engine._state[0, engine.packed.column.harm + 2 * group] += 1e-12
+    engine.packed.state[0, engine.packed.column.harm + 2 * group] += 1e-12
     *_, info = env.step(DRIVE)
     assert not info["shield_trusted"] and info["shield_reason"] == eb.ShieldReason.ASSUMPTION_BROKEN
 

@@ -10,6 +10,7 @@ from ethbrake_marl.extensions.studies.falsification import APART, Scored, far_ap
 from ethbrake_marl.extensions.studies.weakness import Measure, MeasureName
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.physics.state import Bools, Floats, Worlds
+from ethbrake_marl.scenario.ranges import ranges
 
 SCENARIO = eb.load_scenario("paper-random")
 
@@ -43,9 +44,9 @@ def test_falsify__the_bound_of_the_shield_holds_where_it_is_tightest(harm_count:
 def test_ranges__points_are_as_likely_as_a_list(name: str) -> None:
     """Worlds of even points have the means of a list, in every quantity."""
     scenario = eb.load_scenario(name).replace(early_impacts="keep")
-    ranges = scenario.ranges()
-    points = np.random.default_rng(0).random((5_000, len(ranges.names)))
-    found, listed = ranges.sample(points)[0].worlds, scenario.sample(5_000, 7).worlds
+    drawn = ranges(scenario)
+    points = np.random.default_rng(0).random((5_000, len(drawn.names)))
+    found, listed = drawn.sample(points)[0].worlds, scenario.sample(5_000, 7).worlds
     for one, other in (
         (found.gaps_m, listed.gaps_m),
         (found.speeds_mps, listed.speeds_mps),
@@ -100,9 +101,9 @@ def test_far_apart__takes_the_best_first_without_what_does_not_count() -> None:
 
 
 def test_ranges__are_what_a_scenario_draws() -> None:
-    paper, wide = eb.load_scenario("paper-random"), eb.load_scenario("stress-wide").ranges()
-    sample, accepted = paper.ranges().sample(np.full((1, 5), 0.5))
-    assert len(paper.ranges().names) == 5
+    paper, wide = eb.load_scenario("paper-random"), ranges(eb.load_scenario("stress-wide"))
+    sample, accepted = ranges(paper).sample(np.full((1, 5), 0.5))
+    assert len(ranges(paper).names) == 5
     assert accepted.tolist() == [True]
     assert sample.worlds.gaps_m.tolist() == [[7.5, 7.5]]
     assert sample.worlds.speeds_mps.tolist() == [[20.0, 20.0, 20.0]]

@@ -21,6 +21,7 @@ from ethbrake_marl.extensions.studies.sweep import SweepPlan
 from ethbrake_marl.extensions.studies.tuning import TuningPlan
 from ethbrake_marl.extensions.studies.weakness import Measure
 from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.ranges import ranges
 from tests.fixtures.pictures import draw_nothing
 from tests.refused import refused
 from tests.studies.test_reproduction import drawn, made, planted
@@ -301,15 +302,15 @@ def test_levels__may_differ_in_roles_objective_obstacle_and_channel_alone() -> N
 
 
 FALSIFICATIONS: dict[str, Callable[[], object]] = {
-    "scenario 'mixture-delays': is a mixture; take one of its scenarios: paper-delay-low": lambda: load_scenario(
-        "mixture-delays"
-    ).ranges(),
-    "scenario 'cooperation-2-blocked': v2x: draws delays and losses, which no table of worlds holds; give": lambda: (
-        load_scenario("cooperation-2-blocked").ranges()
+    "scenario 'mixture-delays': is a mixture; take one of its scenarios: paper-delay-low": lambda: ranges(
+        load_scenario("mixture-delays")
     ),
-    "scenario 'paper-scenario-1': draws nothing: all its worlds are the same": lambda: load_scenario(
-        "paper-scenario-1"
-    ).ranges(),
+    "scenario 'cooperation-2-blocked': v2x: draws delays and losses, which no table of worlds holds; give": lambda: (
+        ranges(load_scenario("cooperation-2-blocked"))
+    ),
+    "scenario 'paper-scenario-1': draws nothing: all its worlds are the same": lambda: ranges(
+        load_scenario("paper-scenario-1")
+    ),
     "--against coast: --measure harm compares with nobody; use regret or difference": lambda: Measure.of(
         "harm", "full_brake", "coast", PAPER, "first"
     ),

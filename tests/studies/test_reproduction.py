@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation.statistics import rate
+from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS, PaperRow
 from ethbrake_marl.extensions.report.seed_curves import SeedCurve
-from ethbrake_marl.extensions.report.tests import PAPER_ROWS, PaperRow
 from ethbrake_marl.extensions.reproduction import delay_curves, folder as folder_module, hybrid, trainings
 from ethbrake_marl.extensions.reproduction.delay_curves import Course
 from ethbrake_marl.extensions.reproduction.figures import estimates_figure

@@ -24,6 +24,7 @@ from ethbrake_marl.physics.estimates import move_on
 from ethbrake_marl.physics.messages import Messages
 from ethbrake_marl.physics.motion import has_acted
 from ethbrake_marl.physics.state import Bools, Floats, Vehicles, Worlds
+from ethbrake_marl.scenario.sampling import middle_world
 from ethbrake_marl.scenario.schema import Scenario
 
 TOUCHING_M = 1e-9  # a gap below this is a contact: places are told with rounding
@@ -123,7 +124,7 @@ class Ranges:
                 f"scenario {scenario.name!r}: is a mixture, and a vehicle that is not known could be of any of {names};"
                 " believed agents need one of these"
             )
-        world = scenario.middle_world()
+        world = middle_world(scenario)
         low, high = ({key: np.array(scenario.bounds(key)).T[k] for key in ("gaps_m", *OF_OTHERS[1:5])} for k in (0, 1))
         named = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps")
         one, N = np.ones((1, scenario.vehicles)), scenario.vehicles

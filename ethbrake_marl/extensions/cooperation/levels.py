@@ -13,7 +13,7 @@ import numpy as np
 from ethbrake_marl.agents.registry import split_names
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.evaluation.identity import LIST_SEED
-from ethbrake_marl.evaluation.named_worlds import load_runnable
+from ethbrake_marl.evaluation.trial import load_runnable
 from ethbrake_marl.extensions.studies.folder import StudyFolder
 from ethbrake_marl.extensions.studies.trainings import TrainingJob
 from ethbrake_marl.files.yaml import Override

@@ -34,7 +34,7 @@ from ethbrake_marl.errors import (
     unknown_name,
 )
 from ethbrake_marl.evaluation.identity import LIST_SEED, policies_of, result_versions, scenario_sha256
-from ethbrake_marl.evaluation.named_worlds import make_lineup
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.outcome import LeftOut
 from ethbrake_marl.extensions.datasets.parquet import KEY, OF_STEPS, parquet_dataset
 from ethbrake_marl.extensions.datasets.recording import Recording, Task, record_episodes

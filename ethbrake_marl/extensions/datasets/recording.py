@@ -21,8 +21,8 @@ from ethbrake_marl.engine.compiled_step import Step
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.infos import Report
 from ethbrake_marl.errors import PhysicsError, renumbered
+from ethbrake_marl.evaluation.aftermath import ShovedFront
 from ethbrake_marl.evaluation.record import line_positions
-from ethbrake_marl.evaluation.rollout import ShovedFront
 from ethbrake_marl.game.actions import command_to_action
 from ethbrake_marl.game.harm import HARM_COUNTS, Ledger
 from ethbrake_marl.game.observations import ObservationSpec

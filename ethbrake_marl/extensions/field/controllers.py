@@ -301,3 +301,5 @@ R157_FSM = Part(
 )
 
 AEB = Part(make_controller, form="aeb[:ttc=1.5]", about="automatic emergency braking", knows=Source.MESSAGES)
+
+FIELD = ("idm", "acc", "cacc", "rss", "r157_human", "r157_fsm", "aeb")  # behind ``--agents field``

@@ -276,7 +276,7 @@ class _Run:
         nothing = np.full((worlds.n, len(engine.learners)), np.nan)
         ruling = engine.guard.decide(engine, before, nothing)
         policies = renew_memory(ruling.memory.policies, idle, take_memory(before.policies, idle))
-        engine.guarded = ruling.memory._replace(policies=policies)
+        engine.remember(ruling.memory._replace(policies=policies))
         for c, i in enumerate(engine.learners):
             self.wanted_mps2[due, i] = action_to_command(ruling.applied[:, c], worlds.vehicles, i)[due]
 

@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.engine.engine import Engine, Moment
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine.state import State
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.game.observations import Observations
-from ethbrake_marl.physics.columns import Packed, columns
+from ethbrake_marl.physics.columns import columns
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Bools, Floats, Ints
 from ethbrake_marl.policies.network_spec import Float32s
@@ -88,7 +89,7 @@ def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) 
     return gained
 
 
-def visit(engine: Engine, act: Act) -> tuple[Observations, Moment]:
+def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
     """Play every row to its end by ``act``: what is seen at each decision [m, L, F], and those moments [m]."""
     seen_then, moments = [], []
 
@@ -98,7 +99,7 @@ def visit(engine: Engine, act: Act) -> tuple[Observations, Moment]:
         return act(seen.reshape(-1, seen.shape[2])).astype(np.float64).reshape(seen.shape[:2])
 
     play_on(engine, decide, 1.0)
-    return np.concatenate(seen_then), Moment.join(moments)
+    return np.concatenate(seen_then), State.join(moments)
 
 
 def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
@@ -138,8 +139,8 @@ def other_count(count: HarmCount) -> HarmCount:
     return "total" if count == "first" else "first"
 
 
-def moving_rows(moments: Moment) -> Bools:
+def moving_rows(moments: State) -> Bools:
     """In which rows some vehicle moves; where everything stands there is nothing to learn."""
-    column = Packed(moments.state, moments.params).column
-    moving: Bools = (moments.state[:, column.speed : column.command] != 0.0).any(axis=1)
+    column = moments.packed.column
+    moving: Bools = (moments.motion[:, column.speed : column.command] != 0.0).any(axis=1)
     return moving

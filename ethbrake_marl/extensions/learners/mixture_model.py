@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import update_learning_rate
 from torch.nn.functional import mse_loss, softplus
 
-from ethbrake_marl.engine.engine import Moment
+from ethbrake_marl.engine.state import State
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.averaged_actor import AveragedActor
 from ethbrake_marl.extensions.learners.branches import moving_rows, other_count, visit
@@ -42,7 +42,7 @@ class ModesModel(CounterfactualModel):
         assert recipe.modes is not None
         self.plan = recipe.modes
         self._stage: Stage | None = None
-        self._own: Moment | None = None  # starts of the worlds of the stage's network
+        self._own: State | None = None  # starts of the worlds of the stage's network
         self._rate_share = 1.0
         super().__init__(environment, recipe)
 
@@ -55,7 +55,7 @@ class ModesModel(CounterfactualModel):
         member = policy.actors[stage.network]
         if stage.does == "further":  # whole episodes in some of the stage's own worlds
             assert self._own is not None
-            some = torch.randint(len(self._own.state), (self.n_envs,)).numpy()
+            some = torch.randint(len(self._own.motion), (self.n_envs,)).numpy()
             found, moments = visit(self.engine.branch(self._own.take(some)), member.act)
             seen = found.reshape(1, -1, found.shape[2])
             self.num_timesteps += each
@@ -95,7 +95,7 @@ class ModesModel(CounterfactualModel):
         pupil = copy.deepcopy(self.policy.actors[0])
         self._imitate(pupil, shown, seed + stage.network)
         self._own = own_worlds(engine, self.plan, found, pupil.act, gamma)
-        if len(shown.action) == 0 or len(self._own.state) == 0:
+        if len(shown.action) == 0 or len(self._own.motion) == 0:
             raise NoOtherMode(
                 f"modes: network {stage.network + 1}: in none of {self.plan.worlds:,} worlds did one of"
                 f" {self.plan.templates} templates do better by {self.plan.gain:g}; leave out modes, or have"
@@ -117,7 +117,7 @@ class ModesModel(CounterfactualModel):
                 descend(pupil.optimizer, loss)
         follow(pupil.average, pupil.learning, 0.0)
 
-    def _compare(self, seen: Float32s, moments: Moment) -> tuple[Float32s, Floats, Float32s]:
+    def _compare(self, seen: Float32s, moments: State) -> tuple[Float32s, Floats, Float32s]:
         """At some decisions: what is seen [B, F], what going on with each network costs [B, K], what each counts [B].
 
         Where all networks would do the same now nothing depends on the choice: the gate is asked again at the next one.

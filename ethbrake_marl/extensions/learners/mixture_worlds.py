@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.engine.engine import Engine, Moment
+from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.profiles import profile_problem
+from ethbrake_marl.engine.state import State
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.extensions.learners.branches import Act, Offsets, play_on, play_to_the_end
 from ethbrake_marl.extensions.learners.mixture_plan import ModesPlan
@@ -26,7 +27,7 @@ class Explored(NamedTuple):
     """Worlds of the training, and the best that networks do in them."""
 
     alert: Worlds
-    start: Moment  # at the first decision
+    start: State  # at the first decision
     gained: Floats  # [n] the highest return
     harm: Floats  # [n] the least harm (m2/s2)
 
@@ -49,7 +50,7 @@ def explore(engine: Engine, plan: ModesPlan, acts: Sequence[Act], gamma: float) 
 
 
 def drive_from(
-    engine: Engine, start: Moment, act: Act, gamma: float, count: HarmCount | None = None
+    engine: Engine, start: State, act: Act, gamma: float, count: HarmCount | None = None
 ) -> tuple[Floats, Floats]:
     """Return of the first learner [n], NaN for a row that could not be advanced, and harm of the world [n] (m2/s2).
 
@@ -95,7 +96,7 @@ def show_templates(engine: Engine, plan: ModesPlan, found: Explored, gamma: floa
     return Shown(np.concatenate(seen_then)[kept], wanted[kept])
 
 
-def own_worlds(engine: Engine, plan: ModesPlan, found: Explored, act: Act, gamma: float) -> Moment:
+def own_worlds(engine: Engine, plan: ModesPlan, found: Explored, act: Act, gamma: float) -> State:
     """The starts of the worlds in which ``act`` is at most ``plan.margin`` worse than the networks before it.
 
     Those where it makes no difference are left out, and those where the networks before do no harm: they teach nothing.

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
-from ethbrake_marl.engine.engine import Moment
+from ethbrake_marl.engine.state import State
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.branches import moving_rows, other_count, play_on
 from ethbrake_marl.extensions.learners.optimizer import descend, follow
@@ -18,6 +18,7 @@ from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
 from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.state import Floats, Ints
 from ethbrake_marl.policies.network_spec import Float32s
+from ethbrake_marl.scenario.sampling import members_of
 
 FOR_GOOD = 2**31  # steps: more than any episode has
 
@@ -69,7 +70,7 @@ class OptionsModel(CounterfactualModel):
         self._n_updates += len(losses)
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
 
-    def _try_actions(self, seen: Float32s, moments: Moment) -> tuple[Float32s, Ints, Floats]:
+    def _try_actions(self, seen: Float32s, moments: State) -> tuple[Float32s, Ints, Floats]:
         """At some decisions: what is seen [B, F], numbers of the actions tried [B, C], and what each costs [B, C].
 
         The first one is the one that the actor takes. ``caution`` is part of the costs.
@@ -130,8 +131,8 @@ class OptionsModel(CounterfactualModel):
         """What decisions [B] of these rows usually cost in their scenarios [B], to which these costs are added."""
         numbers = self._numbers[rows]
         first = int(numbers.min())
-        drawn = self.engine.scenario.members_of(
-            int(numbers.max()) - first + 1, self.engine.seed, first=first, channel="training"
+        drawn = members_of(
+            self.engine.scenario, int(numbers.max()) - first + 1, self.engine.seed, first=first, channel="training"
         )
         member, usual = drawn[numbers - first], self.policy.usual.numpy()
         for m in np.unique(member):

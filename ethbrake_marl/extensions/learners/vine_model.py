@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from torch import Tensor
 
-from ethbrake_marl.engine.engine import Moment
+from ethbrake_marl.engine.state import State
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.averaged_actor import AveragedActor, Deterministic
 from ethbrake_marl.extensions.learners.branches import Act, Offsets, moving_rows, play_to_the_end
@@ -77,7 +77,7 @@ class CounterfactualModel(BaseAlgorithm):
         self._update_current_progress_remaining(self.num_timesteps, total)
         self._train(actor, self._try_out(seen, moments, actor))
 
-    def _visit(self, told: BaseCallback, act: Act) -> tuple[Float32s, Moment]:
+    def _visit(self, told: BaseCallback, act: Act) -> tuple[Float32s, State]:
         """Drive on for ``n_steps``; what was seen [n_steps, rows, F], and the worlds' moments, step by step."""
         seen, moments, numbers = [], [], []
         for _ in range(self.recipe.n_steps):
@@ -92,9 +92,9 @@ class CounterfactualModel(BaseAlgorithm):
             told.update_locals(locals())
             told.on_step()
         self._numbers = np.concatenate(numbers)  # of those worlds in the training
-        return np.stack(seen), Moment.join(moments)
+        return np.stack(seen), State.join(moments)
 
-    def _try_out(self, seen: Float32s, moments: Moment, actor: Deterministic) -> Tried:
+    def _try_out(self, seen: Float32s, moments: State, actor: Deterministic) -> Tried:
         """Try some of the visited decisions with more and with less, each to the end of its episode."""
         recipe, learners = self.recipe, len(self.engine.learners)
         moving = np.flatnonzero(moving_rows(moments).repeat(learners))

@@ -1,1 +1,1 @@
-"""What nobody can avoid: proven bounds on harm, whatever the controlled vehicle does."""
+"""Proven bounds on harm: nobody can do less, whatever the controlled vehicle does."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -21,10 +20,11 @@ from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import SummaryRow, SummaryTable, summarise
 from ethbrake_marl.extensions.report.episode_figure import trajectories
 from ethbrake_marl.extensions.report.page import Part
+from ethbrake_marl.extensions.report.paper_rows import is_papers_test, summarise_beside_paper
 from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap, learning_curve
 from ethbrake_marl.extensions.report.style import write_picture
-from ethbrake_marl.extensions.report.tests import TESTS, is_papers_test, other_tests
+from ethbrake_marl.extensions.report.three_tests import TESTS, brief, other_tests
 from ethbrake_marl.files.store import read_object
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.game.rewards import RewardParams
@@ -46,9 +46,8 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
         """Tell that a stage of the report begins, or that all have ended."""
         tell(Progress(f"report{stage and ': '}{stage}", next(done), 2 + len(others)))
 
-    rows = experiment.rows
-    if is_papers_test(evaluation.task, evaluation.seed):
-        rows = SummaryTable(replace(row, beside_paper=True) for row in rows)
+    is_papers = is_papers_test(evaluation.task, evaluation.seed)
+    rows = summarise_beside_paper(evaluation) if is_papers else experiment.rows
     beside: dict[str, SummaryTable] = {}
     for other in others:  # the policy was trained on the scenario of the run alone
         begin(f"the same policy on {other.name}")
@@ -73,7 +72,7 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
     report.driven(experiment.agents).write(page, force=True)
     begin("")
     return RunReport(
-        (rows.brief(beside), *rows.tables()[1:]), f"report, with every measure and the paper's rows: {page}"
+        (brief(rows, beside), *rows.tables()[1:]), f"report, with every measure and the paper's rows: {page}"
     )
 
 

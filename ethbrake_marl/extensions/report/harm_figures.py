@@ -15,6 +15,7 @@ from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.summary import SummaryRow
 from ethbrake_marl.extensions.report.style import TITLES, finish, label_text, name_axes, new_panels, plain, series_style
 from ethbrake_marl.extensions.report.svg import SLIM_IN
+from ethbrake_marl.extensions.search.regret import regrets_of
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 
 _POINTS = 250  # of a curve; more cannot be told apart
@@ -71,7 +72,7 @@ def regret_distribution(evaluation: Evaluation) -> Figure:
 
     Where nothing is known to be the best, the same of the harm itself.
     """
-    regrets = evaluation.regrets
+    regrets = regrets_of(evaluation)
     figure, panels = new_panels((10.0, 3.8), columns=2, sharey=True)
     for axes, count in zip(panels, HARM_COUNTS, strict=True):
         for number, (agent, outcome) in enumerate(evaluation.outcomes.items()):
@@ -99,7 +100,7 @@ def harm_in_parts(evaluation: Evaluation) -> Figure:
 
     Raises ``InvalidInput`` where nothing is proven of the worlds.
     """
-    regrets = evaluation.regrets
+    regrets = regrets_of(evaluation)
     if regrets is None:
         raise InvalidInput("harm_in_parts: nothing is proven of these worlds, so no part can be told from another")
     avoidable = regrets.limits.proof.avoidable

@@ -24,6 +24,7 @@ from ethbrake_marl.extensions.report.page import Page, Part, Section
 from ethbrake_marl.extensions.report.player import Played
 from ethbrake_marl.extensions.report.shown_worlds import BASELINE, NAMES, ROUNDING, WORDS, choose_shown, worst_rows
 from ethbrake_marl.extensions.search.limits import Unproven
+from ethbrake_marl.extensions.search.regret import limits_of, regrets_of
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
@@ -34,7 +35,7 @@ SHIELD_WORLDS = 200  # in which what a shield replaced is simulated again
 
 def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) -> Section:
     """The ten worlds in which an agent did worst; those that the page plays have a button."""
-    regrets, outcome = evaluation.regrets, evaluation.outcome(focus)
+    regrets, outcome = regrets_of(evaluation), evaluation.outcome(focus)
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
     columns: dict[str, NDArray[Any] | None] = {
         "First-impact harm": outcome.first_impact_harm,
@@ -60,12 +61,12 @@ def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) ->
 
 def avoidable_section(evaluation: Evaluation) -> Section:
     """Collisions and harm where contact could be avoided, and where nobody could; and the regret of each agent."""
-    regrets = evaluation.regrets
+    regrets, limits = regrets_of(evaluation), limits_of(evaluation)
     body: list[str | Part] = []
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
-    if isinstance(evaluation.limits, Unproven):
+    if isinstance(limits, Unproven):
         told = "Nothing is proven of these worlds, so what was avoidable is not told apart."
-        body.append(f"{told} Reason: {evaluation.limits.because}.")
+        body.append(f"{told} Reason: {limits.because}.")
     elif regrets is None or avoidable is None:
         body.append("Where contact can be avoided is not decided for these vehicles, so that is not told apart.")
     else:
@@ -183,10 +184,10 @@ class Report:
         if self.focus:
             sections.append(worst_section(self.evaluation, self.focus, [one.number for one in self.played]))
         sections += [avoidable_section(self.evaluation), self.shield, Section("Figures", self.figures)]
-        all_rows = SummaryTable(self.rows)
+        all_rows = _table_of(self.rows)
         sheet, nowhere = all_rows.sheet(), set(_empty(all_rows))
         for title, about, told_rows in self.tests:
-            rows = SummaryTable(told_rows)
+            rows = _table_of(told_rows)
             notes = [Part.paragraph(text, "note") for text in _remarks(rows)]
             told = [_short_table(rows), *notes, *_measured(rows), Part.paragraph(rows.identity_line(), "quiet")]
             sections.append(Section(title, [about, *told]))
@@ -265,7 +266,7 @@ class Report:
         return [Part.remarks([*self.remarks, *_remarks(rows)]), Part.beside([drawing, _short_table(rows)])]
 
     def _results(self) -> Section:
-        rows, limits = SummaryTable(self.rows), self.evaluation.limits
+        rows, limits = _table_of(self.rows), limits_of(self.evaluation)
         because = f" Nothing is proven of these worlds: {limits.because}." if isinstance(limits, Unproven) else ""
         told: list[str | Part] = [self.summary] if self.summary else []
         return Section("Results", [*told, Part.box("Three words", WORDS), *_measured(rows, because)])
@@ -313,16 +314,19 @@ def _change(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
     return "less" if high < 0.0 else "more" if low > 0.0 else "as much"
 
 
+def _table_of(rows: Sequence[SummaryRow]) -> SummaryTable:
+    """The rows as a table, with those of other sources if they have some beside them."""
+    return rows if isinstance(rows, SummaryTable) else SummaryTable(rows)
+
+
 def _short_table(rows: SummaryTable) -> Part:
     """Each agent, how often it collides, and both harms."""
-    return _table(SummaryTable(replace(row, beside_paper=False) for row in rows).sheet(), _CAPTION, _SHORT)
+    return _table(SummaryTable(rows).sheet(), _CAPTION, _SHORT)
 
 
 def _remarks(rows: SummaryTable) -> list[str]:
     """What must not be overlooked about these rows."""
-    return [
-        text for kind, text in SummaryTable(replace(row, beside_paper=False) for row in rows).notes() if kind == "note"
-    ]
+    return [text for kind, text in SummaryTable(rows).notes() if kind == "note"]
 
 
 def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
@@ -330,7 +334,7 @@ def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
 
     ``because``: why columns may be empty.
     """
-    ours = SummaryTable(replace(row, beside_paper=False) for row in rows)
+    ours = SummaryTable(rows)
     whole, notes, empty = rows.sheet(), ours.notes(), _empty(rows)
     folded = [
         _table(whole, "Every harm and what it is compared with", set(whole.names) - _OTHERS),

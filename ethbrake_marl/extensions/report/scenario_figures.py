@@ -13,7 +13,7 @@ from matplotlib.ticker import PercentFormatter
 
 from ethbrake_marl.envs.rendering import BODY_M, vehicle_colour
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.named_worlds import drawn_alike
+from ethbrake_marl.evaluation.varying import drawn_alike
 from ethbrake_marl.extensions.report.style import (
     GREY,
     finish,

@@ -8,6 +8,7 @@ import numpy as np
 
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.extensions.report.player import Played
+from ethbrake_marl.extensions.search.regret import regrets_of
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.state import Bools, Floats, Ints
 
@@ -45,7 +46,7 @@ def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS)
             found[row] = Played(int(evaluation.index[row]), kind, why)
 
     add(f"Where {focus} did worst", worst_rows(evaluation, focus), WORST)
-    regrets = evaluation.regrets
+    regrets = regrets_of(evaluation)
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
     if avoidable is not None:
         add(f"Avoidable, and {focus} collided", _largest(total, outcome.collided & avoidable), _EACH)
@@ -61,7 +62,7 @@ def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS)
 
 def worst_rows(evaluation: Evaluation, focus: str) -> Ints:
     """The ten worlds of the largest regret in total harm, or of the largest total harm where no best is known."""
-    outcome, regrets = evaluation.outcome(focus), evaluation.regrets
+    outcome, regrets = evaluation.outcome(focus), regrets_of(evaluation)
     value = outcome.total_harm if regrets is None else regrets.regret(outcome, "total")
     return _largest(value, value > 0.0)[:WORST]
 

@@ -10,7 +10,7 @@ from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.statistics import mean
-from ethbrake_marl.extensions.report.tests import PAPER_ROWS
+from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS
 from ethbrake_marl.extensions.reproduction.folder import (
     FIRST_IMPACTS,
     H_STAR,

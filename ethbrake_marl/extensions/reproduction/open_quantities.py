@@ -1,5 +1,5 @@
-"""What the paper leaves open: each quantity, what the paper says of it, our default, alternatives, and how far the
-headline of the random test moves when one of them changes.
+"""Quantities that the paper leaves open: what it says of each, our default, alternatives, and how far the headline of
+the random test moves when one of them changes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import Progress
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import mean, paired_difference
-from ethbrake_marl.extensions.report.tests import PAPER_ROWS
+from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS
 from ethbrake_marl.extensions.reproduction.figures import changes_figure
 from ethbrake_marl.extensions.reproduction.folder import (
     POLICIES,

@@ -10,12 +10,13 @@ from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import Progress
 from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.named_worlds import make_agents
+from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.extensions.reproduction.folder import Reproduction
 from ethbrake_marl.extensions.reproduction.trainings import EARLY, STOPPED
 from ethbrake_marl.extensions.reproduction.verdicts import LIST_SEED, PREDICTED, PROVEN
 from ethbrake_marl.extensions.search.limits import Unproven
+from ethbrake_marl.extensions.search.regret import limits_of
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.policy import Policy
@@ -81,8 +82,9 @@ def harms(evaluation: Evaluation) -> dict[str, Floats]:
     pairwise = evaluation.outcomes.get(NAMES[PAIRWISE])
     if pairwise is not None and pairwise.predicted_harm is not None:
         found[PREDICTED] = pairwise.predicted_harm
-    if not isinstance(evaluation.limits, Unproven) and evaluation.limits.proof.harm is not None:
-        found[PROVEN] = evaluation.limits.proof.harm
+    limits = limits_of(evaluation)
+    if not isinstance(limits, Unproven) and limits.proof.harm is not None:
+        found[PROVEN] = limits.proof.harm
     return found
 
 

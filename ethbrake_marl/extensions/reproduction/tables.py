@@ -9,7 +9,7 @@ from itertools import chain
 
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.statistics import mean, rate, relative_decrease
-from ethbrake_marl.extensions.report.tests import PaperRow
+from ethbrake_marl.extensions.report.paper_rows import PaperRow
 from ethbrake_marl.extensions.reproduction.folder import Made, Parameter, csv_text
 from ethbrake_marl.extensions.reproduction.strategies import ABOUT_BASELINE, FULL_BRAKE, NAMES, PAIRWISE, harms
 from ethbrake_marl.extensions.reproduction.verdicts import HARM, PERCENT, PREDICTED, PROVEN, Verdict, compare_number

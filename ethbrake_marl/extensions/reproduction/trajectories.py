@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 
 from ethbrake_marl.errors import Progress
-from ethbrake_marl.evaluation.named_worlds import make_agents
+from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
 from ethbrake_marl.extensions.report.episode_figure import trajectories
 from ethbrake_marl.extensions.report.page import Part

@@ -1,4 +1,4 @@
-"""What is known of each world whoever drives: whether contact is avoidable, the proven and the best known harm."""
+"""Limits of each world, whoever drives: whether contact is avoidable, the proven and the best known harm."""
 
 from __future__ import annotations
 
@@ -19,6 +19,10 @@ from ethbrake_marl.scenario.task import Task
 _VEHICLES, _DRIVEN = 3, 1
 
 _DECIDED = ({1}, {1, 2})  # of three vehicles: who is driven where avoidability is proven
+
+
+class IncompleteTable(UserWarning):
+    """A table of best known harm holds some of the worlds asked about, and not the others."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,17 +1,20 @@
-"""The limits of an evaluation: the least harm known of each world is that of ``limits.limits``, or what an agent of
-the same evaluation achieved, whichever is less.
+"""Regret: an agent's harm minus the best known harm of the same world.
+
+The best known is the least of what ``limits`` knows beforehand and what the agents of the same evaluation achieved.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.outcome import Outcome, Values
-from ethbrake_marl.extensions.search.limits import Limits
+from ethbrake_marl.extensions.search.limits import IncompleteTable, Limits, Unproven, known_limits
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.state import Bools, Floats
 
@@ -55,20 +58,6 @@ class Regrets:
         return Between.of(~self.avoidable, self.limits.proof.impact, self.first_impact_harm, self.total_harm)
 
 
-# What was avoidable and the best known in each world, by the names of ``--per-world``.
-KNOWN_OF_WORLDS: dict[str, Callable[[Regrets, Outcome], Values | None]] = {
-    "avoidable": lambda r, _: None if r.avoidable is None else r.avoidable + 0,
-    "unavoidable_reason": lambda r, _: r.limits.proof.reason,
-    "best_known_first_impact_harm": lambda r, _: r.first_impact_harm,
-    "best_known_total_harm": lambda r, _: r.total_harm,
-    "best_known_source": lambda r, _: r.source,
-    "impact_proven": lambda r, _: r.limits.proof.impact + 0,
-    "proven_harm": lambda r, _: r.limits.proof.harm,
-    "regret_first_impact_harm": lambda r, o: r.regret(o, "first"),
-    "regret_total_harm": lambda r, o: r.regret(o, "total"),
-}
-
-
 @dataclass(frozen=True, slots=True)
 class Between:
     """The worlds with proven contact in which no impact is proven, and the least harm known there (m2/s2)."""
@@ -100,3 +89,54 @@ class Between:
             return cls(float(there.mean()), None, None, None)
         harmless = float((total[known] < NO_HARM).mean())
         return cls(float(there.mean()), float(first[known].mean()), float(total[known].mean()), harmless)
+
+
+# What was avoidable and the best known in each world, by the names of ``--per-world``.
+KNOWN_OF_WORLDS: dict[str, Callable[[Outcome, Regrets], Values | None]] = {
+    "avoidable": lambda _, r: None if r.avoidable is None else r.avoidable + 0,
+    "unavoidable_reason": lambda _, r: r.limits.proof.reason,
+    "best_known_first_impact_harm": lambda _, r: r.first_impact_harm,
+    "best_known_total_harm": lambda _, r: r.total_harm,
+    "best_known_source": lambda _, r: r.source,
+    "impact_proven": lambda _, r: r.limits.proof.impact + 0,
+    "proven_harm": lambda _, r: r.limits.proof.harm,
+    "regret_first_impact_harm": lambda o, r: r.regret(o, "first"),
+    "regret_total_harm": lambda o, r: r.regret(o, "total"),
+}
+
+
+def limits_of(evaluation: Evaluation) -> Limits | Unproven:
+    """What is known of each world whoever drives, computed once for an evaluation.
+
+    Warns (``IncompleteTable``) where a table of best known harm holds some of the worlds, and not the others.
+    """
+    return evaluation.once(_limits)
+
+
+def _limits(evaluation: Evaluation) -> Limits | Unproven:
+    if evaluation.host:
+        return Unproven(f"{evaluation.host} moved these worlds, and what is proven is of the physics here")
+    found = known_limits(evaluation.worlds, evaluation.task)
+    if isinstance(found, Limits) and found.warning:
+        warnings.warn(found.warning, IncompleteTable, stacklevel=4)
+    return found
+
+
+def regrets_of(evaluation: Evaluation) -> Regrets | None:
+    """Best known harm of every world, the agents of this evaluation included; None where nothing is proven."""
+    return evaluation.once(_regrets)
+
+
+def _regrets(evaluation: Evaluation) -> Regrets | None:
+    limits = limits_of(evaluation)
+    if isinstance(limits, Unproven):
+        return None
+    outcomes = evaluation.outcomes.values()
+    first = np.fmin.reduce([limits.first_impact_harm, *(outcome.first_impact_harm for outcome in outcomes)])
+    total = np.fmin.reduce([limits.total_harm, *(outcome.total_harm for outcome in outcomes)])
+    regrets = Regrets(limits, first, total, np.zeros(0, np.str_))
+    below = np.logical_or.reduce([regrets.below(outcome) for outcome in outcomes])
+    avoidable = limits.proof.avoidable
+    witness = np.zeros(below.shape, np.bool_) if avoidable is None else avoidable
+    source = np.select([witness, ~limits.known, below], ["witness", "agents", "below_table"], "table")
+    return replace(regrets, source=source)

@@ -65,3 +65,5 @@ BEST_HARM = Part(  # what the entry point names (pyproject.toml)
     about="the best profile known; a search at the alert where none is known",
     knows=Source.MODEL,
 )
+
+RUNGS = ("planner", "best_harm")  # behind ``--agents ladder``, above the core's: up to the best that is known

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.errors import check_whole_number
-from ethbrake_marl.evaluation.named_worlds import NamedWorld
+from ethbrake_marl.extensions.studies.named_worlds import NamedWorld
 from ethbrake_marl.physics.state import Floats, Ints
 from ethbrake_marl.scenario.sample import Sample
 

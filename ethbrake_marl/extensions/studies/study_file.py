@@ -10,7 +10,7 @@ from typing import Annotated, Any, Self
 from pydantic import Field, PrivateAttr
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.named_worlds import load_runnable
+from ethbrake_marl.evaluation.trial import load_runnable
 from ethbrake_marl.files.yaml import Document, FileModel, Wording, flow_text, read_model, read_yaml
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario

@@ -10,11 +10,14 @@ import numpy as np
 
 from ethbrake_marl.agents.protocol import Driver
 from ethbrake_marl.errors import InvalidInput, PhysicsError, unknown_name
-from ethbrake_marl.evaluation.named_worlds import NamedWorld, make_lineup, states_of
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.evaluation.varying import states_of
 from ethbrake_marl.extensions.studies.falsification import Falsified, Watcher, far_apart, search
+from ethbrake_marl.extensions.studies.named_worlds import NamedWorld
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.scenario.ranges import ranges
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
 
@@ -81,18 +84,18 @@ class Measure:
         Worlds without harm, regret or difference are not kept: the result may hold none.
 
         Raises ``InvalidInput`` where the scenario draws nothing, or has none of the worlds that were tried, and what
-        ``Scenario.ranges`` raises.
+        ``scenario.ranges`` raises.
         """
-        ranges = self.scenario.ranges()
+        drawn = ranges(self.scenario)
 
         def score(points: Floats) -> Floats:
-            sample, accepted = ranges.sample(points)
+            sample, accepted = drawn.sample(points)
             found, rows = np.full(len(points), -np.inf), np.flatnonzero(accepted)
             if len(rows):
                 found[rows] = self(sample.take(rows)).score
             return found
 
-        tried = search(score, len(ranges.names), budget, seed, adaptive=adaptive, on_round=on_round)
+        tried = search(score, len(drawn.names), budget, seed, adaptive=adaptive, on_round=on_round)
         worst = far_apart(tried, most)
         if self.name != "bound":
             worst = worst[tried.scores[worst] > 0.0]
@@ -102,7 +105,7 @@ class Measure:
                 " anybody may act, or the physics fails; give early_impacts: keep, or a larger --budget"
             )
         above = np.flatnonzero(tried.scores > 0.0)
-        sample, kept = ranges.sample(tried.points[worst])[0], []
+        sample, kept = drawn.sample(tried.points[worst])[0], []
         if len(worst):
             found = self(sample)
             kept = [

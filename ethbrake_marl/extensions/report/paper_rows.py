@@ -1,4 +1,4 @@
-"""The three tests that are shown beside each other, and the rows that the paper prints for its own."""
+"""The rows of the paper's two tables, and which evaluations they are about."""
 
 from __future__ import annotations
 
@@ -6,33 +6,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.measures import BASELINE
+from ethbrake_marl.evaluation.summary import RowsBeside, SummaryTable, summarise
+from ethbrake_marl.extensions.report.three_tests import is_as_shipped
 from ethbrake_marl.scenario.task import Task
-
-TESTS = {
-    "paper-random": "Main test, the paper's rules: Vehicle 2 may drive, nothing stands ahead of Vehicle 1, and pushing"
-    " it on costs nothing in either count.",
-    "paper-random-brake-only": "Brake-only test: the same worlds, but Vehicle 2 may only brake and coast; it can"
-    " neither drive on nor push with its motor.",
-    "paper-random-obstacle": "Obstacle test: the same worlds with the obstacle that Vehicle 1 brakes for, 1.7 m beyond"
-    " where it stops by itself. Vehicle 1's impact with it is harm.",
-}
-
-
-def is_as_shipped(scenario: Scenario) -> bool:
-    """Whether every value of the scenario is that of the shipped one of its name, whatever its texts say."""
-    one, other = (
-        each.model_dump(exclude={"title", "description", "source"}) for each in (scenario, load_scenario(scenario.name))
-    )
-    return one == other
-
-
-def other_tests(scenario: Scenario) -> tuple[Scenario, ...]:
-    """The two tests that belong beside results on ``scenario``; none where it is not one of the three as shipped."""
-    if scenario.name not in TESTS or not is_as_shipped(scenario):
-        return ()
-    return tuple(load_scenario(name) for name in TESTS if name != scenario.name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,3 +75,25 @@ def check_papers_test(task: Task, seed: int | None) -> None:
             f" are {'worlds of no known seed' if seed is None else 'a list'} of {task.scenario.name!r};"
             f" {'give evaluate the seed of the list, or ' if seed is None else ''}leave paper out"
         )
+
+
+def summarise_beside_paper(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTable:
+    """``summarise``, with the rows of the paper's tables below; ``InvalidInput`` where they are about another test."""
+    check_papers_test(evaluation.task, evaluation.seed)
+    return SummaryTable(summarise(evaluation, baseline=baseline), _beside())
+
+
+def _beside() -> RowsBeside:
+    rows: list[str | tuple[str, dict[str, str]]] = []
+    for paper in PAPER_ROWS:
+        section = f"paper, {paper.table}"
+        rows += [] if section in rows else [section]
+        texts = {
+            "collision_rate": f"{100 * paper.collision_rate:.4g} %",
+            "first_impact_harm": f"{paper.average_harm:.6g}",
+        }
+        if paper.harm_decrease is not None:
+            texts["harm_decrease_first"] = f"{100 * paper.harm_decrease:.4g} %"
+        rows.append((paper.agent, texts))
+    conditions = [("quiet", f"Paper, {name}: {told}.") for name, told in PAPER_PARAMETERS.items()]
+    return RowsBeside(rows, [*conditions, ("note", PAPER_NOTE)])

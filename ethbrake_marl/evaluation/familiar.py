@@ -1,0 +1,70 @@
+"""Warnings of policies that drive in worlds beyond those of their training."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ethbrake_marl.agents.protocol import Driver, Team
+from ethbrake_marl.errors import Unfamiliar
+from ethbrake_marl.evaluation.identity import driving_policy
+from ethbrake_marl.physics.state import Worlds
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.schema import Scenario
+
+_MOST_BEYOND = 0.05  # share of the worlds: as many may lie beyond without a word
+
+_TRAINED = 2_000  # worlds of a training that say where it took place
+
+
+def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, vehicles: Sequence[int]) -> None:
+    """Warn (``Unfamiliar``) where a trained policy drives in worlds beyond those that it was trained in.
+
+    These are drawn from the scenario in its manifest. Where that cannot be drawn here, nothing is said. Of the channel
+    only what a world has of it is compared: latencies.
+    """
+    drives: dict[str, tuple[str, Policy, dict[str, None]]] = {}  # by hash: the first agent, vehicles in order
+    for name, agent in agents.items():
+        for vehicle, driver in Team.of(agent, vehicles).drivers.items():
+            if isinstance(policy := driving_policy(driver), Policy):
+                sha256 = policy.manifest.manifest_sha256
+                drives.setdefault(sha256, (name, policy, {}))[2][f"vehicle_{vehicle + 1}"] = None
+    for name, policy, driven in drives.values():
+        try:
+            trained = Scenario.of_dump(policy.manifest.scenario)
+            before = trained.sample(_TRAINED, 0).worlds
+        except ValueError:
+            continue
+        found = [each for each in driven if each not in policy.manifest.learners]
+        if not np.isclose(trained.time_step_s, scenario.time_step_s):
+            found.append("time_step_s")
+        found += [f"{worlds.N} vehicles"] if worlds.N != before.N else _beyond(before, worlds)
+        for i, script in scenario.scripts.items():
+            if str(trained.scripts.get(i, script)) != str(script):
+                found.append(f"{scenario.vehicle_names[i]} by {script}")
+        if found:
+            beyond = f"trained on {trained.name}, and not for what {scenario.name} has: {', '.join(found)}"
+            warnings.warn(f"{name}: {beyond}", Unfamiliar, stacklevel=2)
+
+
+def _beyond(before: Worlds, worlds: Worlds) -> list[str]:
+    """The quantities that lie beyond those ``before``."""
+    found, known, here = [], QUANTITY.of(before), QUANTITY.of(worlds)
+    for key, rule in here.items():
+        if key not in known:
+            found.append(key)
+            continue
+        values, seen = rule.of(worlds), rule.of(before)
+        low, high = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
+        margin = 0.01 * (high - low) + 1e-9 * np.abs(high)
+        share = ((values < low - margin) | (values > high + margin)).any(axis=1).mean()
+        none = np.isnan(values).any(axis=1).mean()
+        if none > _MOST_BEYOND and not np.isnan(seen).any():
+            found.append(f"no {key} in {100.0 * none:.0f} % of the worlds")
+        if share > _MOST_BEYOND:
+            found.append(f"{key} in {100.0 * share:.0f} % of the worlds")
+    gone = {key: rule.of(before) < rule.high for key, rule in known.items() if key not in here}
+    return found + [f"no {key}" for key, there in gone.items() if there.any(axis=1).all()]  # all had it before

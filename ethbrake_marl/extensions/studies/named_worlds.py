@@ -1,0 +1,91 @@
+"""Files of named worlds: what a search has found, to be driven again.
+
+A file says which scenario its worlds are of, by its content, what drove there, and what that was measured to be.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.identity import scenario_sha256
+from ethbrake_marl.files.yaml import FileModel, Wording, flow_text, read_model, read_yaml
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.physics.state import Worlds
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.tables import worlds_from_table
+
+MOST_NAMED_WORLDS = 1000  # of a file
+
+SIZE_LIMIT = 8 << 20  # bytes of it: so many worlds of a long line
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class NamedWorld(FileModel):
+    """One world: its name, its initial state by the columns of a table, and what was measured there (m2/s2)."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
+    score: Number
+    harm: Number
+    reference: Number | None = None
+    state: Annotated[dict[str, Number], Field(min_length=1, max_length=1000)]
+
+
+class NamedWorlds(FileModel):
+    """A file of named worlds."""
+
+    format: Literal["ethbrake-worlds"]
+    version: Annotated[int, Field(ge=1, le=1)]  # a literal would take true and 1.0, which equal 1
+    scenario: str
+    scenario_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    settings: list[str] = Field(default=[])  # what was set beside the scenario's name, as ``--set`` takes it
+    agent: str
+    measure: Literal["harm", "regret", "difference", "bound"]
+    against: str | None = None
+    harm_count: HarmCount
+    found_by: str  # the command
+    worlds: Annotated[list[NamedWorld], Field(min_length=1, max_length=MOST_NAMED_WORLDS)]
+
+    @classmethod
+    def of(cls, scenario: Scenario, /, **told: Any) -> NamedWorlds:
+        """The file of worlds of this scenario."""
+        return cls(format="ethbrake-worlds", version=1, scenario_sha256=scenario_sha256(scenario), **told)
+
+    @classmethod
+    def read(cls, path: str | Path) -> NamedWorlds:
+        """Read such a file; raises ``InvalidInput`` naming file, line and key."""
+        document = read_yaml(path, SIZE_LIMIT)
+        found = read_model(document, cls, Wording(cls, "search again (ethbrake study falsify)"), "of named worlds")
+        names = [world.name for world in found.worlds]
+        if twice := next((name for k, name in enumerate(names) if name in names[:k]), None):
+            raise InvalidInput(f"{path}: world {twice!r} is given twice; names must differ")
+        return found
+
+    @property
+    def text(self) -> str:
+        """The file's text; reading it back gives the same worlds to the bit."""
+        head = self.model_dump(exclude={"worlds"}, exclude_none=True)
+        lines = [f"{key}: {flow_text(value)}" for key, value in head.items() if value != []]
+        lines.append("worlds:")
+        for world in self.worlds:
+            entries = [f"{key}: {flow_text(value)}" for key, value in world.model_dump(exclude_none=True).items()]
+            lines += [f"  - {entries[0]}", *(f"    {entry}" for entry in entries[1:])]
+        return "\n".join(lines) + "\n"
+
+    def worlds_of(self, scenario: Scenario, where: str) -> Worlds:
+        """The worlds at the alert; raises ``InvalidInput`` for another scenario than theirs."""
+        if scenario_sha256(scenario) != self.scenario_sha256:
+            raise InvalidInput(
+                f"{where}: its worlds were found in scenario {self.scenario!r}"
+                f"{''.join(f' with --set {each}' for each in self.settings)}, which {scenario.name!r} is not, or is no"
+                " longer: their contents differ; use that scenario, or search again (ethbrake study falsify)"
+            )
+        columns = self.worlds[0].state.keys()
+        for k, world in enumerate(self.worlds):
+            if world.state.keys() != columns:
+                raise InvalidInput(f"{where}: worlds[{k}].state has other columns than worlds[0]; all need the same")
+        return worlds_from_table(scenario, {name: [world.state[name] for world in self.worlds] for name in columns})
