@@ -1,4 +1,4 @@
-"""What a training asks of a learning algorithm."""
+"""Interface of a learning algorithm: how it builds its model, and what of the model a checkpoint keeps."""
 
 from __future__ import annotations
 

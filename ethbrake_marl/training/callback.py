@@ -1,4 +1,4 @@
-"""What happens between two updates: measure, log, write checkpoints, stop."""
+"""Between two updates of a training: measure, log, write checkpoints, stop."""
 
 from __future__ import annotations
 

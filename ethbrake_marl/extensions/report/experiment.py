@@ -1,4 +1,4 @@
-"""What ``ethbrake run`` shows beside its results: three figures, a page, and the policy in the other two tests."""
+"""The report of ``ethbrake run``: three figures, a page, and the policy in the other two tests."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import SummaryRow, SummaryTable, summarise
 from ethbrake_marl.extensions.report.episode_figure import trajectories
 from ethbrake_marl.extensions.report.page import Part
-from ethbrake_marl.extensions.report.paper_rows import is_papers_test, summarise_beside_paper
+from ethbrake_marl.extensions.report.paper_rows import is_papers_test, with_paper_rows
 from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap, learning_curve
 from ethbrake_marl.extensions.report.style import write_picture
@@ -47,7 +47,7 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
         tell(Progress(f"report{stage and ': '}{stage}", next(done), 2 + len(others)))
 
     is_papers = is_papers_test(evaluation.task, evaluation.seed)
-    rows = summarise_beside_paper(evaluation) if is_papers else experiment.rows
+    rows = with_paper_rows(experiment.rows) if is_papers else experiment.rows
     beside: dict[str, SummaryTable] = {}
     for other in others:  # the policy was trained on the scenario of the run alone
         begin(f"the same policy on {other.name}")
