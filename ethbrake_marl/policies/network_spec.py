@@ -20,27 +20,30 @@ PerhapsHidden = Annotated[tuple[Width, ...], Field(max_length=8)]
 
 
 class TensorRow(NamedTuple):
-    """One tensor: its name in a bundle, its shape, and its name in Stable-Baselines3's policy (PPO's or SAC's)."""
+    """One tensor of a bundle."""
 
     name: str
     shape: tuple[int, ...]
-    sb3_name: str
+
+    def inside(self, part: str) -> TensorRow:
+        """The same tensor, as one of a part of a larger policy."""
+        return self._replace(name=f"{part}.{self.name}")
 
 
 class NetworkSpec(FileModel):
-    """An actor, and perhaps a critic, both multilayer perceptrons on the same observation.
+    """The networks of a policy: an actor, and perhaps a critic, both multilayer perceptrons on the same observation.
 
-    The action is ``output(actor(observation))`` in [-1, 1]: ``clip`` cuts the actor's mean at the bounds (PPO's
-    Gaussian, whose noise is one number per action), ``tanh`` squashes it (SAC's Gaussian, whose noise is a second
-    head of the actor). Without ``value_hidden`` there is no critic: a policy needs none to act.
+    The action is ``output(actor(observation))`` in [-1, 1]. ``clip`` cuts the actor's mean at the bounds (PPO's
+    Gaussian, whose noise is one number per action). ``tanh`` squashes it (SAC's Gaussian, whose noise is a second head
+    of the actor). Without ``value_hidden`` there is no critic: a policy needs none to act.
 
-    With ``networks`` above 1 there are as many actors of this shape, and a gate with ``gate_hidden`` layers that gives
-    each a score: the actor of the highest score acts, the first of equal ones. The gate is asked at each decision and
-    remembers nothing. There is neither noise nor critic then.
+    ``networks`` above 1 is a mixture of experts: as many actors of this shape, and a gating network with
+    ``gate_hidden`` layers that scores them. The expert with the highest score acts, the first one if scores are equal.
+    The gating network is asked at every decision and has no memory. A mixture has neither noise nor critic.
 
-    With output ``choice`` the actor gives each of ``choices`` actions, evenly from -1 to 1, a score, and the action of
-    the highest one is taken, the lowest of equal ones. Again there is neither noise nor critic. Where it chooses
-    ``among`` whole policies, too, their scores come before those of the actions, and all see the same observation.
+    Output ``choice`` scores actions: ``choices`` of them, evenly from -1 to 1. The action with the highest score is
+    taken, the lowest one if scores are equal. There is neither noise nor critic. The actor may also score whole
+    policies, ``among``; their scores come before the actions', and all see the same observation.
     """
 
     observation_size: Annotated[int, Field(ge=1, le=4096)]
@@ -95,48 +98,33 @@ class NetworkSpec(FileModel):
 
     @property
     def tensors(self) -> tuple[TensorRow, ...]:
-        """Every tensor, all float32; weights are [outputs, inputs] as in ``y = W x + b``.
-
-        The training library counts activations too, so the index of its layers is twice ours.
-        """
-
-        def layer(name: str, sb3_name: str, inputs: int, outputs: int) -> list[TensorRow]:
-            return [
-                TensorRow(f"{name}.weight", (outputs, inputs), f"{sb3_name}.weight"),
-                TensorRow(f"{name}.bias", (outputs,), f"{sb3_name}.bias"),
-            ]
-
-        def network(name: str, sb3_name: str, hidden: tuple[int, ...], sb3_head: str, outputs: int) -> list[TensorRow]:
-            sizes = [self.observation_size, *hidden]
-            layers = [layer(f"{name}.{k}", f"{sb3_name}.{2 * k}", sizes[k], sizes[k + 1]) for k in range(len(hidden))]
-            return [*chain(*layers), *layer(f"{name}.output", sb3_head, sizes[-1], outputs)]
-
-        hidden, actions = self.policy_hidden, self.action_size
+        """Every tensor of a bundle, all float32. Weights are [outputs, inputs] as in ``y = W x + b``."""
+        actors = [row for name in self.actors for row in self._network(name, self.policy_hidden, self._outputs)]
         if self.networks > 1:
-            gate = network(
-                "gate", "gate.average", self.gate_hidden, f"gate.average.{2 * len(self.gate_hidden)}", self.networks
-            )
-            actors = [
-                network(name, f"members.{m}.mlp_extractor.policy_net", hidden, f"members.{m}.action_net", actions)
-                for m, name in enumerate(self.actors)
-            ]
-            return (*chain(*actors), *gate)
+            return (*actors, *self._network("gate", self.gate_hidden, self.networks))
         if self.choices is not None:
-            scores = len(self.among) + self.choices
-            chooser = network("policy", "average", hidden, f"average.{2 * len(hidden)}", scores)
-            for m, each in enumerate(self.among, 1):
-                named = ((f"among_{m}.{row.name}", row.shape) for row in each.tensors)
-                chooser += [TensorRow(name, shape, name.replace(".", "_")) for name, shape in named]
-            return tuple(chooser)
+            among = (row.inside(f"among_{m}") for m, each in enumerate(self.among, 1) for row in each.tensors)
+            return (*actors, *among)
         if self.output == "clip":
-            rows = network("policy", "mlp_extractor.policy_net", hidden, "action_net", actions)
-            rows.append(TensorRow("policy.log_std", (actions,), "log_std"))
+            actors.append(TensorRow("policy.log_std", (self.action_size,)))
         else:
-            rows = network("policy", "actor.latent_pi", hidden, "actor.mu", actions)
-            rows += layer("policy.log_std", "actor.log_std", hidden[-1], actions)
-        if self.value_hidden:
-            rows += network("value", "mlp_extractor.value_net", self.value_hidden, "value_net", 1)
-        return tuple(rows)
+            actors += _layer("policy.log_std", self.policy_hidden[-1], self.action_size)
+        critic = self._network("value", self.value_hidden, 1) if self.value_hidden else []
+        return (*actors, *critic)
+
+    @property
+    def _outputs(self) -> int:
+        """Outputs of each actor: actions, or scores."""
+        return self.action_size if self.choices is None else len(self.among) + self.choices
+
+    def _network(self, name: str, hidden: tuple[int, ...], outputs: int) -> list[TensorRow]:
+        sizes = [self.observation_size, *hidden]
+        layers = [_layer(f"{name}.{k}", sizes[k], sizes[k + 1]) for k in range(len(hidden))]
+        return [*chain(*layers), *_layer(f"{name}.output", sizes[-1], outputs)]
+
+
+def _layer(name: str, inputs: int, outputs: int) -> list[TensorRow]:
+    return [TensorRow(f"{name}.weight", (outputs, inputs)), TensorRow(f"{name}.bias", (outputs,))]
 
 
 Float32s = NDArray[np.float32]

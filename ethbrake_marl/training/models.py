@@ -15,7 +15,6 @@ from ethbrake_marl.policies.teams import PolicyTeam, Trained
 from ethbrake_marl.scenario.observed import Appended
 from ethbrake_marl.training.algorithm import Algorithm
 from ethbrake_marl.training.finite import refuse_gradients
-from ethbrake_marl.training.networks import tensors_of
 from ethbrake_marl.training.recipe import Scheme
 from ethbrake_marl.training.training import Training
 
@@ -32,7 +31,9 @@ class Learner(NamedTuple):
     def policies(self) -> Trained:
         """Copy the present weights into one policy for all learners, or into one for each."""
         actors = self.algorithm.actors(self.model)
-        return make_policies(self.training, self.model.num_timesteps, lambda k, network: tensors_of(actors[k], network))
+        return make_policies(
+            self.training, self.model.num_timesteps, lambda k, network: self.algorithm.tensors(actors[k], network)
+        )
 
 
 def make_environment(training: Training) -> EthBrakeVecEnv:

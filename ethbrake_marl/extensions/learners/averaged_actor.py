@@ -18,8 +18,8 @@ from ethbrake_marl.extensions.learners.optimizer import adam
 from ethbrake_marl.extensions.learners.scout import Scout
 from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
 from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.policies.network_spec import Float32s
-from ethbrake_marl.training.networks import ACTIVATIONS
+from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
+from ethbrake_marl.training.networks import ACTIVATIONS, sb3_names, tensors_of
 
 
 class Deterministic(BasePolicy):
@@ -36,6 +36,10 @@ class Deterministic(BasePolicy):
     def act(self, observation: Float32s) -> Float32s:
         """Its actions [rows] in [-1, 1]."""
         return np.clip(self.means(observation), -1.0, 1.0)
+
+    def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
+        """Copy the weights that drive under the names of a policy bundle with this network."""
+        return tensors_of(self, network)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> Tensor:
         found: Tensor = self.forward(observation)
@@ -80,8 +84,8 @@ class AveragedActor(Deterministic):
     def take_over(self, tensors: Mapping[str, Float32s]) -> None:
         """Begin with these tensors of a bundle."""
         state = self.state_dict()
-        for row in self._spec.tensors:
-            state[row.sb3_name].copy_(torch.from_numpy(tensors[row.name]))
+        for name, theirs in sb3_names(self._spec).items():
+            state[theirs].copy_(torch.from_numpy(tensors[name]))
         self._learn_from_average()
 
     @torch.no_grad()

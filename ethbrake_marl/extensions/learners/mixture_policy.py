@@ -16,11 +16,12 @@ from ethbrake_marl.extensions.learners.averaged_actor import AveragedActor, Dete
 from ethbrake_marl.extensions.learners.gating_network import AveragedGate
 from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
 from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.policies.network_spec import Float32s
+from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
+from ethbrake_marl.training.networks import tensors_of_layers
 
 
 class ModesPolicy(Deterministic):
-    """Several actors and a gate; under the names that ``NetworkSpec.tensors`` has for them."""
+    """Several actors and a gate; each decision is taken by the actor that the gate chooses."""
 
     def __init__(
         self, observation_space: Space[Any], action_space: Any, rate: Schedule, recipe: CounterfactualRecipe
@@ -45,6 +46,12 @@ class ModesPolicy(Deterministic):
 
     def expect(self, observation: Float32s) -> Floats:
         return self._chosen(observation, AveragedActor.expect)
+
+    def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
+        found = tensors_of_layers("gate", self.gate.average)
+        for name, actor in zip(network.actors, self.actors, strict=True):
+            found |= tensors_of_layers(name, nn.Sequential(*actor.mlp_extractor["policy_net"], actor.action_net))
+        return found
 
     def forward(self, observation: Tensor) -> Tensor:
         """Actions [rows, 1] of the averages."""

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.rollout_classification_model import OptionsModel
 from ethbrake_marl.extensions.learners.rollout_classification_recipe import OptionsRecipe
 from ethbrake_marl.extensions.learners.start_weights import padded
+from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
 from ethbrake_marl.training.algorithm import Algorithm
 from ethbrake_marl.training.training import Training
 
@@ -20,3 +23,8 @@ class Options(Algorithm):
         environment.engine.branch(environment.engine.moment())  # refuses what cannot be branched before it begins
         among = [padded(policy, training, "among") for policy in recipe.policies]
         return OptionsModel(environment, recipe, among)
+
+    def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
+        """Copy the average of the actor's weights, which drives."""
+        found: dict[str, Float32s] = actor.tensors(network)
+        return found

@@ -21,8 +21,8 @@ from ethbrake_marl.extensions.learners.scout import draw_rows
 from ethbrake_marl.physics.state import Floats, Ints
 from ethbrake_marl.policies.actor import Actor
 from ethbrake_marl.policies.layers import Layers
-from ethbrake_marl.policies.network_spec import Float32s
-from ethbrake_marl.training.networks import ACTIVATIONS
+from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
+from ethbrake_marl.training.networks import ACTIVATIONS, copy_of, tensors_of_layers
 
 
 class _TorchActor(Actor):
@@ -70,6 +70,7 @@ class ChoosingActor(Deterministic):
         self.optimizer = adam(rate(1.0), self.learning)
         spec = recipe.network_spec(inputs)
         tensors = {f"among_{m}.{name}": each[name] for m, each in enumerate(among, 1) for name in each}
+        self._among = tuple(tensors)
         for name, tensor in tensors.items():
             self.register_buffer(name.replace(".", "_"), torch.from_numpy(tensor))
         chooser = {row.name: np.zeros(row.shape, np.float32) for row in spec.tensors if row.name not in tensors}
@@ -93,6 +94,10 @@ class ChoosingActor(Deterministic):
     def forward(self, observation: Tensor) -> Tensor:
         """Actions [rows, 1] of the average."""
         return torch.from_numpy(self.act(observation.numpy()))[:, None]
+
+    def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
+        among = {name: copy_of(self.get_buffer(name.replace(".", "_"))) for name in self._among}
+        return {**tensors_of_layers("policy", self.average), **among}
 
     def remember(self, seen: Float32s, tried: Ints, more: Floats) -> None:
         """Keep decisions."""

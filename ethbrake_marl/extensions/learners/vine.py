@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch.optim import Optimizer
 
@@ -10,6 +12,7 @@ from ethbrake_marl.extensions.learners.mixture_model import ModesModel
 from ethbrake_marl.extensions.learners.start_weights import widened
 from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
 from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
+from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
 from ethbrake_marl.policies.shipped import load_named_policy
 from ethbrake_marl.training.algorithm import Algorithm
 from ethbrake_marl.training.training import Training
@@ -31,6 +34,11 @@ class Counterfactual(Algorithm):
             first = model.policy.actors[0] if isinstance(model, ModesModel) else model.policy
             first.take_over(widened(policy, training))
         return model
+
+    def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
+        """Copy the averages of the actor's weights, which drive."""
+        found: dict[str, Float32s] = actor.tensors(network)
+        return found
 
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
         """The optimiser of the actor, or that of each network and of the gate."""
