@@ -42,6 +42,7 @@ class Experiment:
     agents: Mapping[str, Agent]  # baselines, the trained policy, and the same behind its shield
     evaluation: Evaluation
     rows: SummaryTable
+    list_seed: int  # of the evaluation's worlds
     harm_count: HarmCount  # that all agents minimise
     started: float  # s, of ``time.monotonic``
 
@@ -139,7 +140,7 @@ def run_experiment(
         write_per_world(per_world, evaluation, force=True)
         results = write_results(run.path, "results", rows, harm_count, per_world)
         tell(Progress("results", 1, 1))
-        experiment = Experiment(trained, agents, evaluation, rows, harm_count, started)
+        experiment = Experiment(trained, agents, evaluation, rows, list_seed, harm_count, started)
         made = [make(experiment, tell) for make in reports]
     tables = tuple(table for report in made for table in report.tables)
     notes = tuple(report.note for report in made)

@@ -1,18 +1,20 @@
-"""Keep the global random generators of a training apart from the caller's."""
+"""The global random generators, which Stable-Baselines3 uses: kept apart from the caller's, captured and restored."""
 
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 
 @contextmanager
 def own_random_state() -> Iterator[None]:
-    """Stable-Baselines3 seeds and uses the global generators: give them back as they were. One torch thread.
+    """Give the global generators back as they were. Inside, torch has one thread.
 
     A second thread makes a network this small 3 to 15 times slower as soon as another process wants a core.
     """
@@ -25,3 +27,28 @@ def own_random_state() -> Iterator[None]:
         np.random.set_state(states[1])  # noqa: NPY002
         torch.set_rng_state(states[2])
         torch.set_num_threads(states[3])
+
+
+def capture_generators() -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Numbers and arrays that hold the states of the generators of Python, NumPy and torch."""
+    state: Any = np.random.get_state(legacy=False)  # noqa: NPY002
+    version, python_state, gauss = random.getstate()
+    numbers = {
+        "numpy": [int(state["state"]["pos"]), int(state["has_gauss"]), float(state["gauss"])],
+        "python": [version, gauss],
+    }
+    arrays = {
+        "random.torch": torch.get_rng_state().numpy().copy(),
+        "random.numpy": np.array(state["state"]["key"], np.uint32),
+        "random.python": np.array(python_state, np.uint64),
+    }
+    return numbers, arrays
+
+
+def restore_generators(numbers: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Set the generators to the states that ``capture_generators`` returned."""
+    position, has_gauss, cached = numbers["numpy"]
+    np.random.set_state(("MT19937", arrays["random.numpy"], position, has_gauss, cached))  # noqa: NPY002
+    version, gauss = numbers["python"]
+    random.setstate((version, tuple(arrays["random.python"].tolist()), gauss))
+    torch.set_rng_state(torch.from_numpy(arrays["random.torch"].copy()))

@@ -79,11 +79,11 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
 def _drive_other_test(experiment: Experiment, test: Scenario) -> SummaryTable:
     """Evaluate the trained policy and its shield on another test."""
     evaluation = experiment.evaluation
-    worlds = test.sample(min(evaluation.worlds.n, MOST_WORLDS), evaluation.seed)
+    worlds = test.sample(min(evaluation.worlds.n, MOST_WORLDS), experiment.list_seed)
     agents = compared_agents(experiment.trained.policy, test, experiment.harm_count, BESIDE)
     with warnings.catch_warnings():  # the page says that the policy was not trained for this test
         warnings.simplefilter("ignore", Unfamiliar)
-        return summarise(evaluate(worlds, agents, scenario=test, seed=evaluation.seed))
+        return summarise(evaluate(worlds, agents, scenario=test, seed=experiment.list_seed))
 
 
 def write_figures(
