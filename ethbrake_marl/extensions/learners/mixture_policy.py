@@ -50,7 +50,9 @@ class ModesPolicy(Deterministic):
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
         found = tensors_of_layers("gate", self.gate.average)
         for name, actor in zip(network.actors, self.actors, strict=True):
-            found |= tensors_of_layers(name, nn.Sequential(*actor.mlp_extractor["policy_net"].children(), actor.action_net))
+            found |= tensors_of_layers(
+                name, nn.Sequential(*actor.mlp_extractor["policy_net"].children(), actor.action_net)
+            )
         return found
 
     def forward(self, observation: Tensor) -> Tensor:
