@@ -374,7 +374,9 @@ def _checked(source: Path | Document) -> TrainingRecipe:
     name = document.content.get("algorithm", "ppo") if isinstance(document.content, dict) else "ppo"
     if not isinstance(name, str) or name not in ALGORITHMS:
         where, right = document.where(("algorithm",)), f"one of {', '.join(ALGORITHMS)}"
-        raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: must be {right}")
+        absent = "; the package or extension that gives it is not installed"
+        ships = isinstance(source, Path) and source in TrainingRecipe.shipped().values()
+        raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: must be {right}{absent if ships else ''}")
     shipped = f"; every key is in the shipped recipe {name}" if name in TrainingRecipe.shipped() else ""
     model = ALGORITHMS[name][0]
     wording = _RecipeWording(model, f"it is needed{shipped}")
