@@ -23,18 +23,18 @@ from ethbrake_marl.training.networks import ACTIVATIONS, sb3_names, tensors_of
 
 
 class Deterministic(BasePolicy):
-    """A policy whose actions are its ``means``, cut at -1 and 1."""
+    """A policy without noise: its actions are its ``means``, cut at -1 and 1."""
 
     def means(self, observation: Float32s) -> Float32s:
-        """What the weights that learn say to observations [rows, F], [rows]; beyond -1 and 1 it means -1 and 1."""
+        """Outputs [rows] of the weights that learn for observations [rows, F], before they are cut."""
         raise NotImplementedError
 
     def expect(self, observation: Float32s) -> Floats:
-        """The size of the gradient that is to be expected, [rows]."""
+        """Expected size of the gradient, [rows]."""
         raise NotImplementedError
 
     def act(self, observation: Float32s) -> Float32s:
-        """Its actions [rows] in [-1, 1]."""
+        """Actions [rows] in [-1, 1]."""
         return np.clip(self.means(observation), -1.0, 1.0)
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
@@ -49,7 +49,7 @@ class Deterministic(BasePolicy):
 class AveragedActor(Deterministic):
     """An actor that learns (``learning``), and the running average of its weights, which drives.
 
-    The average stands under the names of Stable-Baselines3's PPO, as a bundle wants it.
+    The average has the names of Stable-Baselines3's PPO.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class AveragedActor(Deterministic):
                 nn.init.zeros_(layer.bias)
         nn.init.orthogonal_(self.action_net.weight, 0.01)
         nn.init.constant_(self.action_net.bias, shape.initial_action or 0.0)
-        # of the bundle: the actor itself never explores
+        # a bundle has it; the actor itself never explores
         self.log_std = nn.Parameter(torch.full((1,), -3.0), requires_grad=False)
         last = nn.Linear(hidden[-1], 1)
         self.learning = nn.Sequential(*create_mlp(inputs, -1, hidden, activation), last)
@@ -82,7 +82,7 @@ class AveragedActor(Deterministic):
             learns.copy_(mean)
 
     def take_over(self, tensors: Mapping[str, Float32s]) -> None:
-        """Begin with these tensors of a bundle."""
+        """Take over the tensors of a bundle."""
         state = self.state_dict()
         for name, theirs in sb3_names(self._spec).items():
             state[theirs].copy_(torch.from_numpy(tensors[name]))

@@ -9,7 +9,7 @@ from ethbrake_marl.training.recipe import Fraction, Layers, NonNegative, Positiv
 
 
 class Shares(FileModel):
-    """Of all updates, the share of each stage; together they are 1."""
+    """Share of all updates that each stage has, 1 in all."""
 
     alone: Fraction  # the first network, in all worlds
     further: Fraction  # each of the others in the worlds of its own mode, one after the other
@@ -25,7 +25,7 @@ class Shares(FileModel):
 
 
 class ModesPlan(FileModel):
-    """How many networks, how the worlds of each further one are found, and how the gate between them learns."""
+    """How many experts, how the worlds of each further expert are chosen, and how the gating network learns."""
 
     networks: int = Field(ge=2, le=16, description="how many")
     gate: Layers = Field(description="hidden layers of the gate")

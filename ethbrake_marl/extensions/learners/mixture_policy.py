@@ -21,7 +21,7 @@ from ethbrake_marl.training.networks import tensors_of_layers
 
 
 class ModesPolicy(Deterministic):
-    """Several actors and a gate; each decision is taken by the actor that the gate chooses."""
+    """A mixture of experts: the gating network chooses the actor that takes a decision."""
 
     def __init__(
         self, observation_space: Space[Any], action_space: Any, rate: Schedule, recipe: CounterfactualRecipe
@@ -34,7 +34,7 @@ class ModesPolicy(Deterministic):
         self.gate = AveragedGate(flatdim(observation_space), rate, recipe)
 
     def _chosen(self, observation: Float32s, ask: Callable[[AveragedActor, Float32s], NDArray[Any]]) -> Floats:
-        """What the actors answer where the gate chooses them, [rows]."""
+        """Answer [rows] of the actor that the gating network chooses for each row."""
         chosen, found = self.gate.choose(observation), np.empty(len(observation))
         for number, actor in enumerate(self.actors):
             rows = np.flatnonzero(chosen == number)
@@ -56,6 +56,6 @@ class ModesPolicy(Deterministic):
         return found
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Actions [rows, 1] of the averages."""
+        """Actions [rows, 1] of the average weights."""
         chosen = self.gate.average(observation).argmax(dim=1, keepdim=True)
         return torch.cat([actor(observation) for actor in self.actors], dim=1).gather(1, chosen)

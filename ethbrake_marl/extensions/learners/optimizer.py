@@ -11,7 +11,7 @@ from torch.optim import Optimizer
 
 
 class Adam(torch.optim.Adam):
-    """torch's, to the bit, without what imports torch's compiler (1 to 3 CPU-s), which has nothing to do here."""
+    """torch's Adam, to the bit, without its decorators, which import torch's compiler (1 to 3 CPU-s)."""
 
 
 for _name in ("step", "add_param_group", "zero_grad", "state_dict", "load_state_dict"):
@@ -19,7 +19,7 @@ for _name in ("step", "add_param_group", "zero_grad", "state_dict", "load_state_
 
 
 def adam(rate: float, *networks: nn.Module | None) -> Adam:
-    """An optimiser of all weights of these networks."""
+    """An optimiser for all weights of these networks."""
     return Adam([weight for each in networks if each is not None for weight in each.parameters()], lr=rate, eps=1e-5)
 
 
@@ -33,6 +33,6 @@ def descend(optimizer: Optimizer, *losses: Tensor) -> None:
 
 @torch.no_grad()
 def follow(average: Iterable[Tensor], learning: nn.Module, keep: float) -> None:
-    """Move an average of weights towards the weights that learn, keeping this share of what it was."""
+    """Move the average of weights towards the weights that learn. It keeps a share ``keep`` of itself."""
     for mean, learns in zip(average, learning.parameters(), strict=True):
         mean.lerp_(learns, 1.0 - keep)

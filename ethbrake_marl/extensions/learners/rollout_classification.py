@@ -1,4 +1,7 @@
-"""Options: several actions are tried at a decision, and the actor learns to choose the one that costs least."""
+"""The algorithm rollout classification: try several actions at a decision, learn to choose the one that costs least.
+
+Lagoudakis and Parr 2003. Recipes call it ``algorithm: options``.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +17,10 @@ from ethbrake_marl.training.training import Training
 
 
 class Options(Algorithm):
-    """Policy iteration by what actions cost in closed loop; one actor for all learners."""
+    """Rollout classification, with one actor for all learners."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> OptionsModel:
-        """The model, from random weights and full braking."""
+        """The model, which at first brakes fully, or takes the first policy ``among``."""
         recipe = training.recipe
         assert isinstance(recipe, OptionsRecipe)
         environment.engine.branch(environment.engine.moment())  # refuses what cannot be branched before it begins
@@ -25,6 +28,6 @@ class Options(Algorithm):
         return OptionsModel(environment, recipe, among)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Copy the average of the actor's weights, which drives."""
+        """Copy the running average of the weights."""
         found: dict[str, Float32s] = actor.tensors(network)
         return found

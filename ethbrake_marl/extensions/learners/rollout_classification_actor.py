@@ -26,7 +26,7 @@ from ethbrake_marl.training.networks import ACTIVATIONS, copy_of, tensors_of_lay
 
 
 class _TorchActor(Actor):
-    """The actor of a bundle, three times as fast, to other last bits."""
+    """``Actor`` with torch's products: three times as fast, with other last bits."""
 
     @torch.no_grad()
     def _forward(self, layers: Layers, x: Float32s) -> Float32s:
@@ -40,15 +40,17 @@ class _TorchActor(Actor):
 
 
 class ChoosingActor(Deterministic):
-    """An actor that scores actions (``learning``), the average of its weights (``average``), which drives, and what it
-    remembers: the last decisions at which actions were tried, and how much more than the best one each of them costs.
+    """An actor that scores actions, and a memory of what actions cost.
+
+    The weights ``learning`` learn; their running ``average`` drives. The memory holds the last decisions at which
+    actions were tried, and how much more than the best one each action costs.
     """
 
     seen: Tensor  # [M, F]
-    tried: Tensor  # [M, C] numbers of actions, the one that was taken first
+    tried: Tensor  # [M, C] numbers of actions; the first one was taken
     more: Tensor  # [M, C]
     known: Tensor  # [1] decisions so far; the newest take the places of the oldest
-    usual: Tensor  # [members] what the best action tried costs on average in each scenario of a mixture; 0: not known
+    usual: Tensor  # [members] average cost of the best action tried in each scenario of a mixture; 0: not known
 
     def __init__(
         self,
@@ -83,7 +85,7 @@ class ChoosingActor(Deterministic):
 
     @torch.no_grad()
     def choose(self, observation: Float32s) -> Ints:
-        """Numbers of its actions [rows] for observations [rows, F]."""
+        """Numbers of the actions to take [rows] for observations [rows, F]."""
         chosen: Ints = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen
 
@@ -100,14 +102,14 @@ class ChoosingActor(Deterministic):
         return {**tensors_of_layers("policy", self.average), **among}
 
     def remember(self, seen: Float32s, tried: Ints, more: Floats) -> None:
-        """Keep decisions."""
+        """Add decisions to the memory."""
         places = torch.arange(int(self.known), int(self.known) + len(seen)) % len(self.seen)
         self.seen[places], self.tried[places] = torch.from_numpy(seen), torch.from_numpy(tried)
         self.more[places] = torch.from_numpy(more.astype(np.float32))
         self.known += len(seen)
 
     def draw(self, batches: int, count: int, focus: float) -> Iterator[tuple[Tensor, Tensor]]:
-        """Some of the kept decisions for each step, and what each of them counts; ``focus`` as for ``draw_rows``."""
+        """Draw remembered decisions for each step, and how much each counts; ``focus`` as in ``draw_rows``."""
         known = min(int(self.known), len(self.seen))
         if focus == 0.0 or batches == 0:
             for _ in range(batches):
@@ -119,10 +121,10 @@ class ChoosingActor(Deterministic):
             yield torch.from_numpy(rows[part]), torch.from_numpy(importance[part])
 
     def loss(self, some: Tensor, importance: Tensor, guide: float) -> Tensor:
-        """Of some of the kept decisions: the expected cost of choosing with the chances of a softmax of the scores.
+        """Expected cost, in some remembered decisions, of choosing at random by a softmax of the scores.
 
-        Where the chances are nearly 0 or 1 this has no slope. So ``guide`` times a convex loss is added: each action
-        that is not the best should have a lower score, the more so the more it costs.
+        It has no slope if the chances are nearly 0 or 1. So ``guide`` times a convex loss is added, which lowers the
+        score of every action but the best, more for an action that costs more.
         """
         more = self.more[some]
         scores = self.learning(self.seen[some]).gather(1, self.tried[some])

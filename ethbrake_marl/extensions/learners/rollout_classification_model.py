@@ -28,7 +28,7 @@ LEAST_USUAL = 0.1  # m2/s2: a scenario with next to no harm counts no more than 
 
 
 class OptionsModel(CounterfactualModel):
-    """Visits decisions by its actor, tries several actions at some of them, and learns what each costs."""
+    """Visit decisions by the actor, try several actions at some of them, and learn what each costs."""
 
     policy: ChoosingActor  # type: ignore[assignment]
     recipe: OptionsRecipe  # type: ignore[assignment]
@@ -71,9 +71,9 @@ class OptionsModel(CounterfactualModel):
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
 
     def _try_actions(self, seen: Float32s, moments: State) -> tuple[Float32s, Ints, Floats]:
-        """At some decisions: what is seen [B, F], numbers of the actions tried [B, C], and what each costs [B, C].
+        """Try actions at some decisions. Return observations [B, F], numbers of the actions [B, C], and costs [B, C].
 
-        The first one is the one that the actor takes. ``caution`` is part of the costs.
+        The first action is the one that the actor takes. ``caution`` is part of the costs.
         """
         recipe, actor, learners = self.recipe, self.policy, len(self.engine.learners)
         observed, first, last = seen.reshape(-1, seen.shape[2]), actor.first, recipe.network.choices - 1
@@ -128,7 +128,7 @@ class OptionsModel(CounterfactualModel):
         return observed[rows], tried, costs
 
     def _usual(self, rows: Ints, least: Floats) -> Floats:
-        """What decisions [B] of these rows usually cost in their scenarios [B], to which these costs are added."""
+        """Usual cost of a decision in the scenario of each row [B], updated by the ``least`` costs [B]."""
         numbers = self._numbers[rows]
         first = int(numbers.min())
         drawn = members_of(

@@ -29,7 +29,7 @@ class ChoosingShape(Shape):
     choices: int = Field(ge=2, le=4096, description="how many actions, evenly from -1 to 1, the network scores")
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """The actor, which takes the action of the highest score."""
+        """The actor, which takes the action with the highest score."""
         return super().spec(observation_size, output="choice", choices=self.choices, **more)
 
 
@@ -39,9 +39,9 @@ PolicyName = Annotated[str, Field(pattern=r"^[a-z]+@.+$", max_length=4096)]
 class OptionsRecipe(TrainingRecipe):
     """Try ``tried`` of the ``n_envs x n_steps`` decisions of a round with several actions each; learn to choose.
 
-    The actions of the policy are ``network.choices``, evenly from -1 to 1, and those of the policies ``among`` which it
-    chooses too. Tried are the one that it takes, one below and one above it in each of the distances ``near``, the
-    actions ``fixed``, and ``drawn`` ones: of the policies, or of the actions where there are none.
+    The policy chooses between ``network.choices`` actions, evenly from -1 to 1, and the policies ``among``. At each
+    decision it tries the action that it takes, one below and one above it in each of the distances ``near``, the
+    actions ``fixed``, and ``drawn`` ones: policies, or actions if there are no policies.
     """
 
     most_decisions = 2**22
@@ -116,20 +116,20 @@ class OptionsRecipe(TrainingRecipe):
 
     @property
     def others(self) -> int:
-        """How many actions are tried beside the one that the policy takes."""
+        """Number of actions tried beside the one that the policy takes."""
         return 2 * len(self.near) + len(self.fixed) + self.drawn
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """The actor, with the policies among which it chooses."""
+        """The actor, with the policies that it may choose."""
         several = {"observation_size": observation_size, "value_hidden": ()}
         among = tuple(each.manifest.network.model_copy(update=several) for each in self.policies)
         return self.network.spec(observation_size, among=among)
 
     @cached_property
     def policies(self) -> tuple[Policy, ...]:
-        """Those among which it chooses, read once; raises ``InvalidInput`` naming one that cannot be taken.
+        """The policies ``among``, read once; raises ``InvalidInput`` naming one that cannot be used.
 
-        One that itself chooses among policies stands for those.
+        A policy that itself chooses among policies is replaced by those.
         """
         found: list[Policy] = []
         for name in self.among:

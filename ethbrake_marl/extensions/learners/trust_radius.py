@@ -10,20 +10,20 @@ from ethbrake_marl.policies.network_spec import Float32s
 
 
 class Tried(NamedTuple):
-    """Decisions that were tried in two ways, and what that brought."""
+    """Decisions that were tried in two ways, and the measured gradients."""
 
     seen: Float32s  # [B, F]
-    mean: Float32s  # [B] what the actor said; beyond -1 and 1 it means -1 and 1
-    gradient: Float32s  # [B] of the return by the action
-    importance: Float32s  # [B] what each counts
+    mean: Float32s  # [B] the actor's output; its action is cut at -1 and 1
+    gradient: Float32s  # [B] of the return with respect to the action
+    importance: Float32s  # [B] how much each decision counts
 
 
 def trusted_targets(tried: Tried, radius: float, anchor: float) -> tuple[Float32s, Float32s]:
-    """Where the means [B] should go, and how much that weighs [B]: ``m + g / w`` with ``w = |g| / radius + anchor``.
+    """Targets [B] for the actor's means, and their weights [B]: ``m + g / w`` with ``w = |g| / radius + anchor``.
 
-    Half the weighted squared distance from there is, up to a constant, ``-g (mu - m) + w (mu - m)^2 / 2``: the exact
-    slope, and a curvature with which nothing moves farther than the radius, however large its gradient. A mean at or
-    beyond a bound is not asked to go farther out, where its action would not change.
+    Half the weighted squared distance to the target is ``-g (mu - m) + w (mu - m)^2 / 2`` up to a constant. Its slope
+    at ``m`` is exact, and its minimum is at most one radius away, however large the gradient. A mean at or beyond a
+    bound is not moved farther out, because its action would not change.
     """
     outward = ((tried.mean >= 1.0) & (tried.gradient > 0.0)) | ((tried.mean <= -1.0) & (tried.gradient < 0.0))
     gradient = tried.gradient.copy()

@@ -1,4 +1,8 @@
-"""``vine``: gradients of the return from branches of the same moment, played on in two ways."""
+"""The algorithm ``vine``: gradients of the return, measured by playing on from the same moment in two ways.
+
+Vine is the sampling of Schulman et al. 2015 (TRPO): branches from visited states with common random numbers. Recipes
+call it ``algorithm: counterfactual``.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +23,10 @@ from ethbrake_marl.training.training import Training
 
 
 class Counterfactual(Algorithm):
-    """Gradients of the return by playing on from the same moment in two ways; one actor for all learners."""
+    """Vine, with one actor for all learners, or a mixture of experts for one."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> CounterfactualModel:
-        """The model, from the policy of the training's ``start`` if it has one."""
+        """The model, with the weights of the policy to start from, or random ones."""
         recipe = training.recipe
         assert isinstance(recipe, CounterfactualRecipe)
         environment.engine.branch(environment.engine.moment())  # refuses what cannot be branched before it begins
@@ -36,12 +40,12 @@ class Counterfactual(Algorithm):
         return model
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Copy the averages of the actor's weights, which drive."""
+        """Copy the running averages of the weights."""
         found: dict[str, Float32s] = actor.tensors(network)
         return found
 
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
-        """The optimiser of the actor, or that of each network and of the gate."""
+        """The optimiser of the actor, or of each expert and of the gating network."""
         if not isinstance(model, ModesModel):
             return {"policy": model.policy.optimizer}
         members = {f"network_{k + 1}": actor.optimizer for k, actor in enumerate(model.policy.actors)}
