@@ -65,8 +65,9 @@ if TYPE_CHECKING:
 
     # Shields: for any interface, and one for each
     from ethbrake_marl.shield.wrappers import shield as shield
-    from ethbrake_marl.shield.members import ShieldReason as ShieldReason
-    from ethbrake_marl.shield.options import ShieldMode as ShieldMode, ShieldOptions as ShieldOptions
+    from ethbrake_marl.shield.reasons import ShieldReason as ShieldReason
+    from ethbrake_marl.shield.contract import ShieldMode as ShieldMode
+    from ethbrake_marl.shield.options import ShieldOptions as ShieldOptions
     from ethbrake_marl.shield.wrappers import (
         HybridShield as HybridShield,
         ShieldedEnv as ShieldedEnv,
@@ -78,18 +79,15 @@ if TYPE_CHECKING:
     # Training
     from ethbrake_marl.training.recipe import TrainingRecipe as TrainingRecipe, load_recipe as load_recipe
     from ethbrake_marl.training.session import TrainResult as TrainResult, resume as resume, train as train
-    from ethbrake_marl.errors import Progress as Progress
+    from ethbrake_marl.progress import Progress as Progress
 
     # Evaluation
     from ethbrake_marl.evaluation.evaluation import Evaluation as Evaluation
     from ethbrake_marl.evaluation.outcome import Outcome as Outcome
     from ethbrake_marl.evaluation.record import EpisodeRecord as EpisodeRecord, record_episode as record_episode
     from ethbrake_marl.evaluation.rollout import evaluate as evaluate
-    from ethbrake_marl.evaluation.summary import (
-        SummaryRow as SummaryRow,
-        SummaryTable as SummaryTable,
-        summarise as summarise,
-    )
+    from ethbrake_marl.evaluation.summary import SummaryTable as SummaryTable, summarise as summarise
+    from ethbrake_marl.evaluation.summary_row import SummaryRow as SummaryRow
     from ethbrake_marl.evaluation.comparison import compare_results as compare_results
     from ethbrake_marl.evaluation.per_world import read_result as read_result
     from ethbrake_marl.evaluation.groups import summarise_by as summarise_by

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
-import threading
 import traceback
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from difflib import get_close_matches
 from importlib.util import find_spec
 from numbers import Integral
-from types import FrameType
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-
 _NAMED = 5  # failed worlds that a message names one by one
+
 LINE_LIMIT = 1_500  # characters of a message; of a longer one the beginning and the end are shown
+
 _KEPT_BEGINNING, _KEPT_END = 1_000, 400
 
 
@@ -251,102 +248,3 @@ def check_one_learner(scenario: str, learners: Sequence[str], advice: str) -> No
         raise InvalidInput(
             f"scenario {scenario!r} has {len(learners)} learners ({', '.join(learners) or 'none'}); {advice}"
         )
-
-
-# Progress of a long piece of work, for those who asked to be told.
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """``done`` of ``total`` of the part called ``name``.
-
-    Of a training ``done`` counts decisions of learners, and ``total`` is what they come to in whole updates.
-
-    >>> import ethbrake_marl as eb
-    >>> eb.Progress("full_brake", 500, 1000)
-    Progress(name='full_brake', done=500, total=1000, metrics={}, note='', updates=0, wall_s=0.0)
-
-    """
-
-    name: str  # "training", an agent that drives, "figures", ...
-    done: int  # worlds, or decisions of learners
-    total: int  # the same when it is done
-    metrics: Mapping[str, float] = field(default_factory=dict)  # of a policy while it is trained: its last evaluation
-    note: str = ""  # to be told once
-    updates: int = 0  # of a training
-    wall_s: float = 0.0  # of a training
-    objective: str = field(default="", repr=False)  # what ``metrics["objective"]`` is, in words
-
-    @property
-    def harm(self) -> str:
-        """The harm that a training is for, in words: that of ``metrics`` which stands first; empty without one."""
-        if self.objective and "objective" in self.metrics:
-            return f"{self.objective} {self.metrics['objective']:.2f}"
-        words = {"first_impact_harm": "first-impact harm", "total_harm": "total harm"}
-        told = [f"{words[key]} {value:.2f}" for key, value in self.metrics.items() if key in words]
-        return ", ".join(told[:1])
-
-    @staticmethod
-    def listener(told: Told) -> OnProgress | None:
-        """The function to tell; for ``show`` one that writes on stderr."""
-        return ShownProgress() if told == "show" else told
-
-
-OnProgress = Callable[[Progress], None]
-
-Told = OnProgress | Literal["show"] | None
-"""Who is told how far a training is: a function, stderr (``show``), or nobody."""
-
-
-class ShownProgress:
-    """Shows on stderr how far a training is: on a terminal in one line, else one for each tenth and evaluation."""
-
-    def __init__(self) -> None:
-        self._terminal = sys.stderr.isatty()
-        self._last: tuple[str, int] | None = None  # harm and tenth of the last line
-
-    def __call__(self, progress: Progress) -> None:
-        """Show it, if it is news."""
-        ended, harm = progress.done >= progress.total, progress.harm
-        news = (harm, 10 * progress.done // max(progress.total, 1))
-        if not (self._terminal or progress.note or news != self._last):
-            return
-        self._last = news
-        text = f"{progress.name}: {progress.done:,} of {progress.total:,}"
-        text += f", {harm}" if harm else ""
-        text += f"; {progress.note}" if progress.note else ""
-        sys.stderr.write(f"\r{text}\x1b[K{chr(10) if ended else ''}" if self._terminal else f"{text}\n")
-        sys.stderr.flush()
-
-
-# Ctrl-C and SIGTERM as a question that is asked between two steps, in the place of an exception inside one.
-
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-
-@contextmanager
-def stop_on_signal() -> Iterator[Callable[[], bool]]:
-    """Give a function that says whether to stop; the second signal acts as if nobody listened.
-
-    Outside the main thread, where Python delivers no signals, the function always says no.
-    """
-    asked = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield asked.is_set
-        return
-    before = {number: signal.getsignal(number) for number in _SIGNALS}
-
-    def listen(number: int, frame: FrameType | None) -> None:
-        asked.set()
-        restore()
-
-    def restore() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-    try:
-        for number in _SIGNALS:
-            signal.signal(number, listen)
-        yield asked.is_set
-    finally:
-        restore()

@@ -15,7 +15,8 @@ from ethbrake_marl.physics.forecast import forecast
 from ethbrake_marl.physics.left_out import leaving_out_failed
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shield.members import Backup, begin_running, certify
+from ethbrake_marl.shield.certify import Backup, certify
+from ethbrake_marl.shield.running import begin_running
 from ethbrake_marl.shield.step import StepShield
 from tests.failing_worlds import plant, planted_list, without
 

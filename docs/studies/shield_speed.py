@@ -13,10 +13,11 @@ import numpy as np
 
 from ethbrake_marl.agents.driving import episode_engine
 from ethbrake_marl.evaluation.lineup import make_agents
+from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.shield.certify import certify
 from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.members import certify
 from ethbrake_marl.shield.step import StepShield
 
 SCENARIO = load_scenario("paper-random")
@@ -24,7 +25,7 @@ SCENARIO = load_scenario("paper-random")
 
 def batch_rate(intervals: str | None, n: int) -> tuple[float, int]:
     """Decisions per second of a batch under random proposals, and the members of each world."""
-    shield = StepShield(SCENARIO, 1, uncertainty=None if intervals is None else parse_uncertainty(intervals))
+    shield = RobustShield(SCENARIO, 1, uncertainty=None if intervals is None else parse_uncertainty(intervals))
     shield.begin(SCENARIO.sample(n, 3).worlds, np.arange(n))
     rng = np.random.default_rng(0)
     shield.decide(rng.uniform(-1.0, 1.0, n))

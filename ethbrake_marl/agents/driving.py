@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent, Driver, Team
-from ethbrake_marl.agents.registry import make_role
+from ethbrake_marl.agents.registry import around_one_vehicle, make_role
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.memory import Memory
 from ethbrake_marl.errors import InvalidInput, PhysicsError
@@ -72,10 +72,11 @@ def episode_engine(worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: i
     drivers = team.drivers
     undriven = [scenario.vehicle_names[i] for i in scenario.learners if i not in drivers]
     if undriven:
+        for_one = ", ".join(f"+{name}" for name in around_one_vehicle())
         raise InvalidInput(
             f"agent {team.name!r} drives {', '.join(scenario.vehicle_names[i] for i in drivers) or 'nobody'}, but"
             f" {', '.join(undriven)} of scenario {scenario.name!r} must be driven too. An agent that rolls itself out"
-            " (+search, +episode, +robust) can drive one learner, the others need scripts"
+            f" ({for_one}) can drive one learner, the others need scripts"
         )
     scripts = script_agents(scenario, except_for=drivers)
     shield = team.shield

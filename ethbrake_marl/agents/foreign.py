@@ -297,6 +297,10 @@ class PolicyAgent:
         self._infer, self._initial_state, self._clip = infer, initial_state, clip
         self._more = more  # what stands behind the own observation
 
+    def policy_sha256(self) -> str | None:
+        """Hash of the policy's weights as they are now; None where they cannot be found."""
+        return self.weights_sha256()
+
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         """No decision was made yet; the policy's own state is the initial one."""
         n, state = alert.n, None

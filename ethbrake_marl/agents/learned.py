@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Source
+from ethbrake_marl.agents.protocol import ByPolicy, Source
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.actions import action_to_command
 from ethbrake_marl.game.observations import Observations, ObservationSpec, observe
@@ -28,7 +28,7 @@ class LearnedPolicy(Protocol):
         ...
 
 
-class LearnedAgent:
+class LearnedAgent(ByPolicy):
     """Drives one vehicle by a policy's deterministic action; holds no state between steps.
 
     >>> import ethbrake_marl as eb

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from enum import StrEnum
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -144,7 +144,32 @@ def fixed_commands(
     return command
 
 
-class AgentAround:
+class ByPolicy:
+    """Base of what drives by a ``policy``, or is around an agent that does: it says which policy that is."""
+
+    policy: Any
+
+    def policy_sha256(self) -> str | None:
+        """Hash of the policy; None where no policy drives, or none that says its hash."""
+        return policy_sha256(self.policy)
+
+    @property
+    def manifest(self) -> Any:
+        """Manifest of the policy; None without one."""
+        return getattr(self.policy, "manifest", None)
+
+
+def policy_sha256(agent: object) -> str | None:
+    """Hash of the policy that an agent drives by, inside whatever is around it; None without one.
+
+    A policy bundle's is the hash in its manifest, which binds names, network and weights. A policy of another library
+    has the hash of its weights.
+    """
+    ask = getattr(agent, "policy_sha256", None)
+    return ask() if callable(ask) else None
+
+
+class AgentAround(ByPolicy):
     """Base of agents that are put around a ``policy``, which is any agent: each says only what it does differently.
 
     ``adds`` is what it knows beside what the policy knows. Without a memory of its own it has that of the policy.

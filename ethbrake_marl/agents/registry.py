@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,10 +27,10 @@ from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.roles import ScriptSpec
 from ethbrake_marl.scenario.schema import Scenario
 
-# The grammar of agents: ``name[:argument][@policy]``, and behind it what is put around that agent.
+# The grammar of agents: ``name[:argument][:variant][@policy]``, and behind it what is put around that agent.
 #
-# ``+search`` comes first, then one shield: ``+episode``, ``+episode:pairwise``, ``+step`` or ``+robust``, each also
-# with ``:believed`` behind it. A name may be a function of a Python file, ``my_file.py:make_agent``.
+# ``+search`` comes first, then one shield, for instance ``+episode:pairwise`` or ``+step``. A shield has variants, too.
+# A name may be a function of a Python file, ``my_file.py:make_agent``.
 #
 # Each of ``, + @ :`` may stand in a path, too. A path that exists wins: what stands in it separates nothing.
 
@@ -190,9 +190,8 @@ class AgentSettings:
     harm_count: HarmCount = "first"  # which harm an optimising agent minimises
     horizon_s: float = HORIZON_S  # until when it looks ahead
     most_candidates: int | None = None  # of a search, whatever its argument says; None: what that says
-    uncertainty: object = None  # what a shield does not know; read and checked by the shield that takes it
+    uncertainty: object = None  # what a shield around it does not know of the worlds, as that shield reads it
     time_step_s: float = 0.1  # between two decisions
-    believes: bool = False  # ``:believed`` stood behind the argument: it decides on what was received
     role: int | None = None  # index of the vehicle whose role it is; None: a driver, whichever vehicles it drives
 
     def needed_scenario(self) -> Scenario:
@@ -215,6 +214,7 @@ Wrapper = Callable[[Any, str | None, AgentSettings], Driver]
 class Entry:
     """One line of the registry."""
 
+    name: str
     form: str  # how it is written; without ":" it takes no argument, without "@" no policy
     about: str  # one line
     knows: Source | Sequence[Source]  # while it drives; of what goes around an agent: what is added
@@ -222,6 +222,7 @@ class Entry:
     inner: bool = False  # of what goes around an agent: directly, inside a shield
     teams: bool = False  # likewise: around a team, too
     needs: Mapping[str, object] = field(default_factory=dict)  # settings that it cannot do without -> an example
+    options: type | None = None  # of a shield that also goes around environments: the class of its settings
 
     @property
     def is_ours(self) -> bool:
@@ -229,9 +230,14 @@ class Entry:
         return str(getattr(self.make, "__module__", "")).startswith("ethbrake_marl.") and self.make != make_from_file
 
     @property
+    def whole_form(self) -> str:
+        """How it is written, its variants included."""
+        return self.form + "".join(f"[:{variant}]" for variant in variants_of(self.name))
+
+    @property
     def words(self) -> tuple[str, ...]:
         """How what goes around an agent may be written behind the ``+``, where that is a list of words."""
-        name, *options = re.findall(r"[^\[\]+]+", self.form)
+        name, *options = re.findall(r"[^\[\]+]+", self.whole_form)
         found = [name]
         for option in options:
             found += [f"{each}{option}" for each in found]
@@ -244,11 +250,19 @@ class Entry:
 
     def call(self, argument: str | None, settings: AgentSettings, *inside: Driver) -> Driver:
         """What its function makes, of a wrapper around what is ``inside``."""
-        if "[:believed]" in self.form and argument is not None and f":{argument}".endswith(":believed"):
-            argument, settings = argument[: -len(":believed")] or None, replace(settings, believes=True)
         make: Any = self.make
+        before, _, last = (argument or "").rpartition(":")
+        if last in variants_of(self.name):
+            argument, make = before or None, _VARIANTS[f"{self.name}.{last}"].make
         made: Driver = make(*inside, argument, settings)
         return made
+
+
+class Variant(NamedTuple):
+    """A word behind an agent or a shield, after its argument, that makes another one of it."""
+
+    make: Factory | Wrapper
+    about: str  # one line
 
 
 def make_agent(
@@ -272,7 +286,7 @@ def make_agent(
         harm_count: which harm an optimising agent minimises, ``first`` or ``total``.
         horizon_s: until when it looks ahead, s; None: the scenario's horizon, or 8 s.
         most_candidates: for trying an agent out: no search of it takes more.
-        uncertainty: what a robust shield does not know, such as ``"gaps_m=0.5"``.
+        uncertainty: what a shield that certifies uncertain worlds does not know, such as ``"gaps_m=0.5"``.
         time_step_s: between two decisions of what searches or follows a law; None: the scenario's, or 0.1 s.
 
     Raises ``UnknownName`` with a suggestion for an unknown name, ``InvalidInput`` for a bad argument, harm count or
@@ -342,13 +356,14 @@ def find_entry(spec: AgentSpec | str) -> Entry:
     """
     written = parse_spec(spec) if isinstance(spec, str) else spec
     if written.file is not None:
-        return Entry(f"{written.name}[:ARGUMENT][@POLICY]", "your own", Source.UNSTATED, make_from_file)
+        form = f"{written.name}[:ARGUMENT][@POLICY]"
+        return Entry(written.name, form, "your own", Source.UNSTATED, make_from_file)
     if written.name not in _AGENTS:
         if written.name in group_names():
             raise InvalidInput(f"agent {written.core!r}: stands for several agents in --agents; here one is needed")
         raise _AGENTS.unknown(written.name, {*agent_names(), *group_names()})
     entry = _AGENTS[written.name]
-    if written.argument is not None and ":" not in entry.form:
+    if written.argument is not None and ":" not in entry.whole_form:
         raise InvalidInput(f"agent {written.core!r}: {written.name} takes no argument")
     if written.policy is not None and "@" not in entry.form:
         own = "" if entry.is_ours else "; register_agent(..., takes_policy=True) says that it does"
@@ -367,14 +382,23 @@ def agent_names() -> tuple[str, ...]:
 
 
 def agent_entries() -> tuple[Entry, ...]:
-    """All agents, and then all that can be put around one: those that can be loaded, which is done."""
-    agents = (entry for name, entry in _AGENTS.usable().items() if name != _PROFILE)
-    return (*agents, *_SHIELDS.usable().values())
+    """All agents, and then all that can be put around one, each with its variants: those that can be loaded."""
+    agents = [entry for name, entry in _AGENTS.usable().items() if name != _PROFILE]
+    return tuple(_with_variants(entry) for entry in (*agents, *_SHIELDS.usable().values()))
+
+
+def _with_variants(entry: Entry) -> Entry:
+    """The entry with the forms and texts of its variants, of those that can be loaded, for a list."""
+    usable = _VARIANTS.usable()
+    for word in variants_of(entry.name):
+        if variant := usable.get(f"{entry.name}.{word}"):
+            entry = replace(entry, form=f"{entry.form}[:{word}]", about=f"{entry.about}; {word}: {variant.about}")
+    return entry
 
 
 def agents_refused() -> list[str]:
-    """Why some of the installed agents and shields cannot be loaded."""
-    found = [each.why_not(name) for each in (_AGENTS, _SHIELDS) for name in each]
+    """Why some of the installed agents, shields and variants cannot be loaded."""
+    found = [each.why_not(name) for each in (_AGENTS, _SHIELDS, _VARIANTS) for name in each]
     return [reason for reason in found if reason is not None]
 
 
@@ -384,13 +408,40 @@ def around_forms() -> tuple[str, ...]:
 
 
 def shield_forms() -> tuple[str, ...]:
-    """The shields among that, without those that decide on what was received."""
-    return tuple(each for each in around_forms() if not (_around(each).inner or each.endswith(":believed")))
+    """The shields among that, without their variants."""
+    return tuple(each for each in around_forms() if not (_around(each).inner or is_variant(each)))
+
+
+def around_one_vehicle() -> list[str]:
+    """The names of all that goes around an agent but not around a team: first what goes inside a shield."""
+    return [entry.name for inner in (True, False) for entry in _SHIELDS.usable().values()
+            if entry.inner is inner and not entry.teams]  # fmt: skip
+
+
+def shield_names() -> tuple[str, ...]:
+    """The names of all that goes around an agent; nothing is loaded."""
+    return tuple(_SHIELDS)
+
+
+def shield_settings(name: object) -> type | None:
+    """The class of settings of a shield that also goes around environments; None for any other name."""
+    return _SHIELDS[name].options if isinstance(name, str) and name in _SHIELDS else None
+
+
+def variants_of(name: str) -> tuple[str, ...]:
+    """The words that may stand behind an agent or a shield, after its argument, and make another one of it."""
+    keys = (key.rpartition(".") for key in _VARIANTS)
+    return tuple(variant for of, _, variant in keys if of == name)
+
+
+def is_variant(form: str) -> bool:
+    """Whether the last word of ``NAME:WORD`` makes another agent or shield of it."""
+    return form.rpartition(":")[2] in variants_of(form.partition(":")[0])
 
 
 def settings_needed(shield: str | None) -> Mapping[str, object]:
-    """Settings that a shield cannot do without, each with an example. One that estimates the world needs none."""
-    return {} if shield is None or shield.endswith(":believed") else _around(shield).needs
+    """Settings that a shield cannot do without, each with an example; a variant of it needs none."""
+    return {} if shield is None or is_variant(shield) else _around(shield).needs
 
 
 def shields_with(setting: str) -> tuple[str, ...]:
@@ -440,7 +491,7 @@ def register_agent(
     if name in group_names():
         raise AlreadyExists(f"agent {name!r}: stands for several agents in --agents; give another name")
     form = f"{name}[:ARGUMENT]{'[@POLICY]' * takes_policy}" if form is None else form
-    _AGENTS.add(name, Entry(form, about, knows, factory), lambda entry: entry.make is factory)
+    _AGENTS.add(name, Entry(name, form, about, knows, factory), lambda entry: entry.make is factory)
 
 
 def register_shield(
@@ -453,6 +504,7 @@ def register_shield(
     inner: bool = False,
     teams: bool = False,
     needs: Mapping[str, object] | None = None,
+    options: type | None = None,
 ) -> None:
     """Make ``+name`` known behind every agent.
 
@@ -469,14 +521,34 @@ def register_shield(
         inner: it is no shield, and goes around the agent before one.
         teams: it also goes around a team.
         needs: settings of ``AgentSettings`` that it cannot do without, each with an example.
+        options: the class of its settings, ``shield.options.ShieldOptions`` or one derived from it, which makes its
+            guard: then ``eb.shield(env, mode=name)`` knows it, too.
 
     Raises ``AlreadyExists`` for a name that another one has, ``InvalidInput`` for one that is not plain.
 
     """
     if not isinstance(name, str) or not _PLAIN.fullmatch(name):
         raise InvalidInput(f"shield name {name!r}: must be a plain name without argument")
-    entry = Entry(f"+{name}[:ARGUMENT]" if form is None else form, about, knows, wrapper, inner, teams, needs or {})
+    form = f"+{name}[:ARGUMENT]" if form is None else form
+    entry = Entry(name, form, about, knows, wrapper, inner, teams, needs or {}, options)
     _SHIELDS.add(name, entry, lambda entry: entry.make is wrapper)
+
+
+def register_variant(key: str, make: Factory | Wrapper, *, about: str = "a variant of your own") -> None:
+    """Make ``name:variant`` and ``name:argument:variant`` known, of an agent or a shield that has a name already.
+
+    An installed package does the same with an entry point of the group ``ethbrake_marl.variants``.
+
+    Args:
+        key: ``name.variant``.
+        make: makes it in the place of the factory, or wrapper, of that name, from the same arguments; the variant is
+            not in the argument.
+        about: one line for ``ethbrake agent list``.
+
+    Raises ``AlreadyExists`` for a variant that another one has.
+
+    """
+    _VARIANTS.add(key, Variant(make, about), lambda variant: variant.make is make)
 
 
 _PLAIN = re.compile(r"[a-z][a-z0-9_.-]*")
@@ -486,6 +558,8 @@ _PROFILE = "profile"  # a role of scenarios alone
 _AGENTS: Registry[Entry] = Registry("agent", "agents", register_agent)
 
 _SHIELDS: Registry[Entry] = Registry("shield or search", "shields", register_shield)
+
+_VARIANTS: Registry[Variant] = Registry("variant of an agent", "variants", register_variant)
 
 
 def _register_group(name: str, specs: tuple[str, ...]) -> None:

@@ -57,9 +57,8 @@ PROFILE = Part(make_script, form="profile:0=A,S=B", about="in pieces; of roles a
 
 E_V2X_BM = Part(
     make_e_v2x_bm,
-    form="e_v2x_bm[:pairwise][:believed]",
-    about="the best constant deceleration in this simulation; pairwise: the paper's closed form, from the true state;"
-    " believed: on what was received, and the scenario's ranges for the rest",
+    form="e_v2x_bm[:pairwise]",
+    about="the best constant deceleration in this simulation; pairwise: the paper's closed form, from the true state",
     knows=Source.MODEL,
 )
 

@@ -18,7 +18,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.segment import Segment
 
 from ethbrake_marl.envs.registration import register_environments
-from ethbrake_marl.errors import InvalidInput, Progress as PartProgress, one_line, plain_text
+from ethbrake_marl.errors import InvalidInput, one_line, plain_text
+from ethbrake_marl.progress import Progress as PartProgress
 
 _KEPT = "\n\t\N{NO-BREAK SPACE}"  # in lines of a result; the last stands between a number and its unit
 

@@ -12,9 +12,11 @@ import typer
 
 from ethbrake_marl import evaluation, scenario as scenarios, training
 from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, SeedOption, SettingsOption, example
+from ethbrake_marl.cli.pages import page_of
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.sheet import Sheet
-from ethbrake_marl.files.store import new_file, read_plain
+from ethbrake_marl.files.store import new_file
 from ethbrake_marl.files.yaml import flow_text
 
 TRIED_WORLDS = 200  # by `scenario validate`
@@ -369,10 +371,7 @@ def scenario_sample(
             *(",".join("" if each is None else repr(each) for each in state.values()) for state in states),
         ]
         if pictured is not None:
-            from ethbrake_marl.extensions.report.scenario_figures import worlds_figure
-            from ethbrake_marl.extensions.report.style import write_picture
-
-            write_picture(pictured, worlds_figure(chosen, sample, seed=seed), force=out.force)
+            page_of("worlds", f"--output {pictured.name}")(pictured, chosen, sample, seed=seed, force=out.force)
             out.note(f"picture: {pictured}")
         elif output is not None:
             out.write(output, "\n".join([*lines, ""]), what="worlds")

@@ -19,7 +19,8 @@ from ethbrake_marl.cli.command import (
     StepsOption,
     schema_option,
 )
-from ethbrake_marl.errors import InvalidInput, Progress
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.progress import Progress
 
 KEPT = (
     "if the training had begun, the run's folder keeps the last good policy, and ethbrake train --resume FOLDER goes on"

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from ethbrake_marl.doors import front_door
 
 if TYPE_CHECKING:
+    from ethbrake_marl.agents.protocol import policy_sha256 as policy_sha256
     from ethbrake_marl.evaluation.chunks import (
         Lineup as Lineup,
         evaluate_held as evaluate_held,
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
         EPISODES as EPISODES,
         HELD as HELD,
         LIST_SEED as LIST_SEED,
-        policy_sha256 as policy_sha256,
         result_identity as result_identity,
         result_versions as result_versions,
         worlds_sha256 as worlds_sha256,
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         make_lineup as make_lineup,
     )
     from ethbrake_marl.evaluation.measures import (
+        MEASURE_SETS as MEASURE_SETS,
         Measure as Measure,
         MeasureSet as MeasureSet,
         Silent as Silent,
@@ -67,10 +68,10 @@ if TYPE_CHECKING:
     )
     from ethbrake_marl.evaluation.summary import (
         RowsBeside as RowsBeside,
-        SummaryRow as SummaryRow,
         SummaryTable as SummaryTable,
         summarise as summarise,
     )
+    from ethbrake_marl.evaluation.summary_row import SummaryRow as SummaryRow
     from ethbrake_marl.evaluation.tally import Tally as Tally
     from ethbrake_marl.evaluation.trial import load_runnable as load_runnable, try_scenario as try_scenario
     from ethbrake_marl.evaluation.varying import drawn_alike as drawn_alike, states_of as states_of

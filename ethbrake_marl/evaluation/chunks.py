@@ -21,11 +21,11 @@ from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import CHUNK, own_versions, policies_of, result_versions, scenario_sha256
 from ethbrake_marl.evaluation.lineup import make_lineup
-from ethbrake_marl.evaluation.measures import silent_in_long_lists
+from ethbrake_marl.evaluation.measures import MEASURE_SETS, silent_in_long_lists
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.own_measures import LOADED, REGISTERED, load_measures
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk
-from ethbrake_marl.evaluation.summary import SummaryTable
+from ethbrake_marl.evaluation.summary import SummaryTable, summarise_sums
 from ethbrake_marl.evaluation.tally import Tally
 from ethbrake_marl.files.python_file import file_sha256
 from ethbrake_marl.game.harm import HarmCount
@@ -53,6 +53,7 @@ class Lineup:
         uncertainty: what shields do not know that take one, as text.
         measures: that evaluations tell, too, as ``load_measures`` takes them; with those that it was given before.
         told: names of all measures that evaluations tell, whatever is registered later.
+        sets: names of the sets of measures in the process that asks.
         same: what must be the same in every process; see ``Lineup.of``.
         packages: name -> version of each that gave a part to the process that asks: no other may be installed.
 
@@ -64,6 +65,7 @@ class Lineup:
     uncertainty: str | None = None
     measures: tuple[str, ...] = ()
     told: tuple[str, ...] = ()
+    sets: tuple[str, ...] = ()
     same: str = ""
     packages: Mapping[str, str] = field(default_factory=dict)
 
@@ -74,7 +76,8 @@ class Lineup:
         Raises what ``make_lineup`` raises.
         """
         load_measures(how.pop("measures", ()))
-        lineup = cls(tuple(agents), scenario, measures=tuple(LOADED), told=tuple(REGISTERED), **how)
+        sets = tuple(name for name, _ in MEASURE_SETS.items())  # loads them, so that their versions are known
+        lineup = cls(tuple(agents), scenario, measures=tuple(LOADED), told=tuple(REGISTERED), sets=sets, **how)
         made = lineup._make_anew()
         same = lineup._same(made)
         _MADE.clear()
@@ -86,7 +89,9 @@ class Lineup:
         if self.same not in _MADE:
             load_measures(self.measures)
             made = self._make_anew()
-            same = self._same(made) == self.same and {*self.told} <= REGISTERED.keys()
+            same = (
+                self._same(made) == self.same and {*self.told} <= REGISTERED.keys() and {*self.sets} <= {*MEASURE_SETS}
+            )
             if not same or any(_installed(name) != used for name, used in self.packages.items()):
                 raise InvalidInput(
                     "evaluate: a worker has other policies, measures or versions than the process that asks it;"
@@ -191,12 +196,12 @@ def summarise_tally(lineup: Lineup, tally: Tally, seed: int) -> SummaryTable:
     scenario = lineup.scenario
     task = Task(scenario, scenario.learners, lineup.harm_count)
     teams = {name: Team.of(agent, scenario.learners) for name, agent in lineup.make().items()}
-    return SummaryTable.of_tallies(
+    return summarise_sums(
         {name: tally.agents[name] for name in teams},
         Conditions.of_test(task, seed, tally.worlds, tally.silent, Conditions.of_ranges(tally.ranges)),
         silent_in_long_lists(),
-        {name: Knowledge.of(team) for name, team in teams.items()},
-        {name: policies_of(team.drivers) for name, team in teams.items()},
+        knows={name: Knowledge.of(team) for name, team in teams.items()},
+        policies={name: policies_of(team.drivers) for name, team in teams.items()},
         left_out=tally.left_out,
         hidden_share=tally.hidden / tally.worlds,
         worlds_sha256=f"{tally.worlds_hash:064x}",

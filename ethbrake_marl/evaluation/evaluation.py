@@ -55,7 +55,7 @@ class Evaluation:
     """
 
     scenario: Scenario  # of the worlds
-    vehicles: tuple[int, ...]  # indices (0 = front) of the vehicles that were driven; the others followed scripts
+    vehicles: tuple[int, ...]  # indices (0 = front) of the controlled vehicles; the others followed scripts
     worlds: Worlds  # at the alert
     index: Ints  # [n] number of each world in its list
     seed: int | None  # of the list; None for worlds that were given
@@ -77,12 +77,12 @@ class Evaluation:
 
     @property
     def vehicle(self) -> int:
-        """The vehicle that was driven; raises ``InvalidInput`` if it is not exactly one."""
+        """The controlled vehicle; raises ``InvalidInput`` if there is not exactly one."""
         return self.task.vehicle
 
     @property
     def task(self) -> Task:
-        """What was asked of the agents."""
+        """The task of the agents: the scenario and the controlled vehicles."""
         return Task(self.scenario, self.vehicles)
 
     def once(self, compute: Callable[[Evaluation], T]) -> T:
@@ -94,7 +94,7 @@ class Evaluation:
 
     @classmethod
     def join(cls, parts: Sequence[Evaluation]) -> Evaluation:
-        """One from those of consecutive worlds of a list; raises ``PhysicsError`` if every world was left out."""
+        """One evaluation of consecutive parts of a list; raises ``PhysicsError`` if every world was left out."""
         left_out = tuple(left for part in parts for left in part.left_out)
         some = [part for part in parts if part.worlds.n]
         if not some:
@@ -111,7 +111,7 @@ class Evaluation:
         )
 
     def take(self, rows: Ints | Bools) -> Evaluation:
-        """That of some of the worlds; nobody is left out of them."""
+        """The evaluation restricted to ``rows``; no world counts as left out."""
         outcomes = {name: outcome.take(rows) for name, outcome in self.outcomes.items()}
         kinds = {name: column[rows] for name, column in self.kinds.items()}
         return replace(
@@ -127,7 +127,7 @@ class Evaluation:
 
     @property
     def conditions(self) -> Conditions:
-        """Under which these are the results, with all quantities of the worlds."""
+        """The conditions of these results: scenario, list, controlled vehicles, and every quantity of the worlds."""
         because = silent_because(contexts_of(self))
         return Conditions.of_test(self.task, self.seed, self.worlds.n, because, Conditions.of(self.worlds))
 

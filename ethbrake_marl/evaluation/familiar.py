@@ -9,9 +9,8 @@ import numpy as np
 
 from ethbrake_marl.agents.protocol import Driver, Team
 from ethbrake_marl.errors import Unfamiliar
-from ethbrake_marl.evaluation.identity import driving_policy
 from ethbrake_marl.physics.state import Worlds
-from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.policies.manifest import Manifest
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.schema import Scenario
 
@@ -26,19 +25,18 @@ def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scen
     These are drawn from the scenario in its manifest. Where that cannot be drawn here, nothing is said. Of the channel
     only what a world has of it is compared: latencies.
     """
-    drives: dict[str, tuple[str, Policy, dict[str, None]]] = {}  # by hash: the first agent, vehicles in order
+    drives: dict[str, tuple[str, Manifest, dict[str, None]]] = {}  # by hash: the first agent, vehicles in order
     for name, agent in agents.items():
         for vehicle, driver in Team.of(agent, vehicles).drivers.items():
-            if isinstance(policy := driving_policy(driver), Policy):
-                sha256 = policy.manifest.manifest_sha256
-                drives.setdefault(sha256, (name, policy, {}))[2][f"vehicle_{vehicle + 1}"] = None
-    for name, policy, driven in drives.values():
+            if isinstance(manifest := getattr(driver, "manifest", None), Manifest):
+                drives.setdefault(manifest.manifest_sha256, (name, manifest, {}))[2][f"vehicle_{vehicle + 1}"] = None
+    for name, manifest, vehicles_driven in drives.values():
         try:
-            trained = Scenario.of_dump(policy.manifest.scenario)
+            trained = Scenario.of_dump(manifest.scenario)
             before = trained.sample(_TRAINED, 0).worlds
         except ValueError:
             continue
-        found = [each for each in driven if each not in policy.manifest.learners]
+        found = [each for each in vehicles_driven if each not in manifest.learners]
         if not np.isclose(trained.time_step_s, scenario.time_step_s):
             found.append("time_step_s")
         found += [f"{worlds.N} vehicles"] if worlds.N != before.N else _beyond(before, worlds)

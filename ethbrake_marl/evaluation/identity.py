@@ -16,16 +16,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ethbrake_marl.agents.foreign import PolicyAgent
-from ethbrake_marl.agents.learned import LearnedAgent
-from ethbrake_marl.agents.protocol import AgentAround
+from ethbrake_marl.agents.protocol import policy_sha256
 from ethbrake_marl.files.python_file import files_run
 from ethbrake_marl.physics.state import Ints, Worlds
-from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.registry import versions_used
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shield.drivers import ShieldedDriver
 
 Kind = Literal["evaluate", "shield", "best-harm", "ablate", "learning-curves"]
 
@@ -93,25 +89,6 @@ def scenario_sha256(scenario: Scenario) -> str:
     """SHA-256 of all that shapes an episode: every value of the scenario, defaults too, but neither name nor texts."""
     content = scenario.content(without=_WORDS)
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
-
-
-def driving_policy(agent: object) -> object:
-    """What is inside everything that is around an agent: the policy that it drives by, or the agent itself."""
-    while isinstance(agent, AgentAround | LearnedAgent | ShieldedDriver):
-        agent = agent.policy
-    return agent
-
-
-def policy_sha256(agent: object) -> str | None:
-    """The hash of the policy that an agent drives by, inside whatever is around it; None without one.
-
-    Of a bundle it is that in its manifest, which binds names, network and weights (``Manifest.manifest_sha256``); of
-    another library's, that of its weights (``agents.policy``).
-    """
-    agent = driving_policy(agent)
-    if isinstance(agent, PolicyAgent):
-        return agent.weights_sha256()
-    return agent.manifest.manifest_sha256 if isinstance(agent, Policy) else None
 
 
 def policies_of(drivers: Mapping[int, object]) -> dict[str, str]:

@@ -19,6 +19,7 @@ from ethbrake_marl.evaluation.exploits import FAR_M
 from ethbrake_marl.evaluation.outcome import COLUMN, Outcome, Values
 from ethbrake_marl.evaluation.own_measures import heading_of
 from ethbrake_marl.files.sheet import Column
+from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.registry import Registry
 
 BASELINE = "full_brake"
@@ -60,6 +61,15 @@ class Silent:
     because: str  # a clause
 
 
+@dataclass(frozen=True, slots=True)
+class GroupColumn:
+    """What a table of several scenarios shows of a set: one measure, and what stands below about it."""
+
+    column: Column
+    measures: Mapping[HarmCount, str]  # by the harm that agents minimise
+    note: str  # a sentence with ``{harm}`` in it
+
+
 class MeasureSet:
     """Measures that need to know the same thing of the worlds: their *context*, computed once for an evaluation.
 
@@ -72,6 +82,7 @@ class MeasureSet:
     whole: str | None = None  # a counted truth: unless it holds everywhere, nothing is compared, and means have a "≥"
     narrow: tuple[str, ...] = ()  # columns that also a narrow terminal shows, where they have values
     notebook: tuple[str, ...] = ()  # columns that a notebook shows
+    group_column: GroupColumn | None = None
     per_world: Mapping[str, Callable[[Outcome, Any], Values | None]] = {}  # columns of files with every world
     texts: frozenset[str] = frozenset()  # those of them that hold texts
     because_key: str | None = None  # under which the conditions of a result say why the set is silent

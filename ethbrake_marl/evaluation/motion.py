@@ -9,7 +9,7 @@ import numpy as np
 from ethbrake_marl.agents.driving import Episodes, episode_engine
 from ethbrake_marl.agents.protocol import Driver, Team
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.evaluation.own_measures import Tape
+from ethbrake_marl.evaluation.impacts import Tape
 from ethbrake_marl.game.harm import HARM_COUNTS, Ledger
 from ethbrake_marl.physics.left_out import ImpactRows
 from ethbrake_marl.physics.state import Floats, Worlds

@@ -21,7 +21,7 @@ COLUMN = "metric_"  # before the name of a registered measure, in JSON and in fi
 
 Values = NDArray[Any]  # [n]
 
-# Columns of files with every world that hold texts, but for the types of vehicles.
+# Of an agent that does not say what it knows.
 UNSTATED = Knowledge((Source.UNSTATED,))
 
 _COLUMNS = ("at_rest", "predicted_harm", "chosen_policy", "shoved_m", "sampled_harm")  # of an outcome, [n]
@@ -58,7 +58,7 @@ class Outcome:
         return f"Outcome({count_of(n, 'world')}, {int(self.collided.sum()):,} collided, {means})"
 
     def take(self, rows: Ints | Bools) -> Outcome:
-        """That of some of the worlds."""
+        """The outcome restricted to ``rows``."""
         found = {name: getattr(self, name) for name in _COLUMNS}
         columns: dict[str, Any] = {name: None if column is None else column[rows] for name, column in found.items()}
         metrics = {name: column[rows] for name, column in self.metrics.items()}
@@ -66,7 +66,7 @@ class Outcome:
 
     @classmethod
     def join(cls, parts: Sequence[Outcome]) -> Outcome:
-        """One from those of consecutive worlds."""
+        """One outcome of consecutive worlds."""
         first, columns = parts[0], dict[str, Any]()
         for name in _COLUMNS:  # what one part cannot tell is not told of the whole
             told = [getattr(part, name) for part in parts]

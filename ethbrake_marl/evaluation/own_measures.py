@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,9 +12,8 @@ from ethbrake_marl.errors import InvalidInput, describe_error
 from ethbrake_marl.evaluation.impacts import EpisodeImpacts
 from ethbrake_marl.evaluation.outcome import Values
 from ethbrake_marl.files.python_file import load_from_file
-from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.left_out import ImpactRows
-from ethbrake_marl.physics.state import Floats, Worlds, make_worlds
+from ethbrake_marl.physics.state import make_worlds
 from ethbrake_marl.registry import Part, Registry
 
 _NAME = re.compile(r"(?!.*_([0-9]+|interval|low|high)\Z)[a-z][a-z0-9_]{0,63}")  # x_2 is that of the second vehicle
@@ -139,49 +138,20 @@ def _tried() -> EpisodeImpacts:
     return EpisodeImpacts.unwritable(worlds, ImpactRows(np.array([0]), np.array([1]), *one))
 
 
-class Tape:
-    """The steps of a batch of episodes as they are driven (``Watch``), and every impact in them.
+def measure_impacts(episodes: EpisodeImpacts) -> dict[str, Values]:
+    """Every registered measure of these episodes by column, [n]: ``NAME``, or ``NAME_1``, ``NAME_2``, ...
 
-    With ``steps`` False only the impacts are kept.
+    Raises ``InvalidInput`` that names measure and world.
     """
-
-    def __init__(self, worlds: Worlds, *, steps: bool = True) -> None:
-        self.worlds = worlds  # at the alert
-        self.steps: list[tuple[Worlds, Floats, Floats]] = []  # before, commands [n, N], until [n]
-        self._keeps_steps = steps
-        self._rows: list[ImpactRows] = []
-
-    def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Keep one step."""
-        moving = until_s > before.time_s
-        some = np.flatnonzero(moving | (before.time_s == self.worlds.time_s))  # an impact at the very alert
-        rows = advance(before.take(some), command_mps2[some], until_s=until_s[some], record=True)[1].rows
-        assert rows is not None  # they were asked for
-        self._rows.append(replace(rows, world=some[rows.world]))
-        if self._keeps_steps:
-            self.steps.append((before, command_mps2, until_s))
-
-    def impacts(self) -> ImpactRows:
-        """Every impact so far, by world and then by time."""
-        columns = {f.name: np.concatenate([getattr(rows, f.name) for rows in self._rows]) for f in fields(ImpactRows)}
-        order = np.argsort(columns["world"], kind="stable")
-        return ImpactRows(**{name: column[order] for name, column in columns.items()})
-
-    def measured(self) -> dict[str, Values]:
-        """Every registered measure of these episodes by column, [n]: ``NAME``, or ``NAME_1``, ``NAME_2``, ...
-
-        Raises ``InvalidInput`` that names measure and world.
-        """
-        episodes = EpisodeImpacts.unwritable(self.worlds.take(np.arange(self.worlds.n)), self.impacts())
-        found: dict[str, Values] = {}
-        for metric in REGISTERED.values():
-            values = _checked(metric, episodes)
-            if _form(values) != metric.form:
-                raise InvalidInput(
-                    f"measure {metric.name!r}: gave {_form(values)}; when it was registered it gave {metric.form}"
-                )
-            if values.ndim == 1:
-                found[metric.name] = values
-            else:
-                found |= {f"{metric.name}_{i + 1}": column.copy() for i, column in enumerate(values.T)}
-        return found
+    columns: dict[str, Values] = {}
+    for metric in REGISTERED.values():
+        values = _checked(metric, episodes)
+        if _form(values) != metric.form:
+            raise InvalidInput(
+                f"measure {metric.name!r}: gave {_form(values)}; when it was registered it gave {metric.form}"
+            )
+        if values.ndim == 1:
+            columns[metric.name] = values
+        else:
+            columns |= {f"{metric.name}_{i + 1}": column.copy() for i, column in enumerate(values.T)}
+    return columns

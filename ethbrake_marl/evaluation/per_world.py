@@ -14,9 +14,10 @@ from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras, unk
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import Kind
 from ethbrake_marl.evaluation.rescores import Rescored
-from ethbrake_marl.evaluation.summary import SummaryRow
+from ethbrake_marl.evaluation.summary_row import SummaryRow
+from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.files.sheet import Estimate, parquet_file
-from ethbrake_marl.files.store import check_target, parse_strict_json, read_plain, write_output
+from ethbrake_marl.files.store import check_target, write_output
 from ethbrake_marl.game.objectives import Declared
 
 CSV, PARQUET = ".csv", ".parquet"

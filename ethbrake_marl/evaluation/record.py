@@ -15,7 +15,7 @@ import numpy as np
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import InvalidInput, count_of
-from ethbrake_marl.evaluation.own_measures import Tape
+from ethbrake_marl.evaluation.impacts import Tape
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
 from ethbrake_marl.game.harm import HARM_COUNTS, Ledger
 from ethbrake_marl.physics.advance import advance

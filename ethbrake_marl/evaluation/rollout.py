@@ -1,6 +1,6 @@
-"""The evaluation of every agent on the same fixed list of worlds, each world once.
+"""Evaluate agents: draw a fixed list of worlds, let every agent drive each world once, measure what it did.
 
-Counting "the first episodes that finish" instead would over-count short ones, and crashes end early.
+Counting "the first episodes that finish" instead would over-count short episodes, and crashes end early.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ from ethbrake_marl.evaluation.aftermath import SampledHarm, ShovedFront
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.familiar import warn_unfamiliar
 from ethbrake_marl.evaluation.identity import CHUNK, EPISODES, LIST_SEED, policies_of
+from ethbrake_marl.evaluation.impacts import Tape
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.outcome import LeftOut, Outcome
-from ethbrake_marl.evaluation.own_measures import REGISTERED, Tape
+from ethbrake_marl.evaluation.own_measures import REGISTERED, measure_impacts
 from ethbrake_marl.physics.left_out import leaving_out_failed
 from ethbrake_marl.physics.state import Ints, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
@@ -56,26 +57,26 @@ def evaluate(
 ) -> Evaluation:
     """Let each agent drive every world once, from the alert to the episode's end.
 
-    Vehicles that are not driven follow the scenario's scripts. A world's outcome depends neither on ``chunk`` nor
-    on the other worlds. One that cannot be advanced (a defect of the physics) is left out for all agents, and stands
-    in ``left_out``.
+    The other vehicles follow the scenario's scripts. A world's outcome depends neither on ``chunk`` nor on the other
+    worlds. A world that cannot be advanced (a defect of the physics) is left out for all agents, and named in
+    ``left_out``.
 
     Args:
-        worlds: at the alert, or a sample of the scenario's list; None: its first ``episodes`` of ``seed``.
+        worlds: at the alert, or a sample of the scenario's list; None: draw the first ``episodes`` of ``seed``.
         agents: specs as on the command line (``"full_brake,ppo@shipped"``, or a list), made for first-impact harm; or
-            name -> agent, of which each driven vehicle gets its own copy, or ``Team``; they are left as they are.
+            name -> agent or ``Team``. Each controlled vehicle gets a copy of its agent; the originals do not change.
         scenario: of the worlds, also by name or path.
-        vehicle: the one that is driven, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
-        episodes: worlds of the list, 10,000 where neither they nor their number is given.
-        seed: of the list, 7 where none is given; noted, not used, where worlds are given.
+        vehicle: the controlled vehicle, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
+        episodes: number of worlds to draw; None: 10,000.
+        seed: of the list; None: 7. With given worlds it is only noted in the result.
         chunk: worlds advanced together; None: 2,500.
-        on_progress: is called with an agent's name and its worlds done so far, chunk by chunk.
-        aftermath: look how far Vehicle 1 is shoved, what the paper's sum over samples is, and what registered harm
-            metrics are; costs time.
+        on_progress: called after each chunk with an agent's name and the number of its worlds done.
+        aftermath: also measure how far Vehicle 1 is shoved, the paper's sum over samples, and registered measures;
+            takes longer.
 
-    Warns (``Unfamiliar``) of policies beyond their training. Raises ``PhysicsError`` if no world is left;
-    ``InvalidInput`` for worlds that do not fit the scenario or are not at the alert, no agents, nobody to drive, a
-    team of other vehicles, or a learner that nobody drives.
+    Warns (``Unfamiliar``) of policies that drive beyond their training. Raises ``PhysicsError`` if no world is left;
+    ``InvalidInput`` for worlds that do not fit the scenario or are not at the alert, no agents, no controlled vehicle,
+    a team of other vehicles, or a learner that nobody drives.
 
     """
     scenario = load_scenario(scenario)
@@ -91,10 +92,11 @@ def evaluate(
     if not sample.worlds.n:
         raise InvalidInput("evaluate: worlds: there are none; at least one is needed")
     check_alert(sample.worlds, sample.worlds.n, scenario.vehicles)
-    driven, parts = driven_vehicles(scenario, vehicle, agents), []
-    warn_unfamiliar(agents, sample.worlds, scenario, driven)
+    vehicles = driven_vehicles(scenario, vehicle, agents)
+    warn_unfamiliar(agents, sample.worlds, scenario, vehicles)
+    parts = []
     for first, part in chunks_of(sample, chunk or CHUNK):
-        parts.append(drive_chunk(part, agents, scenario, seed, driven, first, aftermath))
+        parts.append(drive_chunk(part, agents, scenario, seed, vehicles, first, aftermath))
         if on_progress is not None:
             for name in agents:
                 on_progress(name, first + part.worlds.n)
@@ -112,33 +114,32 @@ def drive_chunk(
     agents: Mapping[str, Driver],
     scenario: Scenario,
     seed: int | None,
-    driven: tuple[int, ...],
+    vehicles: tuple[int, ...],
     first: int = 0,
     aftermath: bool = True,
 ) -> Evaluation:
-    """Let each agent drive all of these worlds at the alert together; ``first``: row of the first one, for messages.
+    """Let each agent drive all of these worlds at the alert together.
 
-    The evaluation has no worlds where each was left out.
+    ``first`` is the row of the first world, for messages. If every world was left out, the evaluation has none.
     """
-    n, others = sample.worlds.n, [script.name for script in script_agents(scenario, except_for=driven).values()]
-    found: dict[str, tuple[Outcome | None, Ints]] = {}
+    n, others = sample.worlds.n, [script.name for script in script_agents(scenario, except_for=vehicles).values()]
+    outcomes: dict[str, Outcome] = {}
+    advanced: dict[str, Ints] = {}  # rows of the worlds that are in each outcome
     lost: dict[int, LeftOut] = {}
     for name, agent in agents.items():
-        roll_out = partial(_roll_out, sample.worlds, agent, driven, scenario, aftermath)
+        roll_out = partial(_roll_out, sample.worlds, agent, vehicles, scenario, aftermath)
         with AgentFailed.naming(name, others), renumbered(range(first, first + n)):
-            outcome, rows, failed = leaving_out_failed(roll_out, np.arange(n))
-        found[name] = outcome, rows
+            outcome, advanced[name], failed = leaving_out_failed(roll_out, np.arange(n))
+        if outcome is not None:
+            outcomes[name] = outcome
         lost = {row: LeftOut(int(sample.index[row]), seed, name, why) for row, why in failed.items()} | lost
-    left_out = tuple(lost[row] for row in sorted(lost))
-    outcomes = {name: outcome for name, (outcome, _) in found.items() if outcome is not None}
     if lost:
         good = np.setdiff1d(np.arange(n), list(lost))
-        sample, outcomes = (
-            sample.take(good),
-            {name: outcome.take(np.isin(found[name][1], good)) for name, outcome in outcomes.items()},
-        )
+        sample = sample.take(good)
+        outcomes = {name: outcome.take(np.isin(advanced[name], good)) for name, outcome in outcomes.items()}
+    left_out = tuple(lost[row] for row in sorted(lost))
     return Evaluation(
-        scenario, driven, sample.worlds, sample.index, seed, outcomes, left_out=left_out, kinds=sample.kinds
+        scenario, vehicles, sample.worlds, sample.index, seed, outcomes, left_out=left_out, kinds=sample.kinds
     )
 
 
@@ -162,14 +163,14 @@ def _check_request(worlds: object, agents: object, chunk: object) -> None:
 
 
 def driven_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mapping[str, Driver]) -> tuple[int, ...]:
-    """Indices of the vehicles to drive: the given one, or all learners; nobody, if the agents are teams of nobody."""
+    """Indices of the controlled vehicles: the given one, or all learners; none if the agents are teams of nobody."""
     if vehicle is not None or (not scenario.learners and any(not isinstance(a, Team) for a in agents.values())):
         return (controlled_vehicle(scenario, vehicle),)
     return scenario.learners
 
 
 def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
-    """Index of the vehicle to drive: the given one, or the scenario's only learner; raises ``InvalidInput``."""
+    """Index of the controlled vehicle: the given one, or the scenario's only learner; raises ``InvalidInput``."""
     learners = scenario.learners
     names = [scenario.vehicle_names[i] for i in learners]
     if vehicle is None:
@@ -190,10 +191,10 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
 
 
 def _roll_out(
-    whole: Worlds, agent: Driver, driven: tuple[int, ...], scenario: Scenario, aftermath: bool, rows: Ints
+    whole: Worlds, agent: Driver, vehicles: tuple[int, ...], scenario: Scenario, aftermath: bool, rows: Ints
 ) -> Outcome:
-    """Outcome of a fresh team in these worlds; what an agent says about a world counts where it drives alone."""
-    team = Team.of(agent, driven)
+    """Outcome of a fresh team in the worlds of these rows."""
+    team = Team.of(agent, vehicles)
     worlds = scenario.play_pieces(whole.take(rows), tuple(team.drivers))
     task = Task(scenario, tuple(team.drivers))
     shoved = ShovedFront.of(worlds, task) if aftermath else None
@@ -205,17 +206,20 @@ def _roll_out(
         outcome,
         shoved_m=None if shoved is None else shoved.metres,
         sampled_harm=None if sampled is None else sampled.finish(),
-        metrics={} if impacts is None else impacts.measured(),
+        metrics={} if impacts is None else measure_impacts(impacts.episodes()),
     )
 
 
 def outcome_of(team: Team, episodes: Episodes) -> Outcome:
-    """What a team achieved in its episodes, without their aftermath."""
-    told: Any = next(iter(episodes.memories.values()), None) if len(team.drivers) == 1 else None
+    """What a team achieved in its episodes, without their aftermath.
+
+    What an agent predicts about a world counts where it drives alone, or where its shield predicts.
+    """
+    memory: Any = next(iter(episodes.memories.values()), None) if len(team.drivers) == 1 else None
     if episodes.guarded is not None:
-        told = episodes.guarded.told
+        memory = episodes.guarded.told
     predicted, chosen = (
-        _read_column(team, told, what, episodes.final.n) for what in ("predicted_harm", "chosen_policy")
+        _read_column(team, memory, what, episodes.final.n) for what in ("predicted_harm", "chosen_policy")
     )
     return Outcome(
         episodes.ledger,
@@ -229,7 +233,7 @@ def outcome_of(team: Team, episodes: Episodes) -> Outcome:
 
 
 def _read_column(team: Team, memory: Any, what: str, n: int) -> NDArray[np.generic] | None:
-    """What the memory of who drives holds about each world of the batch, or None when it holds nothing."""
+    """A column of an agent's memory, one number per world; None where the memory has no such column."""
     value = memory.get(what) if isinstance(memory, Mapping) else None
     if value is None:
         return None

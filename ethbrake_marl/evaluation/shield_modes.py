@@ -19,7 +19,8 @@ from ethbrake_marl.physics.left_out import LeftOutRows, measured_without_failed
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shield.drivers import Shielded, ShieldedDriver
+from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shield.episodes import Shielded
 from ethbrake_marl.shield.evidence import SAME_HARM, VERDICTS, review
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
 

@@ -22,7 +22,8 @@ from ethbrake_marl.engine.memory import ask_script, begin_script
 from ethbrake_marl.errors import AgentFailed, InvalidInput, check_one_learner
 from ethbrake_marl.evaluation.identity import LIST_SEED
 from ethbrake_marl.evaluation.lineup import check_agents
-from ethbrake_marl.files.yaml import Override, read_yaml
+from ethbrake_marl.files.overrides import Override
+from ethbrake_marl.files.yaml import read_yaml
 from ethbrake_marl.physics.state import Ints, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario, scenario_path
 from ethbrake_marl.scenario.roles import ScriptSpec

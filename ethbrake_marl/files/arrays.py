@@ -19,17 +19,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.files.store import parse_strict_json
+from ethbrake_marl.files.plain import parse_strict_json
 
 HEADER_LIMIT_BYTES = 1 << 20  # of a safetensors file
+
 _NPY_HEADER_LIMIT_BYTES = 4096
+
 _DIRECTORY_LIMIT_BYTES = 1 << 16  # of a zip archive
+
 _MEMBERS_LIMIT = 64
 
 _NPY = re.compile(
     rb"\{'descr': '([<|][a-z][0-9]{1,2})', 'fortran_order': False, 'shape': \(([0-9, ]{0,200})\), \} *\n", re.ASCII
 )
+
 _SHAPE = re.compile(r"|[0-9]{1,18},|[0-9]{1,18}(, [0-9]{1,18}){1,7}", re.ASCII)
+
 _HARMLESS_FLAGS = 0x808  # of a zip member: sizes behind the data, name in UTF-8
 
 

@@ -13,12 +13,14 @@ from types import ModuleType
 from typing import Any
 
 from ethbrake_marl.errors import InvalidInput, describe_error
-from ethbrake_marl.files.store import read_plain
+from ethbrake_marl.files.plain import read_plain
 
 _LIMIT_BYTES = 1 << 20
 
 _RUN: dict[Path, tuple[str, ModuleType]] = {}  # files of this process, with their SHA-256
+
 _BEING_RUN: set[Path] = set()
+
 _READ: dict[str, set[str]] = {}
 
 

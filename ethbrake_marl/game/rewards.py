@@ -29,7 +29,7 @@ import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, describe_error, unknown_name
-from ethbrake_marl.files.yaml import UNSHOWN, FileModel, first_mistake, require
+from ethbrake_marl.files.model import UNSHOWN, FileModel, first_mistake, require
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.game.objectives import Declared, Objective, check_declared, objectives_of
 from ethbrake_marl.physics.elementary import logistic

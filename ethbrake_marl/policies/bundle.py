@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
-from ethbrake_marl.files.store import read_plain
-from ethbrake_marl.files.yaml import read_json_model
+from ethbrake_marl.files.model import read_json_model
+from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.game.features import FEATURES
 from ethbrake_marl.policies.manifest import Manifest, ObservationSchema, content_sha256
 from ethbrake_marl.policies.policy import MANIFEST, WEIGHTS, Policy, checked_tensors

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, JsonValue, model_validator
 
-from ethbrake_marl.files.yaml import NAME_PATTERN, FileModel
+from ethbrake_marl.files.model import NAME_PATTERN, FileModel
 from ethbrake_marl.game.features import Of, registered_in
 from ethbrake_marl.game.observations import ObservationSpec, choose_observation
 from ethbrake_marl.policies.network_spec import NetworkSpec

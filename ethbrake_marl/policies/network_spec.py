@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from ethbrake_marl.files.yaml import FileModel
+from ethbrake_marl.files.model import FileModel
 
 Activation = Literal["relu", "tanh"]
 

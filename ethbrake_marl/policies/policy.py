@@ -17,8 +17,8 @@ from safetensors import SafetensorError
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.arrays import ArrayRow, check_arrays, safetensors_headers
+from ethbrake_marl.files.model import first_mistake
 from ethbrake_marl.files.store import new_folder, write_file
-from ethbrake_marl.files.yaml import first_mistake
 from ethbrake_marl.game.observations import ObservationSpec
 from ethbrake_marl.policies.actor import Actor
 from ethbrake_marl.policies.manifest import Manifest, ObservationSchema, content_sha256, installed_versions
@@ -70,6 +70,11 @@ class Policy:
         """
         spec, step = self.manifest.observation.spec, self.manifest.scenario.get("time_step_s")
         return spec.at_steps_of(float(step)) if isinstance(step, int | float) else spec
+
+    @property
+    def policy_sha256(self) -> str:
+        """The hash in its manifest."""
+        return self.manifest.manifest_sha256
 
     @property
     def steps(self) -> int:

@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName, unknown_name
-from ethbrake_marl.files.yaml import NAME_PATTERN, Document, YamlPath, flow_text, read_yaml, schema_lines
+from ethbrake_marl.files.json_schema import schema_lines
+from ethbrake_marl.files.model import NAME_PATTERN
+from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.mixtures import member_content
 from ethbrake_marl.scenario.schema import Scenario

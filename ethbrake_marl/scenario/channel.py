@@ -35,7 +35,8 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.files.yaml import Document, FileModel, Wording, require
+from ethbrake_marl.files.model import FileModel, Wording, explain, require
+from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.physics.messages import Messages
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Vehicles, Worlds
 
@@ -389,6 +390,6 @@ def register_preset(name: str, settings: Mapping[str, Any]) -> None:
     try:
         channel = V2X.model_validate(dict(settings)).channel
     except ValidationError as error:
-        raise Document(f"preset {name!r}", dict(settings), {}).explain(error, Wording(V2X)) from None
+        raise explain(Document(f"preset {name!r}", dict(settings), {}), error, Wording(V2X)) from None
     if CHANNELS.setdefault(name, channel) != channel:
         raise AlreadyExists(f"preset {name!r} is registered already; give another name")

@@ -10,7 +10,8 @@ from difflib import get_close_matches
 import numpy as np
 from pydantic_core import PydanticCustomError
 
-from ethbrake_marl.files.yaml import UNSHOWN, YamlPath, flow_text, refuse, require
+from ethbrake_marl.files.model import UNSHOWN, refuse, require
+from ethbrake_marl.files.yaml import YamlPath, flow_text
 from ethbrake_marl.scenario.declared import ScenarioFields
 from ethbrake_marl.scenario.distributions import support
 from ethbrake_marl.scenario.fields import QUANTITY

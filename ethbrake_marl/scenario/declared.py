@@ -12,7 +12,8 @@ from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_
 from pydantic_core import PydanticCustomError
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.yaml import NAME_PATTERN, UNSHOWN, FileModel, YamlPath, refuse, require, suggestion
+from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, FileModel, refuse, require, suggestion
+from ethbrake_marl.files.yaml import YamlPath
 from ethbrake_marl.game.features import ListedFeatures, listed_features
 from ethbrake_marl.game.objectives import objectives_of
 from ethbrake_marl.physics.motion import stopping_distances

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Discriminator, Field, PrivateAttr, Tag, ValidationError, field_validator, model_validator
 
-from ethbrake_marl.files.yaml import FileModel, refuse, require
+from ethbrake_marl.files.model import FileModel, refuse, require
 from ethbrake_marl.physics.elementary import exp_each, log, normal_probability, normal_quantile_each
 from ethbrake_marl.physics.state import Floats
 

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.files.yaml import UNITS
+from ethbrake_marl.files.model import UNITS
 from ethbrake_marl.physics.state import Floats, Worlds
 
 BLOCK = 8  # uniform numbers per vehicle and world; a multiple of 4, the numbers of one Philox counter

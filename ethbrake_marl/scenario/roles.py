@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike
 from pydantic import BeforeValidator, PlainSerializer, WithJsonSchema
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.yaml import parse_numeral, refuse
+from ethbrake_marl.files.model import refuse
+from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.physics.state import Floats
 
 LEARNER = "learner"

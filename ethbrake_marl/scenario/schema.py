@@ -10,8 +10,10 @@ from pydantic import BaseModel, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.files.json_schema import FileSchema
+from ethbrake_marl.files.model import Wording, explain, suggestion
 from ethbrake_marl.files.sheet import Sheet
-from ethbrake_marl.files.yaml import Document, FileSchema, Wording, YamlPath, flow_text, suggestion
+from ethbrake_marl.files.yaml import Document, YamlPath, flow_text
 from ethbrake_marl.scenario.checks import check_whole
 from ethbrake_marl.scenario.declared import ScenarioFields
 from ethbrake_marl.scenario.distributions import DISTRIBUTIONS
@@ -235,7 +237,7 @@ def _build(scenario: Scenario, document: Document) -> None:
     try:
         BaseModel.__init__(scenario, **document.content)
     except ValidationError as error:
-        raise document.explain(error, ScenarioWording(Scenario)) from None
+        raise explain(document, error, ScenarioWording(Scenario)) from None
     scenario._members = members
 
 

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.store import read_plain
-from ethbrake_marl.files.yaml import parse_numeral, suggestion
+from ethbrake_marl.files.model import suggestion
+from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.physics.state import Bools, Floats, Worlds, make_worlds, real_numbers
 from ethbrake_marl.scenario.declared import ScenarioFields, obstacle_gap, on_road
 from ethbrake_marl.scenario.distributions import support

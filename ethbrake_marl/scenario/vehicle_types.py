@@ -25,7 +25,7 @@ from pydantic import (
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from ethbrake_marl.files.yaml import NAME_PATTERN, UNSHOWN, FileModel, require
+from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, FileModel, require
 from ethbrake_marl.game.features import ListedFeatures
 from ethbrake_marl.game.objectives import OBJECTIVES
 from ethbrake_marl.physics.state import Floats, Ints

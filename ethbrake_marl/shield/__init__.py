@@ -7,20 +7,15 @@ from typing import TYPE_CHECKING, Any
 from ethbrake_marl.doors import front_door
 
 if TYPE_CHECKING:
-    from ethbrake_marl.extensions.certified.uncertainty import (
-        UNCERTAINTY_EXAMPLE as UNCERTAINTY_EXAMPLE,
-        Uncertainty as Uncertainty,
-        parse_uncertainty as parse_uncertainty,
-    )
-    from ethbrake_marl.shield.drivers import Shielded as Shielded, ShieldedDriver as ShieldedDriver
+    from ethbrake_marl.shield.attach import guard_of as guard_of
+    from ethbrake_marl.shield.contract import ShieldMode as ShieldMode
+    from ethbrake_marl.shield.drivers import ShieldedDriver as ShieldedDriver
+    from ethbrake_marl.shield.episodes import Shielded as Shielded
     from ethbrake_marl.shield.evidence import SAME_HARM as SAME_HARM, VERDICTS as VERDICTS, review as review
-    from ethbrake_marl.shield.members import ShieldReason as ShieldReason
-    from ethbrake_marl.shield.options import (
-        MovingAtHorizon as MovingAtHorizon,
-        ShieldMode as ShieldMode,
-        ShieldOptions as ShieldOptions,
-    )
-    from ethbrake_marl.shield.paper_hybrid import HybridAgent as HybridAgent, guard_of as guard_of
+    from ethbrake_marl.shield.guard import MovingAtHorizon as MovingAtHorizon
+    from ethbrake_marl.shield.options import ShieldOptions as ShieldOptions
+    from ethbrake_marl.shield.paper_hybrid import HybridAgent as HybridAgent
+    from ethbrake_marl.shield.reasons import ShieldReason as ShieldReason
     from ethbrake_marl.shield.sb3 import ShieldedVecEnv as ShieldedVecEnv
     from ethbrake_marl.shield.step import StepShield as StepShield
     from ethbrake_marl.shield.wrappers import (

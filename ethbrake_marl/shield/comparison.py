@@ -1,4 +1,4 @@
-"""The comparison of what happened with what was predicted: to the last bit, the harm so far included."""
+"""A comparison of what happened with what was predicted: to the last bit, the harm so far included."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import numpy as np
 
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.state import Bools, Floats, Worlds
-from ethbrake_marl.shield.members import Running, ends_of_plans
+from ethbrake_marl.shield.certify import ends_of_plans
+from ethbrake_marl.shield.running import Running
 
 SLACK = 1e-9  # by more than this (m, m/s) a world lies outside what several members predict; one member is exact
 
@@ -16,9 +17,9 @@ GROUPS = (("gap", " m"), ("hit flag", ""), ("first-impact harm", " m2/s2"), ("to
 
 
 def seen_columns(packed: Packed) -> Floats:
-    """Running worlds and their harm so far in the columns of ``Running.states``, [n, S]: to be compared with them.
+    """Running worlds and their harm so far in the columns of ``Running.states``, [n, S], to compare the two.
 
-    Those are speeds, gaps, hit flags and both harms, with the obstacle first in each group where there is one. Raises
+    These are speeds, gaps, hit flags and both harms, with the obstacle first in each group where there is one. Raises
     ``InvalidInput`` where only some of the worlds have one.
     """
     state, column = packed.state, packed.column
@@ -31,7 +32,7 @@ def seen_columns(packed: Packed) -> Floats:
 
 
 def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
-    """These worlds in the states [n, S] of a problem with them: speeds, gaps, hit flags, and those of the obstacle."""
+    """The worlds with speeds, gaps and hit flags (the obstacle's too) from the states [n, S] of their problem."""
     added = (states.shape[1] + 4) // 6 - worlds.N  # 1: columns of an obstacle, or of a post, in front of each group
     N = worlds.N + added
     gaps, hit = states[:, N : 2 * N - 1], states[:, 2 * N - 1 : 3 * N - 2] == 1.0

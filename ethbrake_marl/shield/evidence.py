@@ -1,4 +1,4 @@
-"""Was an intervention needed? Every one is simulated again without it."""
+"""Was an intervention needed? Each one is left out, and its episode simulated again."""
 
 from __future__ import annotations
 
@@ -21,13 +21,11 @@ from ethbrake_marl.shield.step import StepShield
 
 SAME_HARM = 1e-9  # harms (m2/s2) closer than this are one harm
 
-ALLOWANCES = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0, 1e6)  # m2/s2, of an operating curve
-
 VERDICTS = ("needed", "harmless", "costly")
 
 
 class Review(NamedTuple):
-    """What each logged intervention of the running episodes was good for; m interventions."""
+    """What each of the m logged interventions of the running episodes was good for."""
 
     world: Ints  # [m] row of the batch
     vehicle: Ints  # [m] whose action was replaced
@@ -43,13 +41,18 @@ class Review(NamedTuple):
 
 
 def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
-    """Simulate every intervention of a driven batch again without it: from there on the ``policy`` drives alone.
+    """Simulate each intervention's episode again without it: from that decision on the ``policy`` drives alone.
 
-    ``shield`` (with ``logging``) as it was when the episodes of ``worlds``, which are at the alert, had ended; what was
-    logged in earlier episodes is left out. ``policy`` proposed: an agent, or of several vehicles the whole team.
-    *needed*: harm would have been higher; *costly*: lower; *harmless*: the same. What was realised is simulated again,
-    too, so both harms are the engine's, also where the truth was not what the shield was told. Raises ``InvalidInput``
-    without a log, or for another number of worlds.
+    The verdict is *needed* where the harm would have been higher, *costly* where lower, *harmless* where the same. The
+    episode as it went is simulated again, too: so both harms are the engine's, even if the shield was told otherwise.
+
+    Args:
+        shield: with ``logging``, after the last episodes of ``worlds``; entries of earlier episodes are left out.
+        policy: proposed in these episodes: an agent, or of several vehicles the whole team.
+        worlds: at the alert.
+
+    Raises ``InvalidInput`` without a log, or for another number of worlds.
+
     """
     if shield.log is None or shield.running is None:
         raise InvalidInput("review: nothing was logged; make the shield with logging=True, and drive behind it")
@@ -70,7 +73,7 @@ def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
 
 
 def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: Ints, step: Ints) -> Floats:
-    """In some worlds [m], when what was applied is applied again up to decision ``step`` [m], then who proposes."""
+    """Harm in some worlds [m] if the applied actions are repeated before decision ``step`` [m], then the policy."""
     scenario, plan = shield.scenario, shield.backup.plan[world]
     actions = plan.reshape(*plan.shape[:2], len(shield.vehicles))
     again = {

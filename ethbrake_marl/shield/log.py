@@ -1,4 +1,4 @@
-"""The log of a step shield: every decision in which something else than the proposal was applied."""
+"""The log of a step shield: every decision in which it replaced a proposed action."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.physics.state import Floats, Ints
-from ethbrake_marl.shield.members import Backup, Decision, Running
+from ethbrake_marl.shield.certify import Backup, Decision
+from ethbrake_marl.shield.running import Running
 
 
 class Intervention(NamedTuple):
-    """One decision in which something else than the proposal was applied."""
+    """One replaced action."""
 
     world: int  # row of the batch
     vehicle: int  # index of the shielded vehicle, 0 = front
@@ -25,13 +26,13 @@ class Intervention(NamedTuple):
     bound: float  # m2/s2, from now on
     margin: float  # m2/s2; negative: what the proposal would have cost beyond the budget at least
     state: Floats  # [S] at the decision
-    plan: Floats  # [L] that was held, of several vehicles [L, K]; before ``step`` what was applied
+    plan: Floats  # [L] the plan at the decision, of several vehicles [L, K]; before ``step`` the applied actions
 
 
 def interventions(
     now: Running, episode: Ints, vehicles: Sequence[int], proposed: Floats, decision: Decision, held: Backup
 ) -> list[Intervention]:
-    """What a decision made from ``now`` replaced; ``episode`` [n] numbers the rows' episodes."""
+    """The actions that a decision replaced. ``now``: the episodes before it; ``episode`` [n]: their numbers."""
     times, states, shape = now.time_s, now.nominal().states, (now.n, len(vehicles))
     columns = (proposed, decision.applied, decision.reason, decision.margin, decision.intervened)
     given, applied, reason, margin, replaced = (np.reshape(column, shape) for column in columns)

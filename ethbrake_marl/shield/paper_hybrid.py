@@ -1,16 +1,18 @@
 """The paper's hybrid (Algorithm 1): at the alert, choose between policy and baseline for the whole episode.
 
-The policy is rolled out in the engine from the alert on; its harm (each impact summed once) is compared with the
-baseline's ``H*`` and the lower one drives the episode. With ``H*`` coupled (realised in the same engine) the hybrid
-is never worse than the baseline, in any world, as long as the policy drives as it did in that rollout; one that draws
-its actions does not, and needs the step shield. With the paper's pairwise ``H*``, which treats the two pairs as
-independent, that does not hold: the pairwise figure is about half of what the same deceleration realises.
+The policy is rolled out in the engine from the alert on. Its harm, each impact summed once, is compared with the
+baseline's ``H*``; whichever is lower drives the episode.
+
+With the coupled ``H*``, realised in the same engine, the hybrid is never worse than the baseline in any world, as long
+as the policy drives as it did in the rollout. A policy that draws its actions does not, and needs the step shield. With
+the paper's pairwise ``H*`` this does not hold: it treats the two pairs as independent, and is about half of the harm
+that the same deceleration realises.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,32 +22,23 @@ from ethbrake_marl.agents.protocol import Agent, AgentAround, Source, check_agen
 from ethbrake_marl.engine.engine import Engine, Ruling
 from ethbrake_marl.engine.memory import Memory, ask_script, begin_script, renew_memory
 from ethbrake_marl.engine.scripts import Script
-from ethbrake_marl.errors import InvalidInput, check_one_learner
 from ethbrake_marl.game.actions import command_to_action
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.checks import check_scenario
-from ethbrake_marl.shield.options import (
-    BelievedGuard,
-    Bound,
-    Guarded,
-    Proposing,
-    ShieldGuard,
-    ShieldOptions,
-    StepGuard,
-    proposing_agent,
-    proposing_agents,
-    read_options,
-)
+from ethbrake_marl.shield.contract import Guarded, ShieldGuard, ShieldMode
+
+Bound = Literal["coupled", "pairwise"]  # whose H* and a*: of the engine's physics, or the paper's closed form
 
 
 class HybridAgent(AgentAround):
-    """Drives by ``policy`` in the worlds where its rolled-out harm is at most ``H*``, else by E-V2X-BM.
+    """Drive by ``policy`` in the worlds where its rolled-out harm is at most ``H*``, else by E-V2X-BM.
 
-    ``bound`` says which ``H*`` and ``a*``; ``harm_count`` which harm counts. Its memory holds ``chosen_policy`` [n],
-    who drives; ``policy_harm`` [n] and ``bound_harm`` [n] were compared, ``predicted_harm`` [n] is the lower one.
-    Raises ``InvalidInput`` for an unknown ``bound`` or ``harm_count``, and for what is not an agent.
+    ``bound`` chooses ``H*`` and ``a*``, ``harm_count`` the harm that counts. The memory holds ``chosen_policy`` [n],
+    where the policy drives; ``policy_harm`` [n] and ``bound_harm`` [n], which were compared; and ``predicted_harm``
+    [n], the lower one of the two. Raises ``InvalidInput`` for an unknown ``bound`` or ``harm_count``, and for what is
+    not an agent.
     """
 
     adds = Source.MODEL  # in which both are compared
@@ -62,7 +55,7 @@ class HybridAgent(AgentAround):
         self.harm_count: HarmCount = harm_count
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Choose in these worlds."""
+        """Roll the policy out, and choose in each world."""
         policy = begin_script(self.policy, alert, vehicle, scripts)
         backup = begin_script(self.backup, alert, vehicle, scripts)
         policy_harm = self._harm(alert, self.policy, vehicle)
@@ -85,7 +78,7 @@ class HybridAgent(AgentAround):
 
 
 class FixedCommand:
-    """One given command per world, for all of its episode."""
+    """One command per world, held for the whole episode."""
 
     name = "fixed"
 
@@ -101,15 +94,14 @@ ROUNDING = 1e-6  # of an action in 32 bits
 
 
 class EpisodeGuard(ShieldGuard):
-    """Mode ``episode``: ``HybridAgent`` chooses who drives at each alert, whatever is proposed.
+    """Mode ``episode``: the hybrid chooses who drives at each alert, whatever is proposed.
 
-    A proposal counts as replaced where it differs by more than the rounding of its 32 bits.
+    A proposal counts as replaced where it differs from the applied action by more than the rounding of 32 bits.
     """
 
-    def _make(self) -> None:
-        (policy,) = self._policies.values()
-        self._hybrid = HybridAgent(policy, self.scenario, bound=self.options.bound, harm_count=self.options.harm_count)
-        self._policies = {}  # the hybrid asks
+    def __init__(self, engine: Engine, hybrid: HybridAgent, *, where: str = "shield") -> None:
+        super().__init__(engine, {}, None, mode=ShieldMode.EPISODE, where=where)  # the hybrid asks its policy itself
+        self._hybrid = hybrid
 
     def _started(self, shield: Memory, alert: Worlds, rows: Ints) -> Memory:
         begun = begin_script(self._hybrid, alert, self.vehicles[0], self.scripts)
@@ -131,101 +123,3 @@ class EpisodeGuard(ShieldGuard):
         """Who drives, and what was compared; ``proposed_action`` is NaN where nothing was proposed."""
         compared = {name: memory.shield[name] for name in ("chosen_policy", "policy_harm", "bound_harm")}
         return self._of_step(ruling) | compared
-
-
-def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -> ShieldGuard:
-    """The guard of the options' mode for all learners of an engine, who proposes among them.
-
-    Raises ``InvalidInput`` where nobody learns, for several learners in another mode than ``step``, and for what is no
-    policy.
-    """
-    where, mode, scenario, vehicles = options.where, options.mode, engine.scenario, engine.learners
-    if not vehicles:
-        raise InvalidInput(
-            f"{where}: no vehicle of scenario {scenario.name!r} learns, so there is nobody to shield; pass"
-            " learners=['vehicle_2'] to the environment"
-        )
-    if mode != "step":
-        check_one_learner(
-            scenario.name,
-            [scenario.vehicle_names[i] for i in vehicles],
-            f"{where} needs exactly one learner in mode {mode}: what it certifies is known only if every other vehicle"
-            " follows a script; mode step shields several together; or pass learners=['vehicle_2'] to the environment",
-        )
-    if mode == "episode":
-        return EpisodeGuard(engine, {vehicles[0]: proposing_agent(policy, where)}, options)
-    policies = {} if policy is None else proposing_agents(policy, vehicles, where)
-    if options.believed:
-        return BelievedGuard(engine, policies, options)
-    return StepGuard(engine, policies, options, warns=True)
-
-
-class Attached:
-    """A guard in the engine of an environment, for the wrapper that put it there.
-
-    Raises ``InvalidInput`` for what is not one of this package's environments, or is shielded already.
-    """
-
-    def __init__(
-        self, env: object, interface: type, maker: str, policy: Proposing | None, where: str, options: Mapping[str, Any]
-    ) -> None:
-        self.options, self._env = read_options(where, options), env
-        engine = self._reached()
-        if isinstance(engine, Engine) and isinstance(engine.guard, ShieldGuard):
-            first = engine.guard.options
-            raise InvalidInput(
-                f"{where}: a {first.where} (mode {first.mode}) shields this environment already, and its bound"
-                " holds for one shield alone; give that one other options, or close() it first"
-            )
-        if isinstance(getattr(env, "attached", None), Attached):
-            raise InvalidInput(f"{where}: {env} is a shield that was closed; put this one around what that is around")
-        if not (isinstance(env, interface) and isinstance(engine, Engine)):
-            raise InvalidInput(
-                f"{where}: goes around {maker}, not {env}; eb.shield(env) chooses the one for an environment of ours"
-            )
-        self.engine, self._left = engine, Guarded(None, {})
-        self.guard = guard_of(engine, policy, self.options)
-        engine.protect(self.guard)
-
-    @property
-    def memory(self) -> Guarded:
-        """What the guard remembers now, or, once it was closed, remembered last."""
-        memory: Guarded | None = self.engine.guarded if self.engine.guard is self.guard else self._left
-        return Guarded(None, {}) if memory is None else memory
-
-    @property
-    def shield(self) -> Any:
-        """As it is now, to be read; None before a reset.
-
-        A ``StepShield`` or ``BelievedShield``; in mode ``episode`` what the ``HybridAgent`` remembers.
-        """
-        return self.memory.shield
-
-    def _reached(self) -> Any:
-        """The engine of the environment inside, as it is now."""
-        return getattr(getattr(self._env, "unwrapped", self._env), "engine", None)
-
-    def check_open(self) -> None:
-        """Raise ``InvalidInput`` where this shield bounds nothing: it was closed, or another environment is inside."""
-        if self._reached() is not self.engine:
-            raise InvalidInput(
-                f"{self.options.where}: another environment is inside than the one that is shielded; put a shield"
-                " around that one"
-            )
-        if self.engine.guard is not self.guard:
-            raise InvalidInput(f"{self.options.where}: this shield was closed; put a new one around the environment")
-
-    def close(self) -> None:
-        """Let go of the engine."""
-        if self.engine.guard is self.guard:
-            self._left = self.memory
-            self.engine.protect(None)
-
-    def penalty(self) -> Floats:
-        """What the interventions of the last step take off the rewards, [n, L]."""
-        self.check_open()
-        ruling = self.engine.ruling
-        if ruling is None:
-            return np.zeros((self.engine.n, len(self.engine.learners)))
-        intervened = self.guard.intervened(ruling) & ruling.asked[:, np.newaxis]
-        return np.asarray(self.options.intervention_penalty * intervened, np.float64)

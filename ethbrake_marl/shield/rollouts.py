@@ -1,7 +1,7 @@
-"""Rollouts of the policies that propose: their actions from the alert, and from any later decision, as plans.
+"""Rollouts of the policies that propose: their actions from the alert, or from a later decision, as a plan.
 
-What a rollout does is written down as a plan and certified like any other (``plan_harm``): a policy that would drive
-differently the second time costs interventions, never the bound.
+The plan is certified like any other (``plan_harm``). A policy that would drive differently the second time costs
+interventions, never the bound.
 """
 
 from __future__ import annotations
@@ -22,25 +22,17 @@ from ethbrake_marl.physics.episode import CLOCK
 from ethbrake_marl.physics.motion import has_acted
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.certify import Backup, Decision, certify, from_now, plan_harm
 from ethbrake_marl.shield.comparison import ends_under, worlds_at
-from ethbrake_marl.shield.members import (
-    NO_CERTIFICATE,
-    NOT_A_NUMBER,
-    Backup,
-    Decision,
-    Running,
-    ShieldReason,
-    certify,
-    from_now,
-    plan_harm,
-)
+from ethbrake_marl.shield.reasons import NO_CERTIFICATE, NOT_A_NUMBER, ShieldReason
+from ethbrake_marl.shield.running import Running
 
 
 class Proposer(NamedTuple):
-    """Who proposes, and what they see now: enough to try, on copies, what they would do later."""
+    """The policies that propose, with all that a rollout of them needs."""
 
     policies: Mapping[int, Agent]  # by shielded vehicle, front to rear
-    memories: Mapping[int, Memory]  # theirs of the running episodes, this decision's action included
+    memories: Mapping[int, Memory]  # of the policies, this decision's action included
     worlds: Worlds  # [n] now
 
 
@@ -49,7 +41,7 @@ def rolled_out(
 ) -> Floats:
     """The actions [n, width] (several vehicles: [n, width, K]) of policies that drive unshielded from the alert.
 
-    Full braking beyond their episode's end.
+    After the end of an episode: full braking.
     """
     team = Team({i: _Rounded(policy) for i, policy in policies.items()}, next(iter(policies.values())).name)
     engine = episode_engine(worlds, team, scenario)
@@ -58,16 +50,33 @@ def rolled_out(
     return actions[:, :, 0] if isinstance(vehicle, int) else actions
 
 
+def certify_by_policy(
+    decision: Decision, running: Running, proposed: Floats, budget: Floats, held: Floats, proposer: Proposer
+) -> Decision:
+    """The decision, with proposals accepted that only a rollout of the policy can certify: see ``certify_rollouts``."""
+    rejected = (decision.reason == NO_CERTIFICATE).reshape(running.n, -1).any(axis=1)
+    rows = np.flatnonzero(rejected)
+    if not rows.size:
+        return decision
+    again = certify_rollouts(running, proposed, rows, budget, held, proposer)
+    margin, plan = decision.margin.copy(), again.backup.plan
+    margin[rows] = np.maximum(margin[rows], again.margin)
+    assert (plan == from_now(decision.backup.plan[rows], plan, again.after.steps - 1)).all()  # one past
+    kept = np.flatnonzero((again.reason != NO_CERTIFICATE).reshape(len(rows), -1).all(axis=1))
+    return decision._replace(margin=margin).put(rows[kept], again._replace(margin=margin[rows]), kept)
+
+
 def certify_rollouts(
     running: Running, proposed: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
 ) -> Decision:
-    """Decide again in ``rows``, where the proposals found no certificate, with the policy itself as the later plan.
+    """Decide again in ``rows``, where the proposals have no certificate, with the policy itself as the later plan.
 
-    The plan that is tried is the proposal (clipped, a number), then what the policy does from the state after it. Where
-    it keeps the budget it becomes the backup, and the proposal is "what the plan says"; elsewhere the reason says that
-    something else must be applied. ``running``, ``proposed``, ``budget`` and the plans ``held`` are those of the
-    whole batch. Of several vehicles, who proposes no number keeps its planned action. Returns the decision of those
-    rows alone.
+    The tried plan is the proposal, clipped, then what the policy does from the state after it. Where it keeps the
+    budget it becomes the backup, and the proposal is the plan's own action. Elsewhere the reason stays
+    ``NO_CERTIFICATE``. Of several vehicles, one whose proposal is no number keeps its planned action.
+
+    ``running``, ``proposed``, ``budget`` and the plans ``held`` are of the whole batch; the decision is of ``rows``
+    alone.
     """
     part, least, silent = running.take(rows), budget[rows], np.isnan(proposed[rows])
     planned = held[rows, np.minimum(running.steps[rows], held.shape[1] - 1)]
@@ -89,9 +98,9 @@ def certify_rollouts(
 def _later_plan(
     running: Running, first: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
 ) -> Floats:
-    """The plans of ``rows``: what was applied, the ``first`` action ([m] or [m, K]), then the policies'.
+    """The plans of ``rows``: the applied actions, the ``first`` one ([m] or [m, K]), then the policies' actions.
 
-    Given up once above the budget.
+    A rollout stops once its harm is above the budget.
     """
     policies, memories, worlds = proposer
     memories, seen = take_memory(memories, rows), worlds.take(rows)
@@ -108,7 +117,7 @@ def _later_plan(
         episodes = episodes._replace(ended=episodes.ended | (so_far > most))
         if episodes.ended.all():
             return plan
-        # as a driver sees them at the next decisions, the last actions in force
+        # as a driver sees the worlds at the next decisions, with the last actions in force
         commands = episodes.problem.command[:, -seen.N :].copy()  # without an obstacle ahead
         for c, vehicle in enumerate(policies):
             column = action if action.ndim == 1 else action[:, c]
@@ -126,27 +135,27 @@ def _later_plan(
 
 
 def no_constants(plan: Floats) -> Floats:
-    """No constant action to replace the rest of a plan."""
+    """An empty list of constant actions: nothing may replace the rest of a plan."""
     return np.zeros((0, *plan.shape[2:]))
 
 
 def proposed_actions(
     policies: Mapping[int, Agent], memories: Mapping[int, Memory], worlds: Worlds
 ) -> tuple[Floats, dict[int, Memory]]:
-    """What the policies propose, [n, K], and what they remember then."""
+    """The actions that the policies propose, [n, K], and their memories afterwards."""
     asked = {i: proposed_action(policy, worlds, memories[i], i) for i, policy in policies.items()}
     after = {i: memory for i, (_, memory) in asked.items()}
     return np.stack([action for action, _ in asked.values()], axis=1), after
 
 
 def proposed_action(policy: Agent, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-    """What a policy proposes, as actions [n] in [-1, 1]; a command that is no number stays none. And its memory."""
+    """The actions [n] in [-1, 1] that a policy proposes, and its memory afterwards. A NaN command stays NaN."""
     command, memory = ask_script(policy, worlds, memory, vehicle)
     return np.where(np.isnan(command), np.nan, command_to_action(command, worlds.vehicles, vehicle)), memory
 
 
 class _Rounded(AgentAround):
-    """A policy whose commands are applied as its actions are written down; it remembers the last ``action``."""
+    """A policy whose commands go through actions, as in a plan; its memory holds the last ``action``."""
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         return {"policy": begin_script(self.policy, alert, vehicle, scripts), "action": np.zeros(alert.n)}

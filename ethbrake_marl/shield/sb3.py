@@ -13,8 +13,7 @@ from ethbrake_marl.envs.pettingzoo import SeededInside
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.state import Bools
-from ethbrake_marl.shield.options import Proposing
-from ethbrake_marl.shield.paper_hybrid import Attached
+from ethbrake_marl.shield.attach import Attached, Proposing
 
 
 class ShieldedVecEnv(SeededInside, VecEnvWrapper):
@@ -77,6 +76,6 @@ class ShieldedVecEnv(SeededInside, VecEnvWrapper):
         self.class_attributes = dict(inspect.getmembers(self.__class__))
 
     def close(self) -> None:
-        """Let go of the environment, and close it."""
+        """Take the shield off the environment, and close that."""
         self.attached.close()
         super().close()

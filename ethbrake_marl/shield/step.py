@@ -1,97 +1,100 @@
-"""The plan that a shield starts with at the alert: constants of least harm, or what the policies do, if that is
-better.
+"""Step mode of the shield: a guaranteed harm that holds at every step, whoever proposes the actions.
 
-For one shielded vehicle the constant is the coupled optimum. For several it is the best of these: all brake fully,
-one of them takes its coupled optimum while the others brake fully, and what a descent finds from the best of those,
-one vehicle after the other.
+**Claim.** Let ``B`` be the bound at the first decision: the harm of the backup plan, executed in the engine. If every
+step applies what ``certify`` says, the harm realised at the end of the episode is at most ``B``, whatever is proposed,
+and the bound never rises on the way. The end is rest or the scenario's horizon. Of what still moves then, and of what
+happens afterwards, nothing is claimed.
+
+**Induction.** Between two decisions the shield holds a *plan*, an action for every decision up to the horizon, and its
+harm ``c``: the harm of the whole episode if that plan is executed from the present state, with the harm so far, and
+with the pairs that were hit before. Both come from one function, ``members.follow_plan``. It advances decision by
+decision with the operations of the engine's step in their order, and adds harm in its order. So:
+
+1. *Start.* ``c = B``.
+2. *The proposal is applied* only with a plan from the next state whose harm, computed by ``follow_plan`` from that very
+   state, is at most the budget. That plan is held from now on, and ``c`` is its harm. If the proposal is the plan's own
+   action, the rest of the plan is that plan, with the same ``c``: the same operations on the same numbers.
+3. *The plan's action is applied* otherwise. The rest of the plan is executed from a state that ``follow_plan`` passed
+   through when it found ``c``: the harm remains ``c`` to the last bit. A plan that harms less may replace it.
+4. *End.* When the episode ends nothing is left to execute, and ``c`` is the harm realised.
+
+The budget is ``c``, or anything between ``c`` and ``B``, so ``c <= B`` always. ∎ No tolerance enters: where the engine
+does what it is said to do, realised harm and the last bound are the same double.
+
+**Several vehicles.** Where several are shielded, an action above is a row of actions, one for each vehicle, and so is
+each entry of the plan; the proof is the same. All proposals together are tried first. If they have no certificate, the
+vehicles are taken from front to rear: each proposal replaces that vehicle's action in the joint plan, and is accepted
+with a plan behind it whose harm is at most the budget; otherwise that vehicle's planned action stays. Each attempt
+begins with a certified plan, and ends with one.
+
+**Several members.** A world may stand for several possible ones, its members. Then every harm above is the largest over
+them, and all are advanced by the same actions: the realised harm of *every* member is at most ``B``.
 """
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, Self, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.agents.driving import script_agents
-from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.protocol import Agent, fixed_commands
-from ethbrake_marl.engine.profiles import profile_problem
+from ethbrake_marl.engine.profiles import ProfileProblem, profile_problem
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, renumbered, unknown_name
-from ethbrake_marl.extensions.certified.enclosure import CORNERS, INTERIOR, Boxes, checked_robust
-from ethbrake_marl.extensions.certified.uncertainty import Uncertainty
-from ethbrake_marl.game.actions import command_to_action
 from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.certify import CONSTANTS, Backup, Decision, certify, from_now, plan_harm
 from ethbrake_marl.shield.checks import check_amount, check_scenario
 from ethbrake_marl.shield.comparison import SLACK, ends_under
+from ethbrake_marl.shield.first_plan import best_constants, joint_constants
 from ethbrake_marl.shield.log import Intervention, interventions
-from ethbrake_marl.shield.members import (
-    CONSTANTS,
-    NO_CERTIFICATE,
-    Backup,
-    Decision,
-    Running,
-    ShieldReason,
-    begin_running,
-    bettered_plan,
-    certify,
-    descend_constants,
-    from_now,
-    plan_harm,
-    put,
-)
-from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts, rolled_out
-
-LOOKED_AT = np.linspace(0.0, -1.0, 101)  # constant actions, for the bound at the alert where there are several members
-
-GRID = np.linspace(0.0, -1.0, 21)  # ... of the descent of several vehicles
-
-ROUNDS = 2  # of that descent
-
-LADDER = np.linspace(0.0, -1.0, 5)  # actions of the first and of the last vehicle in the constants of several
+from ethbrake_marl.shield.reasons import ShieldReason
+from ethbrake_marl.shield.rollouts import Proposer, certify_by_policy, rolled_out
+from ethbrake_marl.shield.running import Running, begin_running, put
 
 Cap = Literal["baseline"]  # whose plan a vehicle's harm is the most that it may bear
 
 
-def joint_constants(vehicles: int) -> Floats:
-    """Constant actions [C, K] of several vehicles, front to rear: all alike, or evenly from one action to another."""
-    alike = np.repeat(np.array(CONSTANTS)[:, np.newaxis], vehicles, axis=1)
-    share = np.linspace(0.0, 1.0, vehicles)
-    ladders = [first + share * (last - first) for first in LADDER for last in LADDER if first != last]
-    return np.concatenate([alike, ladders])
-
-
-def held(action: Floats, width: int) -> Floats:
-    """The plans [n, width, K] that hold these actions [n, K]."""
-    return np.repeat(action[:, np.newaxis], width, axis=1)
-
-
 class StepShield:
-    """Guarantees the harm of a batch: ``begin`` when episodes start, ``decide`` in every step.
+    """Guarantee the harm of a batch: ``begin`` when episodes start, ``decide`` in every step.
 
-    Both change it in one piece, and nothing that it holds is changed in place: what fails, or is interrupted, leaves
-    bound, plan and trust as they were, and a ``copy.copy`` goes on apart.
+    Both replace everything it holds in one assignment, and change nothing in place. So what fails, or is interrupted,
+    leaves bound, plan and trust as they were, and a ``copy.copy`` goes on apart.
 
-    The bound starts as the harm of the coupled optimum, realised decision by decision, or as that of a ``policy``
-    rolled out from the alert where that is lower, and only ever falls; ``allowance`` (m2/s2) is what the budget grants
-    above it (0: none), and the bound is then that budget until the episode ends. It bounds the harm up to the
-    scenario's horizon and says nothing of what still moves then, or of what happens afterwards (``settles`` [n]: where
-    the plan held at the alert leaves nothing moving). The other vehicles follow ``others``
-    (default: the scenario's scripts), whose commands must be fixed at the alert. What happens is compared with what was
-    predicted, bit by bit: where it differs (a vehicle that brakes beyond its capacity, a number that is none, a message
-    that never came) ``distrusted`` [n] is set, nothing is guaranteed any more, and for the rest of the episode the
-    fallback ``best constant`` drives: the better one of the plan's rest and the constants, chosen again after every
-    surprise. In a world that is asked ``only`` after its episode was to be over, full braking is applied. With an
-    ``uncertainty`` (robust mode) all of this holds for the worst member of each world, and what is seen must lie within
-    the range of their predictions. Raises ``InvalidInput`` for an unknown count or vehicle, a negative allowance,
-    others whose commands are not fixed, or what ``robust`` interior cannot certify.
+    The bound starts as the harm of the coupled optimum, realised decision by decision, or of a ``policy`` rolled out
+    from the alert where that harms less; and it only falls. It bounds the harm up to the scenario's horizon, and says
+    nothing of what still moves then, or of what happens afterwards. ``settles`` [n] says where the plan at the alert
+    leaves nothing moving.
+
+    What happens is compared with what was predicted, bit by bit. Where it differs (a vehicle brakes beyond its
+    capacity, a number is none, a message never came) ``distrusted`` [n] is set, and nothing is guaranteed any more. For
+    the rest of the episode the fallback ``best constant`` drives: the better one of the plan's rest and the constants,
+    chosen again after every surprise. A world that is asked ``only`` after its episode was to be over brakes fully.
+
+    With several ``possible`` worlds for each one, all of this holds for the worst of them, and what is seen must lie
+    within the range of their predictions.
+
+    Args:
+        scenario: of all worlds.
+        vehicle: index of the shielded vehicle, or of several, front to rear.
+        harm_count: the harm that is guaranteed.
+        allowance: what the budget grants above the bound, m2/s2; the bound is then that budget until the episode ends.
+        others: scripts of the other vehicles, whose commands must be fixed at the alert; None: the scenario's.
+        cap: ``baseline``: no vehicle bears more than under the plan of least harm.
+        logging: keep every intervention in ``log``.
+
+    Raises ``InvalidInput`` for an unknown count or vehicle, a negative allowance, or others whose commands are not
+    fixed.
+
     """
+
+    possible_are = "possible worlds"  # what messages say of a world's members
 
     def __init__(
         self,
@@ -101,9 +104,7 @@ class StepShield:
         harm_count: HarmCount = "first",
         allowance: float = 0.0,
         others: Mapping[int, Script] | None = None,
-        uncertainty: Uncertainty | None = None,
         cap: Cap | None = None,
-        robust: str = CORNERS,
         logging: bool = False,
     ) -> None:
         check_harm_count(harm_count)
@@ -116,17 +117,11 @@ class StepShield:
             raise InvalidInput(f"shield: vehicle = {vehicle!r}: must be an index from 0 to {scenario.vehicles - 1}")
         if list(each) != sorted(set(each)):
             raise InvalidInput(f"shield: vehicle = {vehicle!r}: several are named front to rear, each once")
-        self.vehicles = tuple(map(int, each))
-        self.vehicle = self.vehicles if several else self.vehicles[0]
-        if uncertainty is not None and (len(self.vehicles) > 1 or cap is not None):
-            what = "several vehicles" if cap is None else "a cap"
-            raise InvalidInput(f"shield: uncertainty: {what} with it: not covered; mode robust shields one vehicle")
         if cap not in (None, *get_args(Cap)):
             raise unknown_name("shield cap", cap, get_args(Cap))
-        self.scenario, self.harm_count, self.allowance = scenario, harm_count, allowance
-        self.uncertainty, self.cap = uncertainty, cap
-        self.robust = checked_robust(robust, "shield")
-        self.boxes: Boxes | None = None  # where every world of them is certified
+        self.vehicles = tuple(map(int, each))
+        self.vehicle = self.vehicles if several else self.vehicles[0]
+        self.scenario, self.harm_count, self.allowance, self.cap = scenario, harm_count, allowance, cap
         self.logging = logging
         self._entries: list[Intervention] = []  # shared with copies; the first ``_logged`` of them are of this one
         self._logged = 0
@@ -141,7 +136,6 @@ class StepShield:
         self.baseline_shares: Floats = np.zeros((0, 0))  # [n, N] what each vehicle bears under the best constants
         scripts = script_agents(scenario, except_for=self.vehicles) if others is None else others
         self._others = {i: script for i, script in scripts.items() if i not in self.vehicles}
-        Boxes.check_possible(self.robust, scenario, harm_count, self._others)
         self._width = int(Decisions(np.zeros(1), scenario.time_step_s).before(scenario.horizon_s)[0]) + 1
 
     @property
@@ -182,11 +176,10 @@ class StepShield:
             raise InvalidInput("shield: shares, but no episode has begun; call begin first")
         return ends_under(self.running.nominal(), self.backup.plan)[1][:, -self.scenario.vehicles :]
 
-    def take(self, rows: Ints) -> StepShield:
+    def take(self, rows: Ints) -> Self:
         """The shield of some rows, which goes on apart."""
         part, held = copy.copy(self), self.backup
         part.running = None if self.running is None else self.running.take(rows)
-        part.boxes = None if self.boxes is None else self.boxes.take(rows)
         part.backup = held._replace(plan=held.plan[rows], harm=held.harm[rows])
         for name in ("first_bound", "alone_harm", "settles", "replaced", "distrusted", "baseline_shares", "episode"):
             setattr(part, name, getattr(self, name)[rows])
@@ -200,11 +193,16 @@ class StepShield:
         *,
         possible: Worlds | None = None,
     ) -> None:
-        """New episodes start in these rows; ``worlds`` holds those rows only, at the alert, as they are believed.
+        """Start new episodes in these rows.
 
-        The ``policy`` that proposes (of several vehicles: one for each, by index) is rolled out from there. Certified
-        are the members of the ``uncertainty``, or the ``possible`` worlds [n * M], each world's own one first.
         Rows 0 to k - 1 together may also begin a larger batch. Raises ``InvalidInput`` for rows that are not there.
+
+        Args:
+            worlds: of these rows alone, at the alert, as the shield takes them to be.
+            rows: where they start.
+            policy: proposes, and is rolled out from the alert; of several vehicles, one for each by its index.
+            possible: the members of each world [n * M], the world itself first; None: ``members_of(worlds)``.
+
         """
         running_rows = len(self.first_bound)
         if not (rows < running_rows).all() and sorted(rows.tolist()) != list(range(len(rows))):
@@ -213,37 +211,19 @@ class StepShield:
                 " rows at once"
             )
         new = copy.copy(self)
-        new._begin(worlds, rows, policy, possible)
+        new._begin(worlds, rows, policy, self.members_of(worlds) if possible is None else possible)
         self.__dict__.update(new.__dict__)
 
-    def _begin(
-        self, worlds: Worlds, rows: Ints, policy: Agent | Mapping[int, Agent] | None, possible: Worlds | None
-    ) -> None:
+    def members_of(self, worlds: Worlds) -> Worlds:
+        """The members of worlds at the alert, [n * M]: here each world alone."""
+        return worlds
+
+    def _begin(self, worlds: Worlds, rows: Ints, policy: Agent | Mapping[int, Agent] | None, possible: Worlds) -> None:
         """Find the plan to start with in each of these worlds, and keep it in their rows."""
-        if possible is None:
-            possible = worlds if self.uncertainty is None else self.uncertainty.members(worlds)
-        members, vehicles, horizon_s = possible.n // worlds.n, self.vehicles, self.scenario.horizon_s
-        if members > 1 and self.cap is not None:
-            raise InvalidInput(f"shield: cap {self.cap!r} and {members} possible worlds: give one of the two")
-        latest = possible.vehicles.latency_s[:, list(vehicles)].min(axis=1).max()
-        if members > 1 and not latest < horizon_s:
-            raise InvalidInput(
-                f"uncertainty: {self.uncertainty}: vehicle_{vehicles[0] + 1} may decide first at {latest:g} s; must be"
-                f" before the horizon, {horizon_s:g} s"
-            )
-        try:
-            others = fixed_commands(self._others, possible, "shield", vehicle=None)
-        except InvalidInput as error:
-            raise error if members == 1 else InvalidInput(f"uncertainty: {self.uncertainty}: {error}") from None
-        with renumbered(np.repeat(np.arange(worlds.n), members)):
-            problem = profile_problem(
-                possible, vehicles, harm_count=self.harm_count, horizon_s=horizon_s,
-                time_step_s=self.scenario.time_step_s, others_mps2=others, written_out=self.scenario.has_obstacle,
-            )  # fmt: skip
+        members, vehicles = possible.n // worlds.n, self.vehicles
+        problem = self._problem(possible, members)
         running = begin_running(problem, members)
-        plan = self._best_constants(worlds, running)
-        if members > 1:
-            plan = bettered_plan(running, plan, LOOKED_AT)[0]
+        plan = best_constants(worlds, running, self.vehicle, self._width, self.scenario, self.harm_count)
         harm, alone = plan_harm(running, plan), np.full(worlds.n, np.inf)
         borne = ends_under(running, plan)[1]
         if self.cap is not None:
@@ -261,60 +241,65 @@ class StepShield:
             plan[better] = actions[better]
             harm = np.where(better, alone, harm)
         settles = ends_under(running, plan)[0]
-        if members > 1 and self.robust == INTERIOR:
-            boxes = Boxes.of(possible, problem, worlds.n, self.scenario, self._others)
-            harm = boxes.at_alert(plan, harm)
-            self.boxes = boxes.placed(self.boxes, rows)
-        constants = joint_constants(len(vehicles)) if len(vehicles) > 1 else np.array(CONSTANTS)
+        harm = self._bound_at_alert(possible, problem, rows, plan, harm)
         new: dict[str, NDArray[Any]] = {
             "first_bound": harm, "alone_harm": alone, "settles": settles,
             "replaced": np.zeros((worlds.n, *plan.shape[2:]), np.int64), "distrusted": np.zeros(worlds.n, np.bool_),
             "baseline_shares": borne[::members, borne.shape[1] - worlds.N :],
         }  # fmt: skip
+        constants = joint_constants(len(vehicles)) if len(vehicles) > 1 else np.array(CONSTANTS)
+        self._keep(rows, running, Backup(plan, harm, constants), new)
+
+    def _problem(self, possible: Worlds, members: int) -> ProfileProblem:
+        """All possible worlds with the commands of the vehicles that are not shielded; refused if these are not known.
+
+        Where there are several members, each must also leave the shielded vehicles a decision before the horizon.
+        """
+        vehicles, horizon_s = self.vehicles, self.scenario.horizon_s
+        if members > 1 and self.cap is not None:
+            raise InvalidInput(f"shield: cap {self.cap!r} and {members} possible worlds: give one of the two")
+        latest = possible.vehicles.latency_s[:, list(vehicles)].min(axis=1).max()
+        if members > 1 and not latest < horizon_s:
+            raise InvalidInput(
+                f"{self.possible_are}: vehicle_{vehicles[0] + 1} may decide first at {latest:g} s; must be before the"
+                f" horizon, {horizon_s:g} s"
+            )
+        try:
+            others = fixed_commands(self._others, possible, "shield", vehicle=None)
+        except InvalidInput as error:
+            raise error if members == 1 else InvalidInput(f"{self.possible_are}: {error}") from None
+        with renumbered(np.repeat(np.arange(possible.n // members), members)):
+            return profile_problem(
+                possible, vehicles, harm_count=self.harm_count, horizon_s=horizon_s,
+                time_step_s=self.scenario.time_step_s, others_mps2=others, written_out=self.scenario.has_obstacle,
+            )  # fmt: skip
+
+    def _bound_at_alert(
+        self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
+    ) -> Floats:
+        """The bound [n] of the first plans, whose harm is ``harm`` in the worst member: here that harm."""
+        return harm
+
+    def _keep(self, rows: Ints, running: Running, backup: Backup, new: dict[str, NDArray[Any]]) -> None:
+        """Put what has begun into its rows, or begin a larger batch with it."""
         old, order = self.running, np.argsort(rows)
-        if old is None or worlds.n >= old.n:
-            self.running, self.backup = running.take(order), Backup(plan[order], harm[order], constants)
+        if old is None or running.n >= old.n:
+            self.running = running.take(order)
+            self.backup = backup._replace(plan=backup.plan[order], harm=backup.harm[order])
             new = {name: values[order] for name, values in new.items()}
-            new["episode"] = np.full(worlds.n, self.episode.max(initial=-1) + 1)
+            new["episode"] = np.full(running.n, self.episode.max(initial=-1) + 1)
         else:
             at = old.rows_of(rows)
             self.running = Running(
-                old.problem.put(at, problem), put(old.states, at, running.states), put(old.steps, rows, running.steps),
-                put(old.ended, at, running.ended), put(old.caps, at, running.caps) if old.caps.size else old.caps,
+                old.problem.put(at, running.problem), put(old.states, at, running.states),
+                put(old.steps, rows, running.steps), put(old.ended, at, running.ended),
+                put(old.caps, at, running.caps) if old.caps.size else old.caps,
             )  # fmt: skip
-            self.backup = Backup(put(self.backup.plan, rows, plan), put(self.backup.harm, rows, harm), constants)
+            plan, harm = put(self.backup.plan, rows, backup.plan), put(self.backup.harm, rows, backup.harm)
+            self.backup = backup._replace(plan=plan, harm=harm)
             new["episode"] = self.episode[rows] + 1
             new = {name: put(getattr(self, name), rows, values) for name, values in new.items()}
         self.__dict__.update(new)
-
-    def _best_constants(self, worlds: Worlds, running: Running) -> Floats:
-        """The plans [n, L] or [n, L, K] of the best constant actions found."""
-        vehicles, members = list(self.vehicles), running.members
-        others = np.array(running.problem.command[::members, running.problem.command.shape[1] - worlds.N :])
-        others[:, vehicles] = -worlds.vehicles.braking_capacity_mps2[:, vehicles]
-
-        def alone(vehicle: int) -> Floats:
-            best = optimise_coupled(
-                worlds, vehicle, harm_count=self.harm_count, horizon_s=self.scenario.horizon_s, others_mps2=others
-            ).deceleration_mps2
-            return command_to_action(-best, worlds.vehicles, vehicle)
-
-        if isinstance(self.vehicle, int):
-            return np.repeat(alone(self.vehicle)[:, np.newaxis], self._width, axis=1)
-        if members > 1:  # a team of one vehicle: no other team is shielded against uncertainty
-            return held(alone(vehicles[0])[:, np.newaxis], self._width)
-        best = np.full((worlds.n, len(vehicles)), -1.0)
-        least = plan_harm(running, held(best, self._width))
-        for c in range(len(vehicles) + 1):
-            if c < len(vehicles):
-                action = np.full_like(best, -1.0)
-                action[:, c] = alone(vehicles[c])
-            else:
-                action = best.copy()
-                descend_constants(running.uncapped, GRID, ROUNDS, action)
-            harm = plan_harm(running, held(action, self._width))
-            best, least = np.where((harm < least)[:, np.newaxis], action, best), np.minimum(harm, least)
-        return held(best, self._width)
 
     def decide(
         self,
@@ -351,15 +336,9 @@ class StepShield:
         given[self.distrusted] = np.nan
         held, budget = self.backup, self.bound
         decision = certify(now, given, held, budget)
-        rejected = (decision.reason == NO_CERTIFICATE).reshape(len(asked), -1).any(axis=1)
-        if proposer is not None and (rows := np.flatnonzero(rejected)).size:
-            found = certify_rollouts(now, given, rows, budget, held.plan, proposer)
-            margin, plan = decision.margin.copy(), found.backup.plan
-            margin[rows] = np.maximum(margin[rows], found.margin)
-            assert (plan == from_now(decision.backup.plan[rows], plan, found.after.steps - 1)).all()  # one past
-            kept = np.flatnonzero((found.reason != NO_CERTIFICATE).reshape(len(rows), -1).all(axis=1))
-            decision = decision._replace(margin=margin).put(rows[kept], found._replace(margin=margin[rows]), kept)
-        decision = certify_inside(self.boxes, now, held, budget, decision, asked & ~self.distrusted)
+        if proposer is not None:
+            decision = certify_by_policy(decision, now, given, budget, held.plan, proposer)
+        decision = self._also_certified(now, held, budget, decision, asked & ~self.distrusted)
         decision.reason[asked & self.distrusted] = ShieldReason.ASSUMPTION_BROKEN
         decision.applied[goes_on] = -1.0  # its episode was to be over: it holds the brakes
         self.replaced = self.replaced + (decision.intervened.T & asked).T
@@ -371,6 +350,10 @@ class StepShield:
                 self._entries = self._entries[: self._logged]
             self._entries.extend(interventions(now, self.episode, self.vehicles, proposed, decision, held))
             self._logged = len(self._entries)
+        return decision
+
+    def _also_certified(self, now: Running, held: Backup, budget: Floats, decision: Decision, asked: Bools) -> Decision:
+        """What is left of a decision that all members allow: here all of it. ``held``: the backup before it."""
         return decision
 
     def as_seen(self, seen: Floats) -> Floats:
@@ -386,27 +369,25 @@ class StepShield:
     def expects(self, seen: Floats) -> Bools:
         """Where what is seen now [n, columns] does not contradict what was predicted, [n].
 
-        One member: where it is what was predicted, to the bit. Several: where it lies within the range of their
-        predictions, by column; once one of them has had an impact, worlds between the corners may leave that range, and
-        any finite numbers will do. So they will where the own latency of a box is uncertain (a decision falls at
-        another time in each of its worlds then), and where friction is.
+        One member: where the two are equal to the bit. Several: where each column lies within the range of their
+        predictions, or, in a world that may leave that range, is a finite number.
         """
-        running, boxes = self.running, self.boxes
+        running = self.running
         assert running is not None
         seen = self.as_seen(seen)
-        columns, N = seen.shape[1], running.problem.mass.shape[1]
+        columns = seen.shape[1]
         if running.members == 1:
             return np.asarray((seen == running.states[:, :columns]).all(axis=1), np.bool_)
         predicted = running.states.reshape(running.n, running.members, -1)
         low, high = predicted[:, :, :columns].min(axis=1) - SLACK, predicted[:, :, :columns].max(axis=1) + SLACK
         within = np.asarray(((seen >= low) & (seen <= high)).all(axis=1), np.bool_)
-        anywhere = (predicted[:, :, 2 * N - 1 : 3 * N - 2] == 1.0).any(axis=(1, 2))
-        if boxes is not None:
-            own = 2 * boxes.limit.shape[1] + boxes.vehicle
-            anywhere |= boxes.high[:, own] > boxes.low[:, own]
-        if self.uncertainty is not None and self.uncertainty.moves_together:
-            anywhere[:] = True
-        return np.asarray(within | (anywhere & np.isfinite(seen).all(axis=1)), np.bool_)
+        return np.asarray(within | (self._leaves_range(running) & np.isfinite(seen).all(axis=1)), np.bool_)
+
+    def _leaves_range(self, running: Running) -> Bools:
+        """Worlds [n] that may leave the range of their members: one of them has had an impact."""
+        N = running.problem.mass.shape[1]
+        predicted = running.states.reshape(running.n, running.members, -1)
+        return np.asarray((predicted[:, :, 2 * N - 1 : 3 * N - 2] == 1.0).any(axis=(1, 2)), np.bool_)
 
     def _compare(self, seen: Floats, asked: Bools) -> None:
         """Find the worlds that did not do what was predicted, and choose anew there from what is seen."""
@@ -432,40 +413,3 @@ class StepShield:
             harm[rows] = np.minimum(found, harm[rows])
             plan[better] = trial[better]
         self.backup = self.backup._replace(plan=plan, harm=harm)
-
-
-def certify_inside(
-    boxes: Boxes | None, running: Running, held: Backup, budget: Floats, decision: Decision, asked: Bools
-) -> Decision:
-    """A decision that the corners allow, refused where its plan is not certified for every world of the box, if any.
-
-    ``held`` is the backup before it. A plan without a certificate never replaces the held one. Episodes end at the
-    horizon: that all corners rest does not mean that every world does.
-    """
-    if boxes is None:
-        return decision
-    plan, other = decision.backup.plan.copy(), (decision.backup.plan != held.plan).any(axis=1)
-    bound = np.where(asked & ~other, held.harm, decision.bound)  # of the corners alone, where the plan is the same
-    changed = np.flatnonzero(asked & other)
-    found = boxes.bound(changed, plan[changed], budget[changed], only_enough=True)
-    least = np.where(decision.intervened, held.harm, budget)[changed]
-    good = found <= least
-    bound[changed[good]] = found[good]
-    known = np.isfinite(found)
-    decision.margin[changed[known]] = (budget[changed] - found)[known]
-    bad = changed[~good]
-    plan[bad], bound[bad] = held.plan[bad], held.harm[bad]
-    decision = decision._replace(bound=bound, backup=decision.backup._replace(plan=plan, harm=bound))
-    refused = bad[~decision.intervened[bad]]
-    if refused.size:  # the held plan's action instead
-        part, plan = running.take(refused), held.plan[refused]
-        action, harm = plan[np.arange(len(plan)), part.steps], held.harm[refused]
-        with renumbered(refused):
-            instead = certify(part, action, Backup(plan, harm, held.constants), harm)
-        every, reason = np.ones(len(refused), np.bool_), np.full(len(refused), NO_CERTIFICATE)
-        instead = instead._replace(intervened=every, reason=reason, margin=decision.margin[refused])
-        decision = decision.put(refused, instead, np.arange(len(refused)))
-    after = decision.after
-    over = np.repeat(after.steps, after.members) >= after.problem.last_step
-    each = np.repeat(asked, after.members)
-    return decision._replace(after=after._replace(ended=np.where(each, over, after.ended)))

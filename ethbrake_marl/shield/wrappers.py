@@ -1,4 +1,4 @@
-"""The shield as a wrapper of each interface: it puts a guard into the engine, whose report then stands in the infos."""
+"""The shield as a wrapper of each interface: it puts a guard into the engine, and the guard reports in the infos."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.state import Bools, Floats
 from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.shield.attach import Attached, Proposing
 from ethbrake_marl.shield.drivers import ShieldedDriver, shielded
-from ethbrake_marl.shield.options import Proposing
-from ethbrake_marl.shield.paper_hybrid import Attached, HybridAgent
+from ethbrake_marl.shield.paper_hybrid import HybridAgent
 
 Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # what a step of the environment returns
 
 
 class _Closing:
-    """A wrapper that lets go of the engine before what is inside closes."""
+    """A wrapper that lets go of the engine before it closes the environment inside."""
 
     attached: Attached
 
     def close(self, **settings: Any) -> None:
-        """Let go of the environment, and close it."""
+        """Take the shield off the environment, and close that."""
         self.attached.close()
         super().close(**settings)  # type: ignore[misc]  # of the wrapper's own library
 
@@ -42,10 +42,10 @@ class _Closing:
 class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
     """Shield the learners of a parallel environment, who are driven by the caller's actions or by a policy.
 
-    Mode ``step``, the default, certifies every action, or replaces it, of several learners together; ``robust`` does so
-    in every member of an uncertainty. Mode ``episode`` is the paper's Algorithm 1: policy or E-V2X-BM drives a whole
-    episode, whatever is proposed. Bounds hold where the other vehicles follow their scripts.
-    ``shield_reason`` and its like in ``infos[agent]`` say what was done. See docs/shield.md.
+    Mode ``step``, the default, certifies every action of all learners together, or replaces it. Mode ``episode`` is the
+    paper's Algorithm 1: policy or E-V2X-BM drives a whole episode, whatever is proposed. Bounds hold where the other
+    vehicles follow their scripts. ``shield_reason`` and other ``shield_...`` keys of ``infos[agent]`` say what was
+    done. See docs/shield.md.
 
     Args:
         env: ``eb.parallel_env(...)`` with one learner (mode ``step``: or more), or what wraps it.
@@ -120,8 +120,8 @@ class ShieldedEnv(
     """``EthBrake-v0`` behind a shield, by default in mode ``step``: each action is certified, or replaced.
 
     The ``options`` are those of ``ShieldOptions``. ``shield_reason`` and its like in the info say what was done.
-    ``policy`` (in mode ``step`` and ``robust`` it may be None) is rolled out at each alert: where it harms no more than
-    the coupled optimum, its harm is the bound.
+    ``policy`` (needed in mode ``episode`` alone) is rolled out at each alert: where it harms no more than the coupled
+    optimum, its harm is the bound.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.ShieldedEnv(eb.EthBrakeEnv("paper-random"))
@@ -208,7 +208,7 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
             Stable-Baselines3's ``VecEnv``. A wrapper inside may change actions: what reaches the engine is certified.
             Or an agent or team, for tables; then ``scenario`` says in which its actions are certified.
         policy: proposes where nobody else does, and bounds the harm where its own is lower; mode ``episode`` needs it.
-        mode: ``step``, ``robust`` or ``episode``; None: ``robust`` with an ``uncertainty``, else ``step``.
+        mode: ``step``, ``episode``, or one of an extension. None: ``step``, unless the options belong to another one.
         options: further keywords of ``ShieldOptions``.
 
     Returns ``HybridShield``, that with agents acting in turn, ``ShieldedEnv``, ``ShieldedVectorEnv`` or

@@ -13,9 +13,10 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from ethbrake_marl.errors import CorruptBundle, OnProgress, Progress
+from ethbrake_marl.errors import CorruptBundle
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.training.checkpoint import TrainingState, write_checkpoint
 from ethbrake_marl.training.finite import TrainingDiverged, weights_are_finite
 from ethbrake_marl.training.fixed_list import Evaluate

@@ -16,15 +16,8 @@ from safetensors import SafetensorError
 
 from ethbrake_marl.engine.memory import Arrays
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
-from ethbrake_marl.files.store import (
-    new_file,
-    new_folder,
-    open_plain,
-    parse_strict_json,
-    read_plain,
-    remove_folder,
-    write_file,
-)
+from ethbrake_marl.files.plain import open_plain, parse_strict_json, read_plain
+from ethbrake_marl.files.store import new_file, new_folder, remove_folder, write_file
 
 ARRAYS, NUMBERS = "arrays.safetensors", "numbers.json"
 

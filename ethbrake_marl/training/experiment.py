@@ -13,17 +13,20 @@ from typing import Any
 
 from ethbrake_marl.agents.learned import TRAINED_POLICY, LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.errors import OnProgress, Progress, check_one_learner
+from ethbrake_marl.errors import check_one_learner
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import EPISODES, LIST_SEED
 from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.evaluation.per_world import results_to_json, write_per_world
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.summary import SummaryRow, SummaryTable, summarise
+from ethbrake_marl.evaluation.summary import SummaryTable, summarise
+from ethbrake_marl.evaluation.summary_row import SummaryRow
+from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.sheet import csv_text
-from ethbrake_marl.files.store import read_object, write_output
+from ethbrake_marl.files.store import write_output
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.paper_hybrid import HybridAgent

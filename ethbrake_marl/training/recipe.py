@@ -14,19 +14,9 @@ from pydantic import Field, field_validator, model_validator
 from pydantic.json_schema import models_json_schema
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.files.yaml import (
-    NAME_PATTERN,
-    Document,
-    FileModel,
-    FileSchema,
-    Wording,
-    YamlPath,
-    flow_text,
-    read_model,
-    read_yaml,
-    refuse,
-    schema_lines,
-)
+from ethbrake_marl.files.json_schema import FileSchema, schema_lines
+from ethbrake_marl.files.model import NAME_PATTERN, FileModel, Wording, read_model, refuse
+from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 from ethbrake_marl.game.features import ListedFeatures, listed_features
 from ethbrake_marl.game.rewards import RewardParams, setting_names
 from ethbrake_marl.policies.network_spec import Activation, NetworkSpec

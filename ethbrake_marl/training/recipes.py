@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import Field, field_validator, model_validator
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.yaml import refuse
+from ethbrake_marl.files.model import refuse
 from ethbrake_marl.policies.network_spec import Activation, NetworkSpec
 from ethbrake_marl.registry import Part
 from ethbrake_marl.training.recipe import (
@@ -136,4 +136,5 @@ class SacRecipe(TrainingRecipe):
 
 
 PPO = Part(PpoRecipe, "ethbrake_marl.training.ppo:Ppo")
+
 SAC = Part(SacRecipe, "ethbrake_marl.training.sac:Sac")

@@ -14,7 +14,8 @@ from typing import Any, ClassVar, Literal, get_args
 from filelock import FileLock, Timeout
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.files.store import new_folder, read_object, write_file
+from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.files.store import new_folder, write_file
 from ethbrake_marl.game.harm import HarmCount
 
 RunStatus = Literal["running", "finished", "interrupted", "failed"]

@@ -8,13 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ethbrake_marl.errors import InvalidInput, Progress, Told, stop_on_signal
-from ethbrake_marl.files.store import hold_lock, read_object, remove_folder, remove_unfinished
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.files.store import hold_lock, remove_folder, remove_unfinished
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.teams import Trained
+from ethbrake_marl.progress import Progress, Told
 from ethbrake_marl.registry import versions_used
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.stopping import stop_on_signal
 from ethbrake_marl.training.callback import RunCallback, StopAt, StopRequested, Watchers
 from ethbrake_marl.training.checkpoint import TrainingState, newest_usable
 from ethbrake_marl.training.finite import FiniteNumbers, TrainingDiverged, weights_are_finite

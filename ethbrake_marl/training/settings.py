@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from ethbrake_marl.agents.registry import split_names
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.files.yaml import Override
+from ethbrake_marl.files.overrides import Override
 from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.recipe import WORDS, TrainingRecipe

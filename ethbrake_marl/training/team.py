@@ -12,8 +12,9 @@ from pydantic import Field, model_validator
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
-from ethbrake_marl.files.store import parse_strict_json, read_plain
-from ethbrake_marl.files.yaml import Document, FileModel, Wording, read_model, refuse
+from ethbrake_marl.files.model import FileModel, Wording, read_model, refuse
+from ethbrake_marl.files.plain import parse_strict_json, read_plain
+from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario

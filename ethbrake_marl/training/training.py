@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.store import read_object
+from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.game.observations import ObservationSpec, choose_observation
 from ethbrake_marl.policies.manifest import installed_versions

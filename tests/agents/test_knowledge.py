@@ -77,11 +77,10 @@ class Hosted:
 
     def begin(self, alert: eb.Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         options, scenario = self.driver.options, self.driver.scenario
-        if options.believed:
-            shield = options.believed_shield(scenario, vehicle, scripts)
+        shield = options.shield(scenario, vehicle, scripts)
+        if getattr(options, "believed", False):
             shield.begin(alert, np.arange(alert.n))
         else:
-            shield = options.step_shield(scenario, vehicle, scripts)
             shield.begin(alert, np.arange(alert.n), {vehicle: self.policy})
         return np.array([shield] * alert.n), begin_script(self.policy, alert, vehicle, scripts)
 
@@ -89,7 +88,7 @@ class Hosted:
         (shield, *_), policy = memory
         proposed, policy = proposed_action(self.policy, worlds, policy, vehicle)
         proposer = Proposer({vehicle: self.policy}, {vehicle: policy}, worlds)
-        if self.driver.options.believed:
+        if getattr(self.driver.options, "believed", False):
             applied = shield.decide(worlds, proposed, proposer)
         else:
             applied = shield.decide(

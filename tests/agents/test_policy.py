@@ -11,7 +11,7 @@ import torch
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.learned import LearnedAgent
-from ethbrake_marl.evaluation.identity import policy_sha256
+from ethbrake_marl.agents.protocol import policy_sha256
 from ethbrake_marl.game.actions import action_to_command
 from ethbrake_marl.game.observations import ObservationSpec, observe
 from ethbrake_marl.shield.drivers import ShieldedDriver

@@ -75,7 +75,7 @@ def tiny_recipe(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def finished_run(tmp_path_factory: pytest.TempPathFactory, tiny_recipe: Path) -> Path:
     """The folder of an `ethbrake run` with 60 worlds, made once for all processes of xdist; not to be changed.
 
-    Its pictures are empty; tests/figures draws them, and a slow test a whole run.
+    Its pictures are empty; tests/extensions/report draws them, and a slow test a whole run.
     """
     alone = "PYTEST_XDIST_WORKER" not in os.environ
     base = tmp_path_factory.getbasetemp() if alone else tmp_path_factory.getbasetemp().parent

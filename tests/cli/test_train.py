@@ -19,13 +19,14 @@ import yaml
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.command import Out
-from ethbrake_marl.errors import InvalidInput, Progress
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.identity import scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.report import experiment
 from ethbrake_marl.extensions.report.experiment import telling_world, write_figures
 from ethbrake_marl.extensions.report.run_figures import learning_curve
 from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
+from ethbrake_marl.progress import Progress
 from tests.cli.conftest import TINY_RECIPE, Command, check_refused, rows_of, told_json
 
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "trained policy", "hybrid"]

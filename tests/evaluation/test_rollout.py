@@ -17,6 +17,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl import registry
+from ethbrake_marl.agents.protocol import policy_sha256
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput, PhysicsError, Unfamiliar
 from ethbrake_marl.evaluation import chunks, identity
@@ -24,7 +25,7 @@ from ethbrake_marl.evaluation.aftermath import ShovedFront
 from ethbrake_marl.evaluation.chunks import Lineup, evaluate_held, summarise_tally, tally_list
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.exploits import FAR_M
-from ethbrake_marl.evaluation.identity import policy_sha256, scenario_sha256, worlds_sha256
+from ethbrake_marl.evaluation.identity import scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.lineup import make_agents, make_lineup
 from ethbrake_marl.evaluation.measures import measures
 from ethbrake_marl.evaluation.outcome import Outcome

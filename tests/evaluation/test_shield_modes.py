@@ -19,7 +19,7 @@ from ethbrake_marl.shield.drivers import ShieldedDriver
 from ethbrake_marl.shield.evidence import review
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
 from tests.failing_worlds import plant, without
-from tests.pages.hostile import Page
+from tests.fixtures.page import Page
 
 PAPER, PAIR = (load_scenario(name) for name in ("paper-random", "cooperation-3-pair"))
 WORLDS = PAPER.sample(60, 3).worlds

@@ -10,7 +10,8 @@ from hypothesis import given, settings, strategies as st
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.store import read_plain, write_output
+from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.files.store import write_output
 from ethbrake_marl.files.yaml import DEPTH_LIMIT, SIZE_LIMIT, flow_text, parse_yaml
 from ethbrake_marl.scenario.schema import Scenario
 

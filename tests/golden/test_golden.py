@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.evaluation.identity import worlds_sha256
+from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.game.harm import empty_ledger
 from ethbrake_marl.physics.advance import advance
@@ -41,7 +42,7 @@ DECISIONS = {
 SHIELDS = {
     "paper": lambda: (StepShield(load_scenario("paper-random"), 1), 60),
     "five vehicles": lambda: (StepShield(line(5), 2, harm_count="total"), 40),
-    "robust": lambda: (StepShield(load_scenario("paper-random"), 1, uncertainty=parse_uncertainty("gaps_m=0.5")), 10),
+    "robust": lambda: (RobustShield(load_scenario("paper-random"), 1, uncertainty=parse_uncertainty("gaps_m=0.5")), 10),
     "obstacle": lambda: (StepShield(load_scenario("paper-random-obstacle"), 1, harm_count="total"), 40),
 }
 

@@ -23,7 +23,7 @@ from stable_baselines3.common.logger import Logger
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.train import run_folder
-from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, Progress
+from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.extensions.search import limits, regret
@@ -33,6 +33,7 @@ from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.layers import dense
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.teams import Trained, read_trained
+from ethbrake_marl.progress import Progress
 from ethbrake_marl.training import (
     model_state,
     models,

@@ -2,7 +2,8 @@
 
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation.trial import load_runnable
-from ethbrake_marl.files.yaml import Override, flow_text, parse_yaml
+from ethbrake_marl.files.overrides import Override
+from ethbrake_marl.files.yaml import flow_text, parse_yaml
 from ethbrake_marl.training.settings import read_settings
 
 PPO = eb.load_recipe("ppo")

@@ -31,6 +31,7 @@ from ethbrake_marl.extensions.studies.tuning import TuningPlan
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.manifest import content_sha256
 from ethbrake_marl.policies.shipped import shipped_policies
+from ethbrake_marl.scenario.tables import read_worlds
 from ethbrake_marl.training.checkpoint import NUMBERS
 from ethbrake_marl.training.session import train
 from tests.programmes.cage import NASTY, OUTSIDE, PRECIOUS, Case, damaged, write
@@ -367,7 +368,9 @@ def texts() -> dict[str, Text]:
         "sweep": Text(SWEEP, sweep, SweepPlan.read),
         "tuning": Text(TUNING, tune, TuningPlan.read),
         "worlds": Text(worlds_text(), again, lambda path: NamedWorlds.read(path).worlds_of(paper, "x")),
-        "CSV": Text(STATES, states, paper.read_worlds, 10, CSV, {"damaged": UNCERTAIN["damaged"]}, "mine.csv"),
+        "CSV": Text(
+            STATES, states, partial(read_worlds, paper), 10, CSV, {"damaged": UNCERTAIN["damaged"]}, "mine.csv"
+        ),
     }
 
 

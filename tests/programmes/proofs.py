@@ -26,7 +26,7 @@ import numpy as np
 import z3
 
 from ethbrake_marl.physics import impact, motion, rows
-from ethbrake_marl.shield import members
+from ethbrake_marl.shield import certify, members
 from tests.programmes import Cases, Given, Told
 
 # ---------------------------------------------------------------- symbolic execution
@@ -432,7 +432,7 @@ def _decided(line: _Line, usable: tuple[bool, ...]) -> int:
         plan, room = line.plan.copy(), np.zeros((2, *line.plan.shape), object)
         after, out, tried = np.zeros(1, object), np.zeros((vehicles, 4), object), np.zeros((2, vehicles), object)
         proposed = np.array([p if use else math.nan for p, use in zip(line.proposed, usable, strict=True)], object)
-        good = members.decide_world(
+        good = certify.decide_world(
             None, None, np.zeros(1, bool), made, proposed, line.budget, line.certified, line.constants, plan, room,
             tried, after, np.zeros(1, bool), out,
         )  # fmt: skip
@@ -499,23 +499,23 @@ BUGS = {
         "bounce = restitution", plastic,
     ),
     "the budget may rise": Bug(
-        members, "decide_world", "    if value <= budget:\n        for c in",
+        certify, "decide_world", "    if value <= budget:\n        for c in",
         "    if value <= 2.0 * budget:\n        for c in", decision,
     ),
     "later proposals are not certified": Bug(
-        members, "decide_world", "    if value <= budget:\n        for c in",
+        certify, "decide_world", "    if value <= budget:\n        for c in",
         "    if value <= budget or step > 0:\n        for c in", decision,
     ),
     "the fallback is the plan's first action": Bug(
-        members, "decide_world", "take_steps(world, states, ended, step, plan[step], after, over)",
+        certify, "decide_world", "take_steps(world, states, ended, step, plan[step], after, over)",
         "take_steps(world, states, ended, step, plan[0], after, over)", decision,
     ),
     "the plan is followed from the second decision on": Bug(
-        members, "try_action", "value = worst_of_plan(world, after, over, step + 1,",
+        certify, "try_action", "value = worst_of_plan(world, after, over, step + 1,",
         "value = worst_of_plan(world, after, over, 1,", decision,
     ),
     "a constant begins one decision late": Bug(
-        members, "better_plan", "for j in range(step, plan.shape[0]):",
+        certify, "better_plan", "for j in range(step, plan.shape[0]):",
         "for j in range(step + 1, plan.shape[0]):",
         decision,
     ),
@@ -529,27 +529,27 @@ BUGS = {
         stopping,
     ),
     "the plan that was certified with a proposal is not kept": Bug(
-        members, "try_action", "                copy_action(room[0, j], plan[j])", "                pass",
+        certify, "try_action", "                copy_action(room[0, j], plan[j])", "                pass",
         decision,
     ),
     "a constant counts without being certified": Bug(
-        members, "better_plan", "certified = worst_of_plan(world, states, ended, step, trial, most)",
+        certify, "better_plan", "certified = worst_of_plan(world, states, ended, step, trial, most)",
         "certified = least", decision,
     ),
     "the bound of the plan is told for the proposal": Bug(
-        members, "decide_world", "tell_action(out, plan[step], value, budget - value)",
+        certify, "decide_world", "tell_action(out, plan[step], value, budget - value)",
         "tell_action(out, plan[step], certified, budget - value)", decision,
     ),
     "of two, what was tried last is looked at, not what is applied": Bug(
-        members, "decide_world", "take_steps(world, states, ended, step, plan[step], after, over)",
+        certify, "decide_world", "take_steps(world, states, ended, step, plan[step], after, over)",
         "take_steps(world, states, ended, step, tried[1], after, over)", decision_of_two,
     ),
     "the first of two that is accepted keeps the bound from before": Bug(
-        members, "decide_world", "bound, accepted = value, accepted + 1", "accepted = accepted + 1",
+        certify, "decide_world", "bound, accepted = value, accepted + 1", "accepted = accepted + 1",
         decision_of_two,
     ),
     "a plan for two is written for the first alone": Bug(
-        members, "copy_action", "for c in range(to.shape[0]):", "for c in range(1):", decision_of_two
+        certify, "copy_action", "for c in range(to.shape[0]):", "for c in range(1):", decision_of_two
     ),
 }  # fmt: skip
 

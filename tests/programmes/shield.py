@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.engine.profiles import profile_problem
+from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.shield.members import begin_running, plan_harm
-from ethbrake_marl.shield.step import StepShield
+from ethbrake_marl.shield.certify import plan_harm
+from ethbrake_marl.shield.running import begin_running
 from tests.programmes import Cases, Given, Told
 from tests.shield.attacks import (
     ABOVE,
@@ -224,7 +225,7 @@ def inside(robust: str, given: Given, scenario: Any = "paper-random", intervals:
     scenario, uncertainty = load_scenario(scenario), parse_uncertainty(intervals or given.intervals)
     boxes = given.boxes
     told, rng = scenario.sample(boxes, given.seed).worlds, np.random.default_rng(given.seed)
-    shield = StepShield(scenario, 1, uncertainty=uncertainty, robust=robust)
+    shield = RobustShield(scenario, 1, uncertainty=uncertainty, robust=robust)
     shield.begin(told, np.arange(boxes))
     decisions, begun = 0, time.process_time()
     while not shield.running.finished.all():

@@ -16,13 +16,14 @@ import numpy as np
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive, script_agents
 from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.episode import CLOCK
 from ethbrake_marl.physics.state import Floats, Worlds
+from ethbrake_marl.shield.certify import Decision, certify
 from ethbrake_marl.shield.comparison import seen_columns
 from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.members import Decision, certify
 from ethbrake_marl.shield.step import StepShield
 
 # ---------------------------------------------------------------- lines
@@ -194,7 +195,8 @@ def attack(
 def begun(scenario: eb.Scenario, worlds: Worlds, **settings) -> StepShield:
     """A shield of all learners in its episodes."""
     learners = scenario.learners
-    shield = StepShield(scenario, learners[0] if len(learners) == 1 else learners, **settings)
+    kind = RobustShield if "uncertainty" in settings else StepShield
+    shield = kind(scenario, learners[0] if len(learners) == 1 else learners, **settings)
     shield.begin(worlds, np.arange(worlds.n))
     return shield
 

@@ -18,7 +18,7 @@ from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.options import MovingAtHorizon
+from ethbrake_marl.shield.guard import MovingAtHorizon
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
 from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv
 from tests.fixtures.asked import Acts, Asked
@@ -53,9 +53,9 @@ class Cheating(Engine):
         step = super()._advance(columns)
         rows = self.ended & ~before if self.last_only else ~before
         if self.what == "a step":
-            self._clock[rows, STEP] += 1.0
+            self.state.clock[rows, STEP] += 1.0
         else:
-            self._state[rows, STATE[self.what](self.packed.column)] += 1e-12
+            self.state.motion[rows, STATE[self.what](self.packed.column)] += 1e-12
         return step
 
 

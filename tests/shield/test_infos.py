@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 import ethbrake_marl as eb
+from ethbrake_marl.extensions.certified.guards import RobustMode
 
 PUSH = np.ones(1, np.float32)  # what is proposed in every last step is this or its opposite
 ROWS = 16
@@ -206,7 +207,7 @@ def test_infos__of_the_first_moment_and_of_the_last_belong_to_their_episode(inte
         assert first["shield_proposed_action"] == first["shield_applied_action"] == 0.0
         assert not first["shield_intervened"] and abs(last["shield_proposed_action"]) == 1.0
         assert last["shield_applied_action"] == pytest.approx(last["chosen_action"].item(), abs=1e-6)
-        assert eb.ShieldMode(first["shield_mode"]).name.lower() == {"believed": "step"}.get(mode, mode)
+        assert first["shield_mode"] == {"episode": 0, "step": 1, "believed": 1, "robust": 2}[mode]
         if mode != "episode":
             assert first["shield_reason"] == eb.ShieldReason.NO_DECISION != last["shield_reason"]
         if mode == "step":
@@ -254,7 +255,7 @@ def test_codes__are_those_of_the_documented_table_and_of_the_texts_in_the_engine
     table = (Path(__file__).parents[2] / "docs" / "shield.md").read_text("utf-8")
     for each in eb.ShieldReason:
         assert f"| {each.value} | `{each.name}` |" in table
-    for mode in eb.ShieldMode:
+    for mode in (*eb.ShieldMode, *RobustMode):
         assert f"{mode.value} `{mode.name}`" in table
 
 

@@ -19,18 +19,20 @@ from ethbrake_marl.envs.pettingzoo import env as aec_env, parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.envs.vector import EthBrakeVectorEnv
 from ethbrake_marl.errors import UncertifiedStep, UnknownName
+from ethbrake_marl.extensions.certified.options import checked_uncertainty
+from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import Interval, Uncertainty, parse_uncertainty
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.certify import certify, plan_harm
 from ethbrake_marl.shield.drivers import ShieldedDriver
 from ethbrake_marl.shield.evidence import review
-from ethbrake_marl.shield.members import certify, plan_harm
-from ethbrake_marl.shield.options import ShieldOptions, checked_uncertainty
+from ethbrake_marl.shield.options import ShieldOptions
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from ethbrake_marl.shield.step import StepShield
 from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
-from tests.limits.worlds import line as one_line
+from tests.fixtures.lines import line as one_line
 from tests.refused import refused
 from tests.shield.attacks import begun, line
 
@@ -127,7 +129,7 @@ AGENTS: dict[str, Callable[[], object]] = {
     "shield: robust interior: an obstacle ahead: it certifies first-impact harm": lambda: make_agent(
         "coast+robust:interior:believed", scenario=PERIODIC.replace(obstacle_gap_m=60.0)
     ),
-    "shield: robust interior: 5 vehicles: it certifies first-impact harm of at most 3 vehicles": lambda: StepShield(
+    "shield: robust interior: 5 vehicles: it certifies first-impact harm of at most 3 vehicles": lambda: RobustShield(
         line(5), 2, uncertainty=parse_uncertainty("gaps_m=0.1"), robust="interior"
     ),
     "shield: agent 'coast' needs scenario=, in which to certify, and takes no policy": lambda: eb.shield(COAST),
@@ -433,7 +435,7 @@ def test_uncertain_latency__ends_before_the_horizon() -> None:
 def test_interior__takes_no_brakes_that_began_to_build_up_before() -> None:
     slow = PAPER.replace(brake_rate_mps3=9)
     braking = replace(slow.sample(1, 3).worlds, command_mps2=np.full((1, 3), -1.0))
-    shield = StepShield(slow, 1, uncertainty=parse_uncertainty("gaps_m=0.1"), robust="interior")
+    shield = RobustShield(slow, 1, uncertainty=parse_uncertainty("gaps_m=0.1"), robust="interior")
     with refused("shield: robust interior: brakes that began to build up before the alert"):
         shield.begin(braking, np.arange(1))
 
@@ -444,11 +446,11 @@ def test_interior__takes_no_script_that_it_cannot_enclose() -> None:
     with refused(
         "vehicle_3 is driven by 'e_v2x_bm:pairwise', which it cannot enclose; full_brake, coast and constant:A"
     ):
-        StepShield(gentle, 1, uncertainty=parse_uncertainty("gaps_m.pair_1=0.1"), robust="interior")
+        RobustShield(gentle, 1, uncertainty=parse_uncertainty("gaps_m.pair_1=0.1"), robust="interior")
 
 
 def test_interior__takes_no_command_beyond_the_least_capacity() -> None:
     weak = line(3).replace(braking_capacity_mps2=[6.0, 6.0, 5.2])  # vehicle_3 holds 5 m/s2, which 4.68 cannot
-    shield = StepShield(weak, 1, uncertainty=parse_uncertainty("braking_capacity_mps2=10%"), robust="interior")
+    shield = RobustShield(weak, 1, uncertainty=parse_uncertainty("braking_capacity_mps2=10%"), robust="interior")
     with refused("uncertainty: braking_capacity_mps2=10%: agent 'constant:5': above the braking capacity 4.68 m/s2"):
         shield.begin(weak.sample(1, 0).worlds, np.arange(1))

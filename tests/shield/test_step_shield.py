@@ -11,13 +11,17 @@ from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.extensions.search.around import Searched
 from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shield import drivers
+from ethbrake_marl.shield import episodes as episodes_module
+from ethbrake_marl.shield.certify import Backup, certify, plan_harm
 from ethbrake_marl.shield.comparison import ends_under
-from ethbrake_marl.shield.drivers import Shielded, ShieldedDriver
-from ethbrake_marl.shield.members import Backup, ShieldReason, begin_running, certify, plan_harm
+from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shield.episodes import Shielded, drive_shielded
+from ethbrake_marl.shield.first_plan import joint_constants
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
+from ethbrake_marl.shield.reasons import ShieldReason
 from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts
-from ethbrake_marl.shield.step import StepShield, joint_constants
+from ethbrake_marl.shield.running import begin_running
+from ethbrake_marl.shield.step import StepShield
 from tests.fixtures.asked import Acts
 from tests.shield.attacks import ADVERSARIES, LEAKS, TEAM_ADVERSARIES, TEAMS, all_infos, attack, begun, line, search
 from tests.shield.plays import reported
@@ -500,7 +504,7 @@ def test_drive_chunks__is_what_the_shielded_team_does_whatever_the_chunk(monkeyp
     for _ in range(2):  # a second batch begins anew
         episodes = drive(worlds, team.on((1, 2)), PAIR)
         ledger, shield = episodes.ledger, episodes.guarded.shield
-        whole = Shielded.driven(eb.make_agent("coast"), worlds, task)
+        whole = drive_shielded(eb.make_agent("coast"), worlds, task)
         assert whole.harm.tolist() == ledger.world_harm("total").tolist() == shield.bound.tolist()
         assert whole.vehicle_harm.tolist() == ledger.vehicle_harm("total").tolist() == shield.shares().tolist()
         assert whole.bound.tolist() == shield.predicted_harm.tolist() and (whole.harm <= whole.bound).all()
@@ -509,8 +513,8 @@ def test_drive_chunks__is_what_the_shielded_team_does_whatever_the_chunk(monkeyp
     np.add.at(logged, tuple(np.transpose([(entry.world, entry.vehicle - 1) for entry in shield.log])), 1)
     assert whole.replaced.tolist() == logged.tolist() and (logged.sum(axis=0) > 0).all()
     assert (whole.replaced <= whole.decisions[:, np.newaxis]).all()
-    monkeypatch.setattr(drivers, "CHUNK", 5)
-    parts = Shielded.driven(eb.make_agent("coast"), worlds, task)
+    monkeypatch.setattr(episodes_module, "CHUNK", 5)
+    parts = drive_shielded(eb.make_agent("coast"), worlds, task)
     assert all(np.array_equal(*columns) for columns in zip(whole, parts, strict=True))
     assert Shielded.stack([whole, parts]).replaced.shape == (2, 12, 2)
 

@@ -19,11 +19,10 @@ from ethbrake_marl.agents.e_v2x_bm.constants import make_line
 from ethbrake_marl.agents.e_v2x_bm.pairwise import CANDIDATES, closed_form, find_breakpoints, onset_s, optimise_pairwise
 from ethbrake_marl.agents.e_v2x_bm.search import make_room, search_line
 from ethbrake_marl.agents.protocol import Agent, Source, fixed_commands
-from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.registry import AgentSettings, variants_of
 from ethbrake_marl.engine.memory import Memory, is_state_free
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, renumbered
-from ethbrake_marl.extensions.certified.estimating_agents import Believing
 from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.jit import by_parts, compiled
@@ -193,9 +192,9 @@ class EV2XBM:
 
 
 def make_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
-    """``e_v2x_bm``, the same as ``e_v2x_bm:coupled``, or ``e_v2x_bm:pairwise``; ``:believed`` behind: believing."""
+    """``e_v2x_bm``, the same as ``e_v2x_bm:coupled``, or ``e_v2x_bm:pairwise``."""
     if argument not in (None, "coupled", "pairwise"):
-        raise InvalidInput(f"agent {settings.spec!r}: the argument must be 'coupled' or 'pairwise', then 'believed'")
+        then = "".join(f", then {variant!r}" for variant in variants_of("e_v2x_bm"))
+        raise InvalidInput(f"agent {settings.spec!r}: the argument must be 'coupled' or 'pairwise'{then}")
     mode: Mode = "pairwise" if argument == "pairwise" else "coupled"
-    agent = EV2XBM(mode, harm_count=settings.harm_count, horizon_s=settings.horizon_s)
-    return Believing(agent, settings.needed_scenario()) if settings.believes else agent
+    return EV2XBM(mode, harm_count=settings.harm_count, horizon_s=settings.horizon_s)

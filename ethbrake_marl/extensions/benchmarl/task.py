@@ -22,8 +22,8 @@ from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.observed import full_state, observation_for, state_features
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.attach import guard_of
 from ethbrake_marl.shield.options import ShieldOptions
-from ethbrake_marl.shield.paper_hybrid import guard_of
 
 GROUP = "learners"
 

@@ -23,14 +23,16 @@ from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.extensions.certified.enclosure import CORNERS, INTERIOR, checked_robust
 from ethbrake_marl.extensions.certified.estimated import Ranges, Told
 from ethbrake_marl.extensions.certified.estimating_agents import Odometer
+from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import MOST_CORNERS, Uncertainty
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.certify import Decision, plan_harm
 from ethbrake_marl.shield.comparison import seen_columns, worlds_at
-from ethbrake_marl.shield.members import Decision, plan_harm, put
 from ethbrake_marl.shield.rollouts import Proposer
+from ethbrake_marl.shield.running import put
 from ethbrake_marl.shield.step import StepShield
 
 PER_WORLD = ("predicted_harm", "interventions", "_heard", "_asked_s", "_wanted", "_impact_s")  # arrays [n, ...]
@@ -100,9 +102,11 @@ class BelievedShield:
             )
         self.shield = self._make()
 
-    def _make(self) -> StepShield:
+    def _make(self) -> RobustShield:
         certain = self.robust or CORNERS
-        return StepShield(self.scenario, self.vehicle, harm_count=self._harm_count, others=self._others, robust=certain)
+        return RobustShield(
+            self.scenario, self.vehicle, harm_count=self._harm_count, others=self._others, robust=certain
+        )
 
     @property
     def members(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,8 +12,9 @@ from ethbrake_marl.agents.protocol import Agent, AgentAround, Knowledge, Source
 from ethbrake_marl.engine.memory import Memory, ask_script, begin_script, renew_memory
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.extensions.certified.estimated import Ranges, Told
-from ethbrake_marl.physics.state import Floats, Worlds
+from ethbrake_marl.physics.state import Floats, Vehicles, Worlds
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.paper_hybrid import HybridAgent
 
 
 class Odometer(NamedTuple):
@@ -95,3 +97,27 @@ class Believing(AgentAround):
         if vehicle not in self._ranges:
             self._ranges[vehicle] = Ranges.of(self.scenario, vehicle)
         return self._ranges[vehicle].believe(worlds, way_m)
+
+
+class BelievingHybrid(Believing):
+    """Algorithm 1 on what was received: at the first decision policy and E-V2X-BM are compared as is believed."""
+
+    policy: HybridAgent
+
+    @property
+    def knows(self) -> Knowledge:
+        """What the policy knows, which drives by what it observes, and what the comparison adds."""
+        return Knowledge.of(self.policy.policy, also=Source.BELIEFS)
+
+    def _shown_at_first(self, believed: Worlds) -> Worlds:
+        """The comparison is a rollout, which begins at t = 0 without impacts: the same line, its clock put back."""
+        v, n = believed.vehicles, believed.n
+        latency = np.maximum(v.latency_s - believed.time_s[:, np.newaxis], 0.0)
+        vehicles = Vehicles.at_once(
+            v.braking_capacity_mps2, v.driving_capacity_mps2, latency, v.mass_t, v.speed_limit_mps, v.restitution,
+            v.brake_rate_mps3, v.release_rate_mps3,
+        )  # fmt: skip
+        return replace(
+            believed, vehicles=vehicles, time_s=np.zeros(n), pair_hit=np.zeros_like(believed.pair_hit),
+            obstacle_hit=np.zeros(n, np.bool_),
+        )  # fmt: skip

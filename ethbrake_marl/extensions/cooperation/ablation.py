@@ -7,15 +7,15 @@ from functools import partial
 from pathlib import Path
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.errors import OnProgress
 from ethbrake_marl.extensions.cooperation.joint_optimum import measure, questions
 from ethbrake_marl.extensions.cooperation.levels import Json, Plan, common_worlds
 from ethbrake_marl.extensions.cooperation.page import write_ablation
 from ethbrake_marl.extensions.search.best_harm import best_harm, chunks_left
 from ethbrake_marl.extensions.studies.trainings import Timed, train_all
 from ethbrake_marl.game.harm import HARM_COUNTS
+from ethbrake_marl.progress import OnProgress
 from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shield.drivers import Shielded
+from ethbrake_marl.shield.episodes import drive_shielded
 from ethbrake_marl.training.team import load_team
 
 
@@ -57,7 +57,7 @@ def ablation_cost(plan: Plan) -> str:
     for level in plan.levels if plan.shield else ():  # learners that brake fully are replaced most often
         if level.scenario.learners:
             task, often = Task(level.scenario, level.scenario.learners), plan.seeds * len(plan.recipes)
-            shielded = partial(Shielded.driven, make_agent("full_brake"), task=task)
+            shielded = partial(drive_shielded, make_agent("full_brake"), task=task)
             world_s = Timed.each_s(samples[level.name].worlds, shielded)
             driving_s += plan.episodes * often * len(HARM_COUNTS) * world_s
     search_s, damaged = 0.0, []

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Driver, Team
-from ethbrake_marl.errors import OnProgress, Progress
 from ethbrake_marl.evaluation.identity import result_identity
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.extensions.cooperation.levels import HARM, TOLERANCE, Level, Plan, common_worlds
@@ -24,10 +23,11 @@ from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount, Ledger
 from ethbrake_marl.game.objectives import objective_harm
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shield.drivers import Shielded
+from ethbrake_marl.shield.episodes import Shielded, drive_shielded
 from ethbrake_marl.training.team import load_team
 from ethbrake_marl.training.training import Training
 
@@ -208,7 +208,7 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
             for harm_count in HARM_COUNTS if plan.shield else ():
                 task, parts = Task(level.scenario, level.scenario.learners, harm_count), []
                 for team in own:
-                    parts.append(Shielded.driven(team, sample.worlds, task))
+                    parts.append(drive_shielded(team, sample.worlds, task))
                     name = f"driving {team.name} behind the shield, {harm_count}"
                     say(Progress(name, sample.worlds.n, sample.worlds.n))
                 behind[harm_count] = Shielded.stack(parts)

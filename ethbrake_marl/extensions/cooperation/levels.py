@@ -16,7 +16,7 @@ from ethbrake_marl.evaluation.identity import LIST_SEED
 from ethbrake_marl.evaluation.trial import load_runnable
 from ethbrake_marl.extensions.studies.folder import StudyFolder
 from ethbrake_marl.extensions.studies.trainings import TrainingJob
-from ethbrake_marl.files.yaml import Override
+from ethbrake_marl.files.overrides import Override
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field, model_validator
 
-from ethbrake_marl.files.yaml import FileModel
+from ethbrake_marl.files.model import FileModel
 from ethbrake_marl.training.recipe import Fraction, Layers, NonNegative, Positive, Rate
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from ethbrake_marl.files.yaml import FileModel
+from ethbrake_marl.files.model import FileModel
 from ethbrake_marl.training.recipe import Rate
 
 

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from ethbrake_marl.agents.protocol import Source
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.learners.recipe_keys import AVERAGING, NO_SHAPING, Averaging, Focus, Holds, OffsetRange
-from ethbrake_marl.files.yaml import refuse
+from ethbrake_marl.files.model import refuse
 from ethbrake_marl.policies.network_spec import Activation, NetworkSpec
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.shipped import SHIPPED, load_named_policy

@@ -13,7 +13,7 @@ from ethbrake_marl.agents.protocol import Source
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.learners.mixture_plan import ModesPlan
 from ethbrake_marl.extensions.learners.recipe_keys import AVERAGING, NO_SHAPING, Averaging, Focus, Holds, OffsetRange
-from ethbrake_marl.files.yaml import refuse
+from ethbrake_marl.files.model import refuse
 from ethbrake_marl.policies.network_spec import Activation, NetworkSpec
 from ethbrake_marl.policies.shipped import SHIPPED, shipped_name
 from ethbrake_marl.registry import Part

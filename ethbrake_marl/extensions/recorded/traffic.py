@@ -22,7 +22,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, count_of, plain_text
-from ethbrake_marl.files.store import open_plain
+from ethbrake_marl.files.plain import open_plain
 from ethbrake_marl.files.yaml import flow_text, parse_numeral
 from ethbrake_marl.physics.elementary import exp, log
 from ethbrake_marl.physics.state import Bools, Floats

@@ -13,11 +13,12 @@ import numpy as np
 
 from ethbrake_marl.agents.learned import TRAINED_POLICY
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.errors import OnProgress, Progress, Unfamiliar
+from ethbrake_marl.errors import Unfamiliar
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.summary import SummaryRow, SummaryTable, summarise
+from ethbrake_marl.evaluation.summary import SummaryTable, summarise
+from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.episode_figure import trajectories
 from ethbrake_marl.extensions.report.page import Part
 from ethbrake_marl.extensions.report.paper_rows import is_papers_test, with_paper_rows
@@ -25,10 +26,11 @@ from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap, learning_curve
 from ethbrake_marl.extensions.report.style import write_picture
 from ethbrake_marl.extensions.report.three_tests import TESTS, brief, other_tests
-from ethbrake_marl.files.store import read_object
+from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.game.rewards import RewardParams
 from ethbrake_marl.policies.manifest import installed_versions
+from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.experiment import Experiment, RunReport, compared_agents, write_results
 

@@ -12,7 +12,7 @@ from matplotlib.ticker import FuncFormatter, PercentFormatter
 from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.summary import SummaryRow
+from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.style import TITLES, finish, label_text, name_axes, new_panels, plain, series_style
 from ethbrake_marl.extensions.report.svg import SLIM_IN
 from ethbrake_marl.extensions.search.regret import regrets_of

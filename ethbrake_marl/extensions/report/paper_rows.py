@@ -8,6 +8,7 @@ from typing import Literal
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.measures import BASELINE
+from ethbrake_marl.evaluation.notes import Note
 from ethbrake_marl.evaluation.summary import RowsBeside, SummaryTable, summarise
 from ethbrake_marl.extensions.report.three_tests import is_as_shipped
 from ethbrake_marl.scenario.task import Task
@@ -100,5 +101,5 @@ def _beside() -> RowsBeside:
         if paper.harm_decrease is not None:
             texts["harm_decrease_first"] = f"{100 * paper.harm_decrease:.4g} %"
         rows.append((paper.agent, texts))
-    conditions = [("quiet", f"Paper, {name}: {told}.") for name, told in PAPER_PARAMETERS.items()]
+    conditions: list[Note] = [("quiet", f"Paper, {name}: {told}.") for name, told in PAPER_PARAMETERS.items()]
     return RowsBeside(rows, [*conditions, ("note", PAPER_NOTE)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,9 +17,11 @@ from ethbrake_marl.agents.protocol import Driver
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.notes import identity_line
 from ethbrake_marl.evaluation.shield_modes import ShieldModes, compare_modes
 from ethbrake_marl.evaluation.statistics import mean, rate
-from ethbrake_marl.evaluation.summary import SummaryRow, SummaryTable
+from ethbrake_marl.evaluation.summary import SummaryTable
+from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.harm_figures import harm_by_agent, harm_in_parts, regret_distribution
 from ethbrake_marl.extensions.report.page import Page, Part, Section
 from ethbrake_marl.extensions.report.player import Played
@@ -189,7 +192,7 @@ class Report:
         for title, about, told_rows in self.tests:
             rows = _table_of(told_rows)
             notes = [Part.paragraph(text, "note") for text in _remarks(rows)]
-            told = [_short_table(rows), *notes, *_measured(rows), Part.paragraph(rows.identity_line(), "quiet")]
+            told = [_short_table(rows), *notes, *_measured(rows), Part.paragraph(identity_line(rows), "quiet")]
             sections.append(Section(title, [about, *told]))
             nowhere.intersection_update(_empty(rows))
         unseen = tuple(name for name in sheet.headings[2:] if name in nowhere)
@@ -200,7 +203,7 @@ class Report:
             if any(each.startswith(name) for each in seen) or not any(each.startswith(name) for each in unseen)
         }
         versions = [Part.facts(self.versions)] if self.versions else []
-        versions += [Part.paragraph(all_rows.identity_line(), "quiet")] if all_rows else []
+        versions += [Part.paragraph(identity_line(all_rows), "quiet")] if all_rows else []
         sections += [
             Section("How to read the tables", [Part.facts(meanings)]),
             Section("Settings and seeds", [Part.facts(self.settings)] if self.settings else ()),
@@ -366,3 +369,46 @@ def _table(sheet: Sheet, caption: str, names: set[str]) -> Part:
         f"The paper's {row.removeprefix('paper, ')}, as printed" if isinstance(row, str) else row for row in some.rows
     ]
     return Part.table(replace(some, title=caption, rows=rows))
+
+
+def write_evaluation(
+    path: Path,
+    evaluation: Evaluation,
+    rows: SummaryTable,
+    agents: Mapping[str, Driver],
+    *,
+    harm_count: HarmCount,
+    force: bool = False,
+    tell: Callable[[int, int], None] | None = None,
+) -> None:
+    """The page of ``ethbrake evaluate --report``, with episodes that ``agents`` drive again.
+
+    ``tell`` hears how many agents of how many have driven theirs. Raises what ``Report.write`` raises.
+    """
+    done: list[str] = []
+
+    def on_agent(agent: str) -> None:
+        done.append(agent)
+        if tell is not None:
+            tell(len(done), len(agents))
+
+    scenario, names, asked = evaluation.scenario, ", ".join(row.agent for row in rows), rows[0].parameters
+    scripts = ", ".join(f"{vehicle} by {script}" for vehicle, script in asked["scripts"].items())
+    report = Report(
+        f"{scenario.name}: {names}" if len(names) <= 60 else f"{scenario.name}: {len(rows)} agents compared",
+        rows,
+        evaluation,
+        harm_count=harm_count,
+        summary=scenario.title or "Agents on the same worlds.",
+        settings={
+            "Command": "ethbrake " + " ".join(sys.argv[1:]),
+            "Agents": names,
+            "Harm that agents minimise": "first impacts only" if harm_count == "first" else "every impact",
+            "Worlds": asked.line,
+            "Driven by the agents": asked.get("controlled_vehicle") or ", ".join(asked["controlled_vehicles"]),
+            "Driven by scripts": scripts or "none",
+            "Time step, horizon": f"{asked['time_step_s']:g} s, {asked['horizon_s']:g} s",
+        },
+        versions=rows[0].versions,
+    )
+    report.driven(agents, on_agent=on_agent).write(path, force=force)

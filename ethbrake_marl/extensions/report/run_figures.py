@@ -12,7 +12,7 @@ from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.statistics import mean
-from ethbrake_marl.evaluation.summary import SummaryRow
+from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.style import band, finish, label_text, name_axes, new_panels, series_style
 
 _PANELS = (

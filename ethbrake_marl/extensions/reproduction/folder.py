@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass as model
 
-from ethbrake_marl.errors import InvalidInput, OnProgress, count_of
+from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.extensions.report.page import Part
 from ethbrake_marl.extensions.reproduction.trainings import Group, groups
 from ethbrake_marl.extensions.reproduction.verdicts import (
@@ -26,6 +26,7 @@ from ethbrake_marl.extensions.reproduction.verdicts import (
 )
 from ethbrake_marl.files.sheet import Estimate, Sheet, Shown, csv_text as csv_of
 from ethbrake_marl.files.store import check_target
+from ethbrake_marl.progress import OnProgress
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.run_folder import RunDirectory

@@ -16,7 +16,7 @@ from ethbrake_marl.extensions.reproduction.hybrid import (
 from ethbrake_marl.extensions.reproduction.open_quantities import reproduce_gaps
 from ethbrake_marl.extensions.reproduction.trainings import OPEN, STOPPED
 from ethbrake_marl.extensions.reproduction.trajectories import play, reproduce_accelerations, reproduce_trajectories
-from ethbrake_marl.files.store import read_object
+from ethbrake_marl.files.plain import read_object
 
 ITEMS = (  # in the order of the paper
     Item(

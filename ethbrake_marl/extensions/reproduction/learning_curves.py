@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.registry import split_names
-from ethbrake_marl.errors import InvalidInput, OnProgress, count_of
+from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.identity import result_identity, worlds_sha256
 from ethbrake_marl.evaluation.seeds import interquartile_mean
 from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
@@ -24,6 +24,7 @@ from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.progress import OnProgress
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.training.run_folder import RunDirectory

@@ -24,7 +24,8 @@ from ethbrake_marl.extensions.reproduction.items import ITEMS, read_results
 from ethbrake_marl.extensions.reproduction.pages import render_page, write_docs
 from ethbrake_marl.extensions.reproduction.verdicts import summarise_verdicts
 from ethbrake_marl.extensions.studies.folder import StudyFolder
-from ethbrake_marl.files.store import read_object, write_file, write_output
+from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.files.store import write_file, write_output
 
 
 def choose_items(names: Sequence[str]) -> list[Item]:

@@ -11,7 +11,6 @@ from typing import Any, Literal
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.errors import Progress
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import mean, paired_difference
 from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS
@@ -34,6 +33,7 @@ from ethbrake_marl.extensions.reproduction.verdicts import HARM, LIST_SEED, PERC
 from ethbrake_marl.files.sheet import Estimate, Sheet
 from ethbrake_marl.physics.state import Bools, Floats
 from ethbrake_marl.policies.shipped import load_shipped
+from ethbrake_marl.progress import Progress
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.recipe import load_recipe

@@ -18,8 +18,9 @@ from ethbrake_marl.extensions.report.page import Page, Part, Section, shown
 from ethbrake_marl.extensions.reproduction.folder import LIMIT_BYTES, Result
 from ethbrake_marl.extensions.reproduction.items import ITEMS
 from ethbrake_marl.extensions.reproduction.verdicts import HOW_JUDGED, MOST_EPISODES
+from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.sheet import Column, Sheet, Shown
-from ethbrake_marl.files.store import read_plain, write_output
+from ethbrake_marl.files.store import write_output
 
 _TITLE = "The paper, made again"
 

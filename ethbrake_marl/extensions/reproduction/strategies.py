@@ -8,7 +8,6 @@ from typing import Literal
 
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.errors import Progress
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.evaluation.rollout import evaluate
@@ -21,6 +20,7 @@ from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.shipped import load_shipped
+from ethbrake_marl.progress import Progress
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.paper_hybrid import HybridAgent

@@ -7,7 +7,6 @@ from functools import cache
 
 import numpy as np
 
-from ethbrake_marl.errors import Progress
 from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
 from ethbrake_marl.extensions.report.episode_figure import trajectories
@@ -37,6 +36,7 @@ from ethbrake_marl.extensions.reproduction.strategies import (
 from ethbrake_marl.extensions.reproduction.verdicts import LIST_SEED, Less, Verdict, judge_statement
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.progress import Progress
 from ethbrake_marl.scenario.catalogue import load_scenario
 
 _AGENTS = (PPO, SAC, COUPLED, FULL_BRAKE)

@@ -10,8 +10,8 @@ from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.agent_tally import AgentTally
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import HELD
-from ethbrake_marl.evaluation.measures import BASELINE, Measure, MeasureSet, Silent
-from ethbrake_marl.evaluation.summary import SummaryRow
+from ethbrake_marl.evaluation.measures import BASELINE, GroupColumn, Measure, MeasureSet, Silent
+from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.search.limits import Unproven
 from ethbrake_marl.extensions.search.regret import KNOWN_OF_WORLDS, Between, Regrets, limits_of, regrets_of
 from ethbrake_marl.files.sheet import DASH, Column
@@ -93,6 +93,15 @@ class LimitMeasures(MeasureSet):
     whole = KNOWN
     narrow = ("mean_regret_first", "share_of_possible_reduction_first")
     notebook = narrow
+    group_column = GroupColumn(
+        Column(
+            "Share of the possible reduction", "share_of_possible_reduction", digits=1, scale=100.0, unit=" %",
+            short="Share of\npossible", interval="hidden",
+        ),
+        {"first": "share_of_possible_reduction_first", "total": "share_of_possible_reduction_total"},
+        "Share of the possible reduction of {harm} harm: 0 % for full braking, 100 % for the best known harm; none"
+        " where that is not known of every world.",
+    )  # fmt: skip
     per_world = KNOWN_OF_WORLDS
     texts = frozenset({"unavoidable_reason", "best_known_source"})
     because_key = "no_limits_because"

@@ -151,17 +151,23 @@ class Planner:
 
 
 def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """``planner`` or ``planner:CANDIDATES``; with ``:believed`` behind, in the believed world."""
-    planner = Planner(
+    """``planner`` or ``planner:CANDIDATES``."""
+    return Planner(
         argument, harm_count=settings.harm_count, horizon_s=settings.horizon_s,
         most_candidates=settings.most_candidates, time_step_s=settings.time_step_s,
     )  # fmt: skip
-    return Believing(planner, settings.needed_scenario(), shows=True) if settings.believes else planner
+
+
+def make_estimating_planner(argument: str | None, settings: AgentSettings) -> Agent:
+    """``planner:believed`` or ``planner:CANDIDATES:believed``: it searches in the estimated world."""
+    return Believing(make_planner(argument, settings), settings.needed_scenario(), shows=True)
 
 
 PLANNER = Part(
     make_planner,
-    form="planner[:CANDIDATES][:believed]",
-    about="a search in the simulation at every decision, with so many candidates each; believed: as above",
+    form="planner[:CANDIDATES]",
+    about="a search in the simulation at every decision, with so many candidates each",
     knows=Source.MODEL,
 )
+
+BELIEVED_PLANNER = Part(make_estimating_planner, about="as above")

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.files.store import check_folder, hold_lock, read_object, remove_unfinished, write_file
+from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.files.store import check_folder, hold_lock, remove_unfinished, write_file
 
 _LOCK = ".lock"
 

@@ -12,7 +12,8 @@ from pydantic import Field
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.identity import scenario_sha256
-from ethbrake_marl.files.yaml import FileModel, Wording, flow_text, read_model, read_yaml
+from ethbrake_marl.files.model import FileModel, Wording, read_model
+from ethbrake_marl.files.yaml import flow_text, read_yaml
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.state import Worlds
 from ethbrake_marl.scenario.schema import Scenario

@@ -11,7 +11,8 @@ from pydantic import Field, PrivateAttr
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.trial import load_runnable
-from ethbrake_marl.files.yaml import Document, FileModel, Wording, flow_text, read_model, read_yaml
+from ethbrake_marl.files.model import FileModel, Wording, read_model
+from ethbrake_marl.files.yaml import Document, flow_text, read_yaml
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe

@@ -17,16 +17,19 @@ from pydantic import AfterValidator, Discriminator, Field, GetJsonSchemaHandler,
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, count_of
+from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.extensions.studies.cluster import connected
 from ethbrake_marl.extensions.studies.figures import FIGURES, REASON, final_figures, finish, is_done
 from ethbrake_marl.extensions.studies.folder import StudyFolder
 from ethbrake_marl.extensions.studies.study_file import Seed, StudyFile, load_parts, refused_part, texts_of
 from ethbrake_marl.extensions.studies.trainings import TrainingJob
+from ethbrake_marl.files.json_schema import FileSchema
+from ethbrake_marl.files.model import FileModel
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import remove_unfinished, write_file
-from ethbrake_marl.files.yaml import FileModel, FileSchema, YamlPath, flow_text
+from ethbrake_marl.files.yaml import YamlPath, flow_text
 from ethbrake_marl.parallel import LOCAL
+from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.training.training import Training
 
 MOST_JOBS = 10_000

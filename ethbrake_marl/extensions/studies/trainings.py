@@ -10,11 +10,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from ethbrake_marl.errors import InvalidInput, OnProgress, Progress
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.files.store import read_object
+from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.parallel import run_each
 from ethbrake_marl.physics.state import Worlds
+from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.training.run_folder import RunDirectory
 from ethbrake_marl.training.team import load_team

@@ -17,8 +17,9 @@ from typing import Any
 
 from ray import tune
 
-from ethbrake_marl.errors import EthBrakeError, InvalidInput, OnProgress, Progress, describe_error
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
 from ethbrake_marl.extensions.studies.figures import HARM, REASON
+from ethbrake_marl.progress import OnProgress, Progress
 
 
 def run_trials(

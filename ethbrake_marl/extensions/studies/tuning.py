@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, Discriminator, Field, PlainValidator, Tag, WithJsonSchema, model_validator
 
-from ethbrake_marl.errors import InvalidInput, OnProgress, count_of, naming_extras
+from ethbrake_marl.errors import InvalidInput, count_of, naming_extras
 from ethbrake_marl.extensions.studies.cluster import connected
 from ethbrake_marl.extensions.studies.figures import (
     FIGURES,
@@ -32,11 +32,15 @@ from ethbrake_marl.extensions.studies.figures import (
 from ethbrake_marl.extensions.studies.folder import StudyFolder
 from ethbrake_marl.extensions.studies.study_file import Seed, StudyFile, load_parts, refused_part, texts_of
 from ethbrake_marl.extensions.studies.trainings import TrainingJob
+from ethbrake_marl.files.json_schema import FileSchema
+from ethbrake_marl.files.model import FileModel
+from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.sheet import csv_text
-from ethbrake_marl.files.store import read_object, remove_unfinished, write_file
-from ethbrake_marl.files.yaml import FileModel, FileSchema, flow_text
+from ethbrake_marl.files.store import remove_unfinished, write_file
+from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.parallel import LOCAL
 from ethbrake_marl.policies.manifest import installed_versions
+from ethbrake_marl.progress import OnProgress
 from ethbrake_marl.scenario.catalogue import check_file_name
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe

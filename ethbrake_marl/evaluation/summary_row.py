@@ -1,0 +1,123 @@
+"""What one agent achieved over a list of worlds: the estimate of every measure, and whose they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from ethbrake_marl.agents.protocol import Knowledge
+from ethbrake_marl.evaluation.conditions import Conditions
+from ethbrake_marl.evaluation.exploits import MARK, Exploits
+from ethbrake_marl.evaluation.measures import EPISODE, MEASURE_SETS, MeasureSet, RegisteredMeasures
+from ethbrake_marl.evaluation.outcome import COLUMN, UNSTATED, LeftOut
+from ethbrake_marl.evaluation.own_measures import heading_of
+from ethbrake_marl.files.sheet import Estimate
+
+
+@dataclass(frozen=True, slots=True)
+class SummaryRow:
+    """What one agent achieved over the list of worlds; harms are means per world, m2/s2.
+
+    ``row["harm_decrease_total"]`` is the estimate of any measure, by its name in JSON; None where it does not exist.
+
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> agents = {name: eb.make_agent(name) for name in ("full_brake", "coast")}
+    >>> rows = eb.summarise(eb.evaluate(scenario.sample(3, seed=7), agents, scenario=scenario))
+    >>> rows[0].agent, rows[0].collisions, round(rows[0].total_harm.value, 2), rows[0]["predicted_harm"]
+    ('full_brake', 2, 36.99, None)
+
+    """
+
+    agent: str  # its name
+    episodes: int  # worlds
+    estimates: Mapping[str, Estimate | None]  # of every measure, by its name in JSON
+    collisions: int  # worlds with at least one impact
+    horizon_ends: int  # worlds that the horizon cut off before the line stood
+    parameters: Conditions  # of the test
+    policy_share: float | None = None  # share of worlds in which a hybrid drove by its policy
+    more: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # fields of sets of measures, by set
+    bounds: frozenset[str] = frozenset()  # measures whose means are lower bounds
+    left_out: tuple[LeftOut, ...] = ()  # worlds of the list that no row counts: they could not be advanced
+    knows: Knowledge = UNSTATED  # what the agent says it knows of the line
+    hidden_share: float = 0.0  # worlds in which the channel hides something from a driven vehicle, whoever drives
+    worlds_sha256: str = ""  # of the list; results on the same worlds have the same
+    scenario_sha256: str = ""  # of all that shapes an episode
+    policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle -> its policy's, where one drives
+    versions: Mapping[str, str] = field(default_factory=dict)  # of what computed it
+
+    def __getitem__(self, measure: str) -> Estimate | None:
+        return self.estimates[measure]
+
+    @property
+    def collision_rate(self) -> Estimate:
+        """Share of worlds."""
+        return self.estimates["collision_rate"]  # type: ignore[return-value]  # every agent has it in every world
+
+    @property
+    def first_impact_harm(self) -> Estimate:
+        """Each pair's first impact."""
+        return self.estimates["first_impact_harm"]  # type: ignore[return-value]  # all have it in all worlds
+
+    @property
+    def total_harm(self) -> Estimate:
+        """Every impact."""
+        return self.estimates["total_harm"]  # type: ignore[return-value]  # all have it in all worlds
+
+    @property
+    def metrics(self) -> dict[str, Estimate]:
+        """Registered measures, by column."""
+        found = {name.removeprefix(COLUMN): each for name, each in self.estimates.items() if name.startswith(COLUMN)}
+        return {name: each for name, each in found.items() if each is not None}
+
+    @property
+    def sees_through(self) -> bool:
+        """Whether the channel hides something here that this agent reads all the same."""
+        return self.hidden_share > 0.0 and self.knows.sees_through
+
+    @property
+    def exploits(self) -> Exploits:
+        """What it does that harm does not count."""
+        shoved = self.estimates["vehicle_1_shoved_m"]
+        return Exploits(None if shoved is None else shoved.value, self.horizon_ends / self.episodes)
+
+    @property
+    def marked(self) -> str:
+        """Its agent, marked where it exploits what harm does not count."""
+        return f"{self.agent} {MARK}" if self.exploits.names else self.agent
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for JSON; what does not exist is null, intervals are ``[low, high]``."""
+        registered = RegisteredMeasures(n.removeprefix(COLUMN) for n in self.estimates if n.startswith(COLUMN))
+        more: dict[str, Any] = {}
+        for name, each in MEASURE_SETS.items():
+            more |= {**self._estimates_of(each), **self.more.get(name, {})}
+        return {
+            "kind": "evaluate",
+            "agent": self.agent,
+            "knows": self.knows.text,
+            "sees_through_channel": self.sees_through,
+            "hidden_share": self.hidden_share,
+            "episodes": self.episodes,
+            "collisions": self.collisions,
+            "horizon_ends": self.horizon_ends,
+            "exploits": list(self.exploits.names),
+            **self._estimates_of(EPISODE),
+            **self._estimates_of(registered),
+            **({"policy_share": self.policy_share} if self.policy_share is not None else {}),
+            **more,
+            "left_out": [left._asdict() for left in self.left_out],
+            "worlds_sha256": self.worlds_sha256,
+            "scenario_sha256": self.scenario_sha256,
+            "policy_sha256": dict(self.policy_sha256),
+            "versions": dict(self.versions),
+            **({"metrics": {name: heading_of(name) for name in self.metrics}} if self.metrics else {}),
+            "parameters": self.parameters,
+        }
+
+    def _estimates_of(self, of: MeasureSet) -> dict[str, Any]:
+        """The estimates of one set, side by side."""
+        there = {m.name: self.estimates[m.name] for m in of.measures if m.name in self.estimates}
+        optional = {measure.name for measure in of.measures if not measure.always}
+        return Estimate.side_by_side({name: each for name, each in there.items() if each or name not in optional})

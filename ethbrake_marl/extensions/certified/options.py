@@ -1,0 +1,135 @@
+"""The settings of mode ``robust``, and of ``believed``, checked; and the guards that they make."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ethbrake_marl.agents.protocol import Agent, Source
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine.scripts import Script
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.certified.enclosure import CORNERS, INTERIOR, checked_robust
+from ethbrake_marl.extensions.certified.estimated_shield import BelievedShield
+from ethbrake_marl.extensions.certified.guards import BelievedGuard, RobustGuard, RobustMode
+from ethbrake_marl.extensions.certified.robust_step import RobustShield
+from ethbrake_marl.extensions.certified.uncertainty import UNCERTAINTY_EXAMPLE, Uncertainty, parse_uncertainty
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.contract import ShieldGuard, ShieldMode
+from ethbrake_marl.shield.options import ShieldOptions, check_mode, misplaced, one_learner, shielded_vehicle
+
+
+@dataclass(frozen=True)
+class RobustOptions(ShieldOptions):
+    """``eb.ShieldOptions`` with what guards against the unknown.
+
+    Args:
+        mode: also ``robust``: ``step`` against an uncertainty. None: ``robust`` with an uncertainty, else ``step``.
+        uncertainty: what mode ``robust`` does not know, such as ``"gaps_m=0.5"``.
+        robust: what mode ``robust`` certifies of an uncertainty: its ``corners`` (fast), or its whole ``interior``.
+        believed: certify on what the vehicle received, mode ``robust`` against all that it did not. Modes ``step`` and
+            ``robust`` of one learner, without ``uncertainty``, ``allowance``, ``cap``, ``logging`` and ``shares``.
+
+    Raises ``InvalidInput`` and ``UnknownName`` as that does.
+
+    >>> import ethbrake_marl as eb
+    >>> eb.ShieldOptions(uncertainty="gaps_m=0.5").mode
+    'robust'
+
+    """
+
+    uncertainty: Uncertainty | str | None = None
+    robust: str = CORNERS
+    believed: bool = False
+
+    def __post_init__(self) -> None:
+        if self.mode is None:
+            object.__setattr__(self, "mode", "step" if self.uncertainty is None else "robust")
+        mode, where = check_mode(self.mode), self.where
+        self.check_switches("believed")
+        if self.believed:
+            if mode == "episode":
+                raise misplaced("believed", True, mode, ["step", "robust"], where)
+            without = {"uncertainty": None, "allowance": 0.0, "cap": None, "logging": False, "shares": False}
+            for name, value in without.items():
+                if getattr(self, name) != value:
+                    raise InvalidInput(
+                        f"{where}: {name} = {getattr(self, name)!r}: not together with believed = True, which"
+                        " certifies against what was not received"
+                    )
+        uncertainty = None if self.believed else mode_uncertainty(mode, self.uncertainty, where)
+        object.__setattr__(self, "uncertainty", uncertainty)
+        super().__post_init__()
+        if checked_robust(self.robust, where) == INTERIOR and mode != "robust":
+            raise misplaced("robust", self.robust, mode, ["robust"], where)
+
+    @property
+    def written(self) -> str:
+        """The mode as it stands behind an agent's ``+``."""
+        robust = "" if self.robust == CORNERS else f":{self.robust}"
+        return f"{self.mode}{robust}{':believed' if self.believed else ''}"
+
+    @property
+    def adds(self) -> Source:
+        """What the shield knows of the line beside what a policy knows."""
+        return Source.BELIEFS if self.believed else super().adds
+
+    def shield(
+        self, scenario: Scenario, vehicle: int | tuple[int, ...], others: Mapping[int, Script] | None = None
+    ) -> Any:
+        """The shield of one vehicle before any episode."""
+        if self.believed:
+            assert isinstance(vehicle, int)
+            robust = self.robust if self.mode == "robust" else None
+            return BelievedShield(scenario, vehicle, harm_count=self.harm_count, robust=robust, others=others)
+        if self.mode == "robust":
+            return RobustShield(
+                scenario, vehicle, harm_count=self.harm_count, allowance=self.allowance, others=others, cap=self.cap,
+                uncertainty=checked_uncertainty(self.uncertainty), robust=self.robust, logging=self.logging,
+            )  # fmt: skip
+        return super().shield(scenario, vehicle, others)
+
+    def check_in(self, scenario: Scenario, *, several: bool) -> None:
+        """Raise ``InvalidInput`` at once where the shield of a driver refuses the scenario."""
+        one = one_learner(scenario)
+        if self.believed:  # without one learner nobody knows whose scripts count
+            self.shield(scenario, one or 0, {} if one is None else None)
+        else:
+            super().check_in(scenario, several=several)
+
+    def guard(self, engine: Engine, policies: Mapping[int, Agent], *, several: bool = False, **how: Any) -> ShieldGuard:
+        """The guard of these settings, for all learners of an engine."""
+        scenario, scripts, where = engine.scenario, engine.scripts, self.where
+        if self.believed:
+            if len(engine.learners) > 1:
+                raise InvalidInput(
+                    f"{where}: believed = True: shields one learner, not several; pass learners=['vehicle_2'] to the"
+                    " environment"
+                )
+            mode = RobustMode.ROBUST if self.mode == "robust" else ShieldMode.STEP
+            shield = self.shield(scenario, engine.learners[0], scripts)
+            return BelievedGuard(engine, policies, shield, mode=mode, where=where)
+        if self.mode == "robust":
+            shield = self.shield(scenario, shielded_vehicle(engine, several), scripts)
+            mode = RobustMode.ROBUST
+            return RobustGuard(engine, policies, shield, mode=mode, where=where, shares=self.shares, **how)
+        return super().guard(engine, policies, several=several, **how)
+
+
+def checked_uncertainty(given: object) -> Uncertainty | None:
+    """An ``Uncertainty``, given as such or in its written form; None stays None. Raises ``InvalidInput`` otherwise."""
+    if given is None or isinstance(given, Uncertainty):
+        return given
+    if isinstance(given, str):
+        return parse_uncertainty(given)
+    raise InvalidInput(f"uncertainty = {given!r}: must be an Uncertainty or text, for instance {UNCERTAINTY_EXAMPLE!r}")
+
+
+def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None:
+    """The uncertainty that goes with a mode: needed by ``robust``, refused by every other one with ``InvalidInput``."""
+    uncertainty = checked_uncertainty(given)
+    if (mode == "robust") != (uncertainty is not None):
+        what = "needs an uncertainty" if uncertainty is None else "takes no uncertainty; robust does"
+        raise InvalidInput(f"{where}: mode {mode} {what}, for instance {UNCERTAINTY_EXAMPLE}")
+    return uncertainty

@@ -1,0 +1,242 @@
+"""Models of files: what a file may say, and one clear message for the first mistake in it.
+
+Where it stands, its value, and what would be right. No other file words its errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn, TypeVar, get_args
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails, PydanticCustomError
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.plain import parse_strict_json
+from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, parse_numeral, read_yaml
+
+# Ending of a key -> the unit in words.
+UNITS = {
+    "s": "seconds",
+    "m": "metres",
+    "mps": "metres per second",
+    "mps2": "metres per second squared",
+    "mps3": "metres per second cubed",
+    "t": "tonnes",
+}
+
+_RIGHT = {
+    "finite_number": "must be a finite number",
+    "int_type": "must be a whole number, written without a decimal point or an exponent",
+    "string_type": "must be text",
+    "dict_type": "must be a mapping",
+    "model_type": "must be a mapping",
+    "model_attributes_type": "must be a mapping",
+    "tuple_type": "must be a list",
+}
+
+NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
+
+
+class FileModel(BaseModel):
+    """What a file may say: unknown keys, other types and later changes are refused."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+UNSHOWN = object()  # a value that the message does not show
+
+
+def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
+    """Raise the error for ``value`` at ``at`` (inside the field being checked): ``right`` says what would do."""
+    shown = "" if value is UNSHOWN else flow_text(value, 60)
+    raise PydanticCustomError("refused", "{right}", {"right": right, "value": shown, "at": at})
+
+
+def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
+    """``refuse`` the value unless ``holds``."""
+    if not holds:
+        refuse(at, value, right)
+
+
+class Wording:
+    """What messages know of one kind of file: its keys by the fields of its model, and what a missing one needs."""
+
+    def __init__(self, model: type[BaseModel], needed: str = "") -> None:
+        self.model, self._needed = model, needed
+
+    def known(self, path: YamlPath) -> list[str]:
+        """The keys that may stand where ``path`` ends."""
+        models = [self.model]
+        for key in path[:-1]:
+            inside = [model.model_fields[key].annotation for model in models if key in model.model_fields]
+            models = [found for annotation in inside for found in _models_in(annotation)] or models
+        return list(dict.fromkeys(f.alias or name for model in models for name, f in model.model_fields.items()))
+
+    def needed(self, path: YamlPath) -> str:
+        """What is needed at ``path``, where it is missing."""
+        return self._needed
+
+    def instead(self, key: str) -> str:
+        """What there is in place of a key that such files do not have; empty where nothing is known of it."""
+        return ""
+
+    def owner(self, path: YamlPath) -> str:
+        """Whose value stands at ``path``, in words; empty where that needs no saying."""
+        return ""
+
+    def right(self, detail: ErrorDetails) -> str:
+        """What would be right, where only this kind of file knows; empty where the error says it itself."""
+        return ""
+
+
+def explain(document: Document, error: ValidationError, wording: Wording) -> InvalidInput:
+    """The error where it does not fit its schema.
+
+    The first is shown, unknown keys before all others, and "(and k more mistakes)" tells the rest. A missing
+    key that an unknown one was probably meant to be is not counted.
+    """
+    # A default that needs another field is not made after an error elsewhere: no defect of its own.
+    details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
+    unknown = [d for d in details if d["type"] == "extra_forbidden"]
+    meant = " ".join(suggestion(str(d["loc"][-1]), wording.known(path_of(d))) for d in unknown)
+    rest = [d for d in details if d not in unknown and not (d["type"] == "missing" and f" {path_of(d)[-1]}" in meant)]
+    shown = (unknown + rest)[0]
+    more = len(unknown) + len(rest) - 1
+    path = path_of(shown)
+    absent = shown["type"] == "missing" and len(path) == 1
+    where = document.file if absent else document.where(path)
+    told = f" (and {more} more mistake{'s' * (more > 1)})" if more else ""
+    return InvalidInput(f"{where}: {_describe(shown, path, wording)}{told}")
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from _models_in(inner)
+
+
+def read_model(source: str | Path | Document, model: type[Model], wording: Wording, advice: str) -> Model:
+    """What a file, or a document, says; raises ``InvalidInput`` with file, line, key, value and what would be right.
+
+    ``advice`` says what must be there where it holds no mapping of keys to values.
+    """
+    document = source if isinstance(source, Document) else read_yaml(source)
+    if not isinstance(document.content, dict):
+        raise InvalidInput(f"{document.file}: must be a mapping {advice}")
+    try:
+        return model.model_validate(document.content)
+    except ValidationError as error:
+        raise explain(document, error, wording) from None
+
+
+def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
+    """The plain content of a JSON file that a program wrote, and what it says; raises ``ValueError`` in one line."""
+    content = parse_strict_json(data)  # no key twice, no NaN
+    try:
+        return content, model.model_validate_json(data)
+    except ValidationError as error:
+        raise ValueError(str(first_mistake(error))) from None
+
+
+class Mistake(NamedTuple):
+    """The first defect that pydantic found in what no person wrote: as text ``place: right``."""
+
+    place: str  # keys with dots between them; empty for the whole
+    given: Any
+    right: str
+
+    def __str__(self) -> str:
+        return f"{self.place}: {self.right}" if self.place else self.right
+
+
+def first_mistake(error: ValidationError) -> Mistake:
+    """Where the first mistake is, and what would be right: for files that programs write, and for settings in code."""
+    detail = error.errors(include_url=False)[0]
+    right = {"missing": "is missing", "extra_forbidden": "unknown key"}.get(detail["type"])
+    return Mistake(".".join(str(key) for key in path_of(detail)), detail["input"], right or _right(detail))
+
+
+def path_of(detail: ErrorDetails) -> YamlPath:
+    """The path inside the file: without pydantic's tags, with the path inside the field that a check gave."""
+    keys = tuple(key for key in detail["loc"] if not (isinstance(key, str) and key.startswith("#")))
+    return (*keys, *detail.get("ctx", {}).get("at", ()))
+
+
+def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
+    place = _place(path, wording)
+    if detail["type"] == "extra_forbidden":
+        inside = wording.known(path)
+        if path[-1] in inside:
+            return f"{place}: does not go with what stands beside it; a quantity has one distribution"
+        hint = wording.instead(str(path[-1])) or suggestion(str(path[-1]), inside) or f"known: {', '.join(inside)}"
+        return f"{place}: unknown key; {hint}"
+    if detail["type"] == "missing":
+        return f"{place}: missing; {wording.needed(path)}"
+    ctx = detail.get("ctx", {})
+    value = ctx["value"] if "value" in ctx else _show(detail)
+    right = _unquote(detail) or wording.right(detail) or _right(detail)
+    return f"{place}{f' = {value}' if value else ''}: {right}".removeprefix(": ")
+
+
+def _show(detail: ErrorDetails) -> str:
+    """The value, unless the whole file is meant; a number keeps the point that makes it wrong."""
+    given = detail["input"]
+    if isinstance(given, BaseModel) or not detail["loc"]:
+        return ""
+    return repr(given) if detail["type"] == "int_type" and isinstance(given, float) else flow_text(given, 60)
+
+
+def _place(path: YamlPath, wording: Wording) -> str:
+    text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path).removeprefix(".")
+    owner = wording.owner(path)
+    return f"{text} ({owner})" if owner else text
+
+
+def _unquote(detail: ErrorDetails) -> str:
+    """What would be right for a number in quotes; empty for anything else."""
+    given = detail["input"]
+    quoted = detail["type"] == "float_type" and isinstance(given, str) and parse_numeral(given) is not None
+    return "must be a number, not text; write it without quotes" if quoted else ""
+
+
+def _right(detail: ErrorDetails) -> str:
+    kind = detail["type"]
+    if detail["input"] != detail["input"]:  # NaN, which is not less than anything, either
+        return "must be a finite number"
+    if kind == "float_type":
+        return "must be a number"
+    if kind == "too_long":
+        most = detail["ctx"]["max_length"]
+        return f"must have {most if most == 2 else f'at most {most}'} entries"  # 2: a pair
+    if kind == "too_short":
+        least = detail["ctx"]["min_length"]
+        return "must not be empty" if least == 1 else f"must have at least {least} entries"
+    if kind == "string_pattern_mismatch":
+        pattern = detail["ctx"]["pattern"]
+        name = "must be 1 to 64 lower case letters, digits, - and _, beginning with a letter or digit"
+        return name if pattern == NAME_PATTERN else f"must match {pattern}"
+    if kind == "literal_error":
+        return f"must be {detail['ctx']['expected'].replace(chr(39), '')}"
+    text = str(detail["msg"]).removeprefix("Value error, ")
+    return _RIGHT.get(kind, text.replace("Input should", "must").replace("must be a valid", "must be a"))
+
+
+def suggestion(key: str, known: Iterable[str]) -> str:
+    """What an unknown ``key`` was probably meant to be; empty when nothing is close.
+
+    A key that differs from a known one only in its unit is recognised as such: ``gaps_km``, ``mass``.
+    """
+    names = sorted(known)
+    stems = {name.rsplit("_", 1)[0]: name for name in names if name.rsplit("_", 1)[-1] in UNITS}
+    same = stems.get(key.rsplit("_", 1)[0]) or stems.get(key)
+    close = [same] if same else get_close_matches(key, names, n=1)
+    if not close:
+        return ""
+    unit = UNITS.get(close[0].rsplit("_", 1)[-1], "")
+    return f"did you mean {close[0]}{f' ({unit})' if unit else ''}?"

@@ -1,0 +1,150 @@
+"""The options of a shield around an interface, and their checks, the same for every interface."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.agents.learned import LearnedAgent, LearnedPolicy
+from ethbrake_marl.agents.protocol import Agent, Team
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.errors import InvalidInput, check_one_learner
+from ethbrake_marl.game.observations import ObservationSpec
+from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.shield.contract import Guarded, ShieldGuard
+from ethbrake_marl.shield.options import ShieldOptions, read_options
+
+
+def proposing_agent(policy: object, where: str) -> Agent:
+    """The policy as an agent; an agent is returned as it is. Raises ``InvalidInput`` for anything else."""
+    if not isinstance(policy, type):
+        if isinstance(policy, Agent):
+            return policy
+        if callable(policy) and isinstance(getattr(policy, "observation", None), ObservationSpec):
+            return LearnedAgent(policy)  # type: ignore[arg-type]  # it is callable, and says what it observes
+    raise InvalidInput(
+        f"{where}: policy = {policy!r}: must be an agent or a policy (eb.load_policy), which says what it observes"
+    )
+
+
+def proposing_agents(
+    policy: Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy], vehicles: Sequence[int], where: str
+) -> dict[int, Agent]:
+    """The agent that proposes for each shielded vehicle, from a team, policies by name of vehicle, or one for all.
+
+    Raises ``InvalidInput`` for anything else, and for a team of other vehicles.
+    """
+    if isinstance(policy, Team):
+        given: dict[int, Agent] = policy.drivers
+    elif isinstance(policy, Mapping):
+        by_name = {f"vehicle_{i + 1}": i for i in vehicles}
+        given = {by_name.get(name, -1): proposing_agent(each, where) for name, each in policy.items()}
+    else:
+        agent = proposing_agent(policy, where)
+        return dict.fromkeys(vehicles, agent)
+    if set(given) != set(vehicles):
+        names = ", ".join(f"vehicle_{i + 1}" for i in vehicles)
+        raise InvalidInput(f"{where}: policy: one for each of {names} is needed, and for nobody else")
+    return {i: given[i] for i in vehicles}
+
+
+Proposing = Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy]
+"""Who proposes: one for every shielded vehicle, a team, or one for each by its vehicle's name."""
+
+
+def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -> ShieldGuard:
+    """The guard of these options for all learners of an engine. ``policy`` proposes where the caller does not.
+
+    Raises ``InvalidInput`` where nobody learns, for several learners in another mode than ``step``, and for what is no
+    policy.
+    """
+    where, mode, scenario, vehicles = options.where, options.mode, engine.scenario, engine.learners
+    if not vehicles:
+        raise InvalidInput(
+            f"{where}: no vehicle of scenario {scenario.name!r} learns, so there is nobody to shield; pass"
+            " learners=['vehicle_2'] to the environment"
+        )
+    if mode != "step":
+        check_one_learner(
+            scenario.name,
+            [scenario.vehicle_names[i] for i in vehicles],
+            f"{where} needs exactly one learner in mode {mode}: what it certifies is known only if every other vehicle"
+            " follows a script; mode step shields several together; or pass learners=['vehicle_2'] to the environment",
+        )
+    if mode == "episode":
+        return options.guard(engine, {vehicles[0]: proposing_agent(policy, where)})
+    policies = {} if policy is None else proposing_agents(policy, vehicles, where)
+    return options.guard(engine, policies, warns=True)
+
+
+class Attached:
+    """A guard in the engine of an environment, for the wrapper that put it there.
+
+    Raises ``InvalidInput`` for what is not one of this package's environments, or is shielded already.
+    """
+
+    def __init__(
+        self, env: object, interface: type, maker: str, policy: Proposing | None, where: str, options: Mapping[str, Any]
+    ) -> None:
+        self.options, self._env = read_options(where, options), env
+        engine = self._reached()
+        if isinstance(engine, Engine) and isinstance(engine.guard, ShieldGuard):
+            first = engine.guard
+            raise InvalidInput(
+                f"{where}: a {first.where} (mode {first.mode.name.lower()}) shields this environment already, and its"
+                " bound holds for one shield alone; give that one other options, or close() it first"
+            )
+        if isinstance(getattr(env, "attached", None), Attached):
+            raise InvalidInput(f"{where}: {env} is a shield that was closed; put this one around what that is around")
+        if not (isinstance(env, interface) and isinstance(engine, Engine)):
+            raise InvalidInput(
+                f"{where}: goes around {maker}, not {env}; eb.shield(env) chooses the one for an environment of ours"
+            )
+        self.engine, self._left = engine, Guarded(None, {})
+        self.guard = guard_of(engine, policy, self.options)
+        engine.protect(self.guard)
+
+    @property
+    def memory(self) -> Guarded:
+        """The guard's memory now; once it was closed, its last one."""
+        memory: Guarded | None = self.engine.guarded if self.engine.guard is self.guard else self._left
+        return Guarded(None, {}) if memory is None else memory
+
+    @property
+    def shield(self) -> Any:
+        """As it is now, to be read; None before a reset.
+
+        A ``StepShield``, or the shield of another mode; in mode ``episode`` the memory of the ``HybridAgent``.
+        """
+        return self.memory.shield
+
+    def _reached(self) -> Any:
+        """The engine of the environment inside, as it is now."""
+        return getattr(getattr(self._env, "unwrapped", self._env), "engine", None)
+
+    def check_open(self) -> None:
+        """Raise ``InvalidInput`` where this shield bounds nothing: it was closed, or another environment is inside."""
+        if self._reached() is not self.engine:
+            raise InvalidInput(
+                f"{self.options.where}: another environment is inside than the one that is shielded; put a shield"
+                " around that one"
+            )
+        if self.engine.guard is not self.guard:
+            raise InvalidInput(f"{self.options.where}: this shield was closed; put a new one around the environment")
+
+    def close(self) -> None:
+        """Take the guard out of the engine."""
+        if self.engine.guard is self.guard:
+            self._left = self.memory
+            self.engine.protect(None)
+
+    def penalty(self) -> Floats:
+        """The penalty of the last step's interventions, to be taken off the rewards, [n, L]."""
+        self.check_open()
+        ruling = self.engine.ruling
+        if ruling is None:
+            return np.zeros((self.engine.n, len(self.engine.learners)))
+        intervened = self.guard.intervened(ruling) & ruling.asked[:, np.newaxis]
+        return np.asarray(self.options.intervention_penalty * intervened, np.float64)

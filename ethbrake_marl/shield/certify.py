@@ -1,0 +1,393 @@
+"""``certify``: is there a plan behind the proposed action that keeps the budget? If not, apply the backup's action.
+
+A plan is tried in every member of a world, one after the other, with the kernels of ``members``. After the proposal
+these plans are tried: the rest of the current plan, then the best constant action. ``step`` says why the harm of the
+episode then stays within the first bound.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.physics.episode import CLOCK, at_rest
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Bools, Floats, Ints
+from ethbrake_marl.shield.members import (
+    Members,
+    all_members,
+    borne_by,
+    follow_plan,
+    hold_constant,
+    members_from,
+    take_steps,
+    worst_of_plan,
+    worst_so_far,
+)
+from ethbrake_marl.shield.reasons import (
+    CONSTANT,
+    ENDED,
+    NO_CERTIFICATE,
+    NOT_A_NUMBER,
+    PLAN_REMAINS,
+    SAME_AS_PLAN,
+    ShieldReason,
+)
+from ethbrake_marl.shield.running import Running, put
+
+APPLIED, REASON, BOUND, MARGIN = range(4)  # columns of a decision, of each vehicle
+
+NEARLY = 1e-9  # a constant whose harm (m2/s2) in one segment is above the limit by less is certified step by step
+
+
+@compiled(apart=True)
+def best_constant(world: Members, states: Floats, ended: Bools, step: int, constants: Floats) -> tuple[int, float]:
+    """Which constant action [C, K] has the least worst harm from here on, and that harm, each in one segment."""
+    best, least, critical = 0, math.inf, 0
+    for c in range(constants.shape[0]):
+        worst, first = 0.0, critical
+        for j in range(ended.shape[0]):
+            m = (first + j) % ended.shape[0]
+            value = hold_constant(world, m, states[m], ended[m], step, constants, c)
+            if value > worst:
+                worst, critical = value, m
+            if not worst < least:
+                break
+        if worst < least:
+            best, least = c, worst
+    return best, least
+
+
+@compiled(apart=True)
+def better_plan(
+    world: Members, states: Floats, ended: Bools, step: int, constants: Floats, value: float, most: float,
+    plan: Floats, trial: Floats,
+) -> tuple[float, float]:  # fmt: skip
+    """Replace the plan from ``step`` on by the best constant, if that harms less than ``value`` and at most ``most``.
+
+    Returns the harm that is certified now, and the least harm found, certified or not.
+    """
+    so_far = worst_so_far(world, states)
+    if value <= so_far or so_far > most:  # nothing can be better
+        return value, min(value, so_far) if value <= so_far else so_far
+    best, least = best_constant(world, states, ended, step, constants)
+    if not least < value or least > most + NEARLY:
+        return value, min(value, least)
+    for j in range(step, trial.shape[0]):
+        copy_action(constants[best], trial[j])
+    certified = worst_of_plan(world, states, ended, step, trial, most)
+    if not certified < value:
+        return value, min(value, least)
+    for j in range(step, plan.shape[0]):
+        copy_action(constants[best], plan[j])
+    return certified, certified
+
+
+@compiled
+def copy_action(action: Floats, to: Floats) -> None:
+    """Copy the actions of one decision, one for each vehicle, or what else is a row of numbers."""
+    for c in range(to.shape[0]):
+        to[c] = action[c]
+
+
+@compiled
+def is_planned(action: Floats, planned: Floats) -> bool:
+    """Whether all vehicles do what the plan says."""
+    for c in range(planned.shape[0]):  # noqa: SIM110  # all() is not compiled
+        if action[c] != planned[c]:
+            return False
+    return True
+
+
+@compiled(apart=True)
+def try_action(
+    world: Members, states: Floats, ended: Bools, step: int, action: Floats, budget: float, certified: float,
+    constants: Floats, plan: Floats, room: Floats, after: Floats, over: Bools,
+) -> tuple[float, float, int]:  # fmt: skip
+    """Take the step of an action [K], and look for a plan after it: harm certified, least harm found, and the reason.
+
+    Where the harm is within the budget, action and plan are in ``plan`` afterwards; else that is as it was, and its
+    harm ``certified``. An action from which the physics fails is not certified.
+    """
+    going = take_steps(world, states, ended, step, action, after, over)
+    value = worst_so_far(world, after) if going >= 0 else math.inf
+    reason, least = PLAN_REMAINS, value
+    if is_planned(action, plan[step]) and going >= 0:
+        reason, value = SAME_AS_PLAN, certified
+    elif going > 0:
+        for j in range(plan.shape[0]):
+            copy_action(plan[j], room[0, j])
+        value = worst_of_plan(world, after, over, step + 1, plan, budget)
+        reason = CONSTANT if value > budget else PLAN_REMAINS
+        value, least = better_plan(world, after, over, step + 1, constants, value, budget, room[0], room[1])
+        if value <= budget:
+            for j in range(plan.shape[0]):
+                copy_action(room[0, j], plan[j])
+    if value <= budget:
+        copy_action(action, plan[step])
+    return value, least, reason
+
+
+@compiled
+def tell_action(out: Floats, action: Floats, bound: float, margin: float) -> None:
+    """Note in ``out`` [K, 4] what is applied, its bound, and the margin of those that did not deviate."""
+    for c in range(action.shape[0]):
+        out[c, APPLIED], out[c, BOUND] = action[c], bound
+        if out[c, REASON] != NO_CERTIFICATE:
+            out[c, MARGIN] = margin
+
+
+@compiled(apart=True)
+def decide_world(
+    world: Members, states: Floats, ended: Bools, step: int, proposed: Floats, budget: float, certified: float,
+    constants: Floats, plan: Floats, room: Floats, tried: Floats, after: Floats, over: Bools, out: Floats,
+) -> bool:  # fmt: skip
+    """Decide in one world, see ``certify``: fills ``after``, ``over`` (by member) and ``out`` (by vehicle: applied,
+    reason, bound, margin); the plan is the one whose harm is ``out``'s bound. First all proposals [K] together; if they
+    have no certificate, one vehicle after the other, front to rear, each beside what is in the plan by then. Returns
+    whether the physics did not fail with what is applied.
+    """
+    deviating = 0
+    for c in range(proposed.shape[0]):
+        usable = not math.isnan(proposed[c])
+        tried[0, c] = min(max(proposed[c], -1.0), 1.0) if usable else plan[step, c]
+        out[c, REASON] = SAME_AS_PLAN if usable else NOT_A_NUMBER
+        if tried[0, c] != plan[step, c]:
+            out[c, REASON] = -1  # open
+            deviating += 1
+    value, least, reason = try_action(
+        world, states, ended, step, tried[0], budget, certified, constants, plan, room, after, over
+    )  # fmt: skip
+    if value <= budget:
+        for c in range(out.shape[0]):
+            out[c, REASON] = reason if out[c, REASON] == -1 else out[c, REASON]
+        tell_action(out, plan[step], value, budget - value)
+        return True
+    bound, accepted = certified, 0
+    for c in range(out.shape[0]):
+        if out[c, REASON] != -1:
+            continue
+        if deviating > 1:
+            copy_action(plan[step], tried[1])
+            tried[1, c] = tried[0, c]
+            value, least, reason = try_action(
+                world, states, ended, step, tried[1], budget, bound, constants, plan, room, after, over
+            )  # fmt: skip
+        fits = value <= budget
+        out[c, REASON], out[c, MARGIN] = reason if fits else NO_CERTIFICATE, budget - least
+        if fits:
+            bound, accepted = value, accepted + 1
+    going = take_steps(world, states, ended, step, plan[step], after, over)
+    if going > 0 and accepted == 0:
+        bound, _ = better_plan(world, after, over, step + 1, constants, bound, bound, plan, room[1])
+    tell_action(out, plan[step], bound, budget - bound)
+    return going >= 0
+
+
+@compiled
+def certify_worlds(
+    running: Running, proposed: Floats, budget: Floats, certified: Floats, constants: Floats, plans: Floats,
+    after: Floats, out: Floats, over: Bools, failed: Bools,
+) -> None:  # fmt: skip
+    """``decide_world`` in every world whose episode runs; ``failed`` [n] where it did. ``plans`` change in place."""
+    n, every = running.steps.shape[0], all_members(running)
+    room, tried = np.zeros((2, plans.shape[1], plans.shape[2])), np.zeros((2, plans.shape[2]))
+    M = running.states.shape[0] // max(n, 1)
+    for k in range(n):
+        a, b = k * M, k * M + M
+        if running.ended[a:b].all():
+            for m in range(a, b):
+                copy_action(running.states[m], after[m])
+            last = min(running.steps[k], plans.shape[1] - 1)
+            for c in range(plans.shape[2]):
+                out[k, c, APPLIED], out[k, c, REASON] = plans[k, last, c], ENDED
+                out[k, c, BOUND], out[k, c, MARGIN] = certified[k], budget[k] - certified[k]
+            over[a:b] = True
+            continue
+        good = decide_world(
+            members_from(every, a, b), running.states[a:b], running.ended[a:b], running.steps[k], proposed[k],
+            budget[k], certified[k], constants, plans[k], room, tried, after[a:b], over[a:b], out[k],
+        )  # fmt: skip
+        failed[k] = not good
+
+
+@compiled
+def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Floats) -> None:
+    """Fill ``value`` [n] with the worst harm of the episodes if the plans are executed from here; infinity: it failed.
+
+    Where one of the ``constants`` is better, it replaces the plan (in place) first.
+    """
+    n, every = running.steps.shape[0], all_members(running)
+    trial = np.zeros((plans.shape[1], plans.shape[2]))
+    M = running.states.shape[0] // max(n, 1)
+    for k in range(n):
+        a, b = k * M, k * M + M
+        world, step, plan = members_from(every, a, b), running.steps[k], plans[k]
+        value[k] = worst_of_plan(world, running.states[a:b], running.ended[a:b], step, plan, math.inf)
+        if constants.shape[0] > 0:
+            value[k], _ = better_plan(
+                world, running.states[a:b], running.ended[a:b], step, constants, value[k], value[k], plan, trial
+            )
+
+
+@compiled
+def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) -> None:
+    """How the episodes end if the plans are executed from here.
+
+    Fills ``rests`` [n]: every member comes to rest before the horizon, and stays so; and ``borne`` [n * M, N]: the harm
+    that each vehicle bears then, an obstacle ahead none.
+    """
+    n, every = running.steps.shape[0], all_members(running)
+    M = running.states.shape[0] // max(n, 1)
+    for k in range(n):
+        rests[k] = True
+        for m in range(k * M, k * M + M):
+            follow_plan(every, m, running.states[m], running.ended[m], running.steps[k], plans[k], math.inf)
+            rests[k] = rests[k] and at_rest(every.table)
+            for i in range(borne.shape[1]):
+                borne[m, i] = borne_by(every.table, running.problem.clock[m, CLOCK.HARM_IS_TOTAL], i)
+
+
+@compiled
+def descend_constants(running: Running, grid: Floats, rounds: int, action: Floats) -> None:
+    """Replace each vehicle's constant action [n, K] in turn by the best of the grid, by harm in one segment.
+
+    In place, one vehicle after the other; of worlds with one member each.
+    """
+    every, states, ended, steps = all_members(running), running.states, running.ended, running.steps
+    for k in range(states.shape[0]):
+        least = hold_constant(every, k, states[k], ended[k], steps[k], action, k)
+        for turn in range(rounds * action.shape[1]):
+            c = turn % action.shape[1]
+            best = action[k, c]
+            for g in range(grid.shape[0]):
+                action[k, c] = grid[g]
+                value = hold_constant(every, k, states[k], ended[k], steps[k], action, k)
+                if value < least:
+                    best, least = grid[g], value
+            action[k, c] = best
+
+
+CONSTANTS = tuple(-k / 10 for k in range(11))  # actions that are tried as constants: coasting to full braking
+
+
+class Backup(NamedTuple):
+    """The plan that is executed where nothing else is certified."""
+
+    plan: Floats  # [n, L] or [n, L, K] actions, column j for decision j
+    harm: Floats  # [n] of the episode, in the worst member, if the plan is executed from now on (m2/s2)
+    constants: Floats = np.array(CONSTANTS)  # [C] or [C, K] actions that may replace the rest of a plan
+
+
+class Decision(NamedTuple):
+    """The applied actions, the reasons, and the bound and plan that hold from now on."""
+
+    applied: Floats  # [n] or [n, K] actions in [-1, 1]
+    intervened: Bools  # [n] or [n, K] what is applied is not what was proposed (clipped)
+    reason: NDArray[np.int64]  # [n] or [n, K] values of ShieldReason
+    bound: Floats  # [n] harm of the episode is at most this from now on (m2/s2)
+    margin: Floats  # [n] or [n, K] budget minus the least harm found after the proposal; negative: why it was rejected
+    after: Running  # as it will be at the next decision
+    backup: Backup  # the plan that goes with the bound
+
+    @property
+    def reason_names(self) -> NDArray[np.str_]:
+        """The reasons in words, [n] or [n, K]."""
+        texts = [ShieldReason(code).text for code in self.reason.ravel().tolist()]
+        return np.array(texts).reshape(self.reason.shape)
+
+    def put(self, rows: Ints, other: Decision, taken: Ints) -> Decision:
+        """A copy with some worlds taken from another decision: ``rows`` of this one are ``taken`` of the other."""
+        columns: dict[str, Any] = {
+            name: put(getattr(self, name), rows, getattr(other, name)[taken]) for name in self._fields[:5]
+        }
+        at, where = self.after.rows_of(rows), other.after.rows_of(taken)
+        after = self.after._replace(
+            states=put(self.after.states, at, other.after.states[where]),
+            ended=put(self.after.ended, at, other.after.ended[where]),
+        )
+        plan = put(self.backup.plan, rows, other.backup.plan[taken])
+        harm = put(self.backup.harm, rows, other.bound[taken])
+        return self._replace(**columns, after=after, backup=self.backup._replace(plan=plan, harm=harm))
+
+
+def plan_harm(running: Running, plan: Floats) -> Floats:
+    """Harm of the episodes in the worst member if the plans are executed from here, [n] m2/s2, caps aside.
+
+    It equals the engine's to the bit.
+    """
+    return bettered_plan(running, plan, np.zeros(0))[1]
+
+
+def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Floats, Floats]:
+    """The plans, or the best constant action where it harms less in the worst member; and that harm."""
+    value = np.empty(running.n)
+    _check_plan(running, plan)
+    plans = np.array(plan, np.float64, order="C")
+    K = len(running.problem.vehicles)
+    each = plans.reshape(*plans.shape[:2], K)
+    harm_of_plans(running.uncapped, constants.reshape(len(constants), K), each, value)
+    _raise_if_any(~np.isfinite(value))
+    return plans, value
+
+
+def from_now(past: Floats, later: Floats | float, steps: Ints) -> Floats:
+    """Plans with the actions of ``past``, which were applied, before the decisions ``steps`` [n], then ``later``."""
+    made = np.arange(past.shape[1]) < steps[:, np.newaxis]
+    return np.where(made if past.ndim == 2 else made[:, :, np.newaxis], past, later)
+
+
+def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) -> Decision:
+    """Decide in every world which proposed actions are applied, and where the backup's; no argument is changed.
+
+    Args:
+        running: the episodes, at this decision.
+        proposed: actions [n] or [n, K]. One beyond [-1, 1] is clipped first; one that is no number is replaced.
+        backup: the plan that is applied where a proposal has no certificate, and its harm.
+        budget: the harm [n] that is guaranteed, at least the backup's.
+
+    Raises ``InvalidInput`` for shapes that do not fit or a budget below the backup's harm, ``PhysicsError`` naming the
+    worlds that cannot be advanced by what would be applied.
+
+    """
+    n, problem, vehicles = running.n, running.problem, len(running.problem.vehicles)
+    _check_plan(running, backup.plan)
+    given = np.ascontiguousarray(proposed, np.float64)
+    shape = (n, *backup.plan.shape[2:])
+    if not (given.shape == shape and backup.harm.shape == budget.shape == (n,)):
+        raise InvalidInput(
+            f"certify: proposed {given.shape}, backup's harm {backup.harm.shape}, budget {budget.shape};"
+            f" {shape}, and twice ({n},) needed"
+        )
+    if not (budget >= backup.harm).all():
+        raise InvalidInput("certify: a budget is below the backup's harm; nothing could be guaranteed")
+    plans, after, out = backup.plan.copy(), np.empty_like(running.states), np.empty((n, vehicles, 4))
+    over, failed = np.zeros(problem.n, np.bool_), np.zeros(n, np.bool_)
+    certify_worlds(
+        running, given.reshape(n, vehicles), budget, backup.harm,
+        backup.constants.reshape(-1, vehicles), plans.reshape(n, plans.shape[1], vehicles), after, out, over, failed,
+    )  # fmt: skip
+    _raise_if_any(failed)
+    applied, bound, margin = out[:, :, 0].reshape(shape), out[:, 0, 2].copy(), out[:, :, 3].reshape(shape)
+    reason = out[:, :, 1].astype(np.int64).reshape(shape)
+    intervened = (reason == NO_CERTIFICATE) | (reason == NOT_A_NUMBER)
+    later = running._replace(states=after, steps=running.steps + ~running.finished, ended=over)
+    return Decision(applied, intervened, reason, bound, margin, later, backup._replace(plan=plans, harm=bound))
+
+
+def _raise_if_any(failed: Bools) -> None:
+    if failed.any():
+        raise PhysicsError({k: "the shield could not follow its plan" for k in np.flatnonzero(failed).tolist()})
+
+
+def _check_plan(running: Running, plan: Floats) -> None:
+    most = int(running.problem.last_step.max(initial=0))
+    vehicles = len(running.problem.vehicles)
+    fits = vehicles == 1 if plan.ndim == 2 else plan.shape[2:] == (vehicles,)
+    if not fits or plan.shape[0] != running.n or plan.shape[1] < most:
+        wanted = f"({running.n}, at least {most}{'' if vehicles == 1 else f', {vehicles}'})"
+        raise InvalidInput(f"shield: plan {plan.shape}; {wanted} is needed")

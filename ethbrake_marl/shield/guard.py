@@ -1,0 +1,131 @@
+"""Mode ``step`` in an engine: a ``StepShield`` decides, and each step is compared with its forecast."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from collections.abc import Mapping
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.engine.engine import Engine, Ruling
+from ethbrake_marl.errors import InvalidInput, UncertifiedStep, count_of
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.shield.comparison import difference, seen_columns
+from ethbrake_marl.shield.contract import Guarded, ShieldGuard, ShieldMode, why
+from ethbrake_marl.shield.step import StepShield
+
+
+class MovingAtHorizon(UserWarning):
+    """A shield's bound ends at the horizon, and something may still be moving then."""
+
+
+class StepGuard(ShieldGuard):
+    """Certify every action, or replace it.
+
+    Args:
+        engine: in which the guard will stand.
+        policies: are rolled out at each alert, and propose where the caller does not.
+        shield: before any episode, of the engine's learners.
+        mode: the code of the infos.
+        where: the interface, for messages.
+        shares: the infos say what each vehicle bears; with a cap they always do.
+        later_rollouts: a policy's own rollout may certify an action.
+        told: the worlds at the alert as the shield takes them to be; None: as they are, which the policies see anyway.
+        warns: with ``MovingAtHorizon``, once, where the plan at an alert leaves something moving at the horizon.
+
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        policies: Mapping[int, Agent],
+        shield: StepShield,
+        *,
+        mode: IntEnum = ShieldMode.STEP,
+        where: str = "shield",
+        shares: bool = False,
+        later_rollouts: bool = True,
+        told: Worlds | None = None,
+        warns: bool = False,
+    ) -> None:
+        super().__init__(engine, policies, shield, mode=mode, where=where)
+        self._several = isinstance(shield.vehicle, tuple)
+        self._shares = shares or shield.cap is not None
+        self._later_rollouts, self._told, self._to_warn = later_rollouts, told, warns
+
+    def _started(self, shield: StepShield, alert: Worlds, rows: Ints) -> StepShield:
+        if self._told is not None and not (rows < self._told.n).all():
+            raise InvalidInput(f"shield: told of {count_of(self._told.n, 'world')}, but row {rows.max()} begins")
+        shield.begin(alert if self._told is None else self._told.take(rows), rows, self._policies or None)
+        moving = int((~shield.settles[rows]).sum())
+        if moving and self._to_warn:
+            self._to_warn = False
+            warnings.warn(
+                f"shield: in {moving} of {len(rows)} worlds something still moves at the horizon,"
+                f" {shield.scenario.horizon_s:g} s, under the plan that gives the bound; the bound says nothing of what"
+                " comes after; a longer horizon_s lets them come to rest",
+                MovingAtHorizon,
+                stacklevel=2,
+            )
+        return shield
+
+    def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
+        """Apply what the shield certifies, in the worlds whose episodes run."""
+        shield: StepShield = memory.shield
+        goes_on, finished = ~running.ended, shield.running.finished  # type: ignore[union-attr]  # it has begun
+        worlds = running.worlds if self._policies or self._told is not None else None  # made anew each time
+        proposed, memories = self._asked(worlds, memory.policies, proposed)
+        seen = seen_columns(running.packed)
+        after = copy.copy(shield)
+        decision = after.decide(
+            proposed if self._several else proposed[:, 0],
+            seen=seen if self._told is None else seen[:, : (3 * seen.shape[1] + 2) // 5],  # without harm
+            only=goes_on,
+            proposer=self._proposer(memories, worlds) if self._later_rollouts else None,
+        )
+        applied = decision.applied.reshape(proposed.shape)
+        stepped_in: Bools = np.any(decision.intervened.reshape(proposed.shape), axis=1)
+        return Ruling(proposed, applied, stepped_in, goes_on & ~finished, decision, Guarded(after, memories))
+
+    def check(self, ruling: Ruling, after: Engine) -> Guarded:
+        """Compare the worlds after the step with what was certified, the last step included.
+
+        Raises ``UncertifiedStep`` where they differ. Where the shield was ``told`` something else than is, the world
+        becomes distrusted instead. Worlds that the physics could not advance are cut off, and not compared.
+        """
+        memory: Guarded = ruling.memory
+        shield: StepShield = memory.shield
+        running, wanted = shield.running, ruling.asked & ~shield.distrusted
+        assert running is not None
+        wanted[list(after.roster.failed)] = False
+        if (wrong := np.flatnonzero(wanted & (after.steps != running.steps))).size:
+            k = int(wrong[0])
+            raise UncertifiedStep(
+                f"shield: world {k} is at step {after.steps[k]} of its episode, certified was step {running.steps[k]}"
+            )
+        seen = shield.as_seen(seen_columns(after.packed))
+        surprising = wanted & ~shield.expects(seen)
+        if not surprising.any():
+            return memory
+        if self._told is None:
+            k = int(np.argmax(surprising))
+            raise UncertifiedStep(
+                f"shield: after this step {difference(running.nominal().states[k], seen[k])} (world {k})"
+            )
+        shield = copy.copy(shield)
+        shield.distrusted = shield.distrusted | surprising
+        return memory._replace(shield=shield)
+
+    def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
+        """What the infos say of a certified step."""
+        shield: StepShield = memory.shield
+        assert shield.running is not None
+        infos = self._of_step(ruling) | why(ruling)
+        infos |= {"bound_harm": shield.bound, "trusted": ~shield.distrusted, "settles": shield.settles}
+        if self._shares:
+            infos |= {"own_harm": shield.shares(), "baseline_own_harm": shield.baseline_shares}
+        return infos
