@@ -12,6 +12,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from ethbrake_marl.agents.learned import TRAINED_POLICY
 from ethbrake_marl.agents.protocol import Driver
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.conditions import Conditions
@@ -24,15 +25,7 @@ from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.harm_figures import harm_by_agent, harm_in_parts, regret_distribution
 from ethbrake_marl.extensions.report.page import Page, Part, Section
 from ethbrake_marl.extensions.report.player import Played
-from ethbrake_marl.extensions.report.shown_worlds import (
-    BASELINE,
-    NAMES,
-    ROUNDING,
-    TRAINED_POLICY,
-    WORDS,
-    choose_shown,
-    worst_rows,
-)
+from ethbrake_marl.extensions.report.shown_worlds import BASELINE, NAMES, ROUNDING, WORDS, choose_shown, worst_rows
 from ethbrake_marl.extensions.search.limits import Unproven
 from ethbrake_marl.extensions.search.regret import limits_of, regrets_of
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown
