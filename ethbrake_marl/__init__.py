@@ -59,7 +59,8 @@ if TYPE_CHECKING:
         agent_names as agent_names,
         make_agent as make_agent,
     )
-    from ethbrake_marl.policies.network import Policy as Policy, load_policy as load_policy
+    from ethbrake_marl.policies.bundle import load_policy as load_policy
+    from ethbrake_marl.policies.policy import Policy as Policy
     from ethbrake_marl.policies.shipped import load_shipped as load_shipped
 
     # Shields: for any interface, and one for each

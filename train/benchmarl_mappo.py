@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
-from ethbrake_marl.policies.manifest import NetworkSpec
-from ethbrake_marl.policies.network import Policy
+from ethbrake_marl.policies.network_spec import NetworkSpec
+from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.scenario.observed import observation_for
 from ethbrake_marl.training.recipe import load_recipe
 from ethbrake_marl.training.recipes import PpoRecipe
-from ethbrake_marl.training.run_folder import RunDirectory, Training
+from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.training import Training
 
 
 def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> None:

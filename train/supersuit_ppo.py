@@ -25,10 +25,10 @@ import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.files.store import new_folder
 from ethbrake_marl.game.rewards import reward_params
-from ethbrake_marl.policies.manifest import NetworkSpec
-from ethbrake_marl.policies.network import Policy
+from ethbrake_marl.policies.network_spec import NetworkSpec
+from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.training.networks import tensors_of
-from ethbrake_marl.training.run_folder import Training
+from ethbrake_marl.training.training import Training
 
 # 1. What to train: the same settings as train/ppo.yaml, in smaller networks.
 

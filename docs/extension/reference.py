@@ -24,7 +24,6 @@ from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.observed import state_features
 from ethbrake_marl.scenario.schema import Scenario, scenario_json_schema
 from ethbrake_marl.training.recipe import TrainingRecipe
-from ethbrake_marl.training.recipe_text import MEANINGS
 
 CARDS = Path(__file__).resolve().parents[2] / "ethbrake_marl" / "_policies"
 ON_EVERY_COMMAND = ("--help",)
@@ -171,10 +170,22 @@ def recipe_keys() -> str:
             each = parts[title]["properties"][key]
             default = f"`{each['default']}`" if each.get("default") else ""
             default = "required" if key in parts[title]["required"] else default
-            rows.append((f"`{key}`", MEANINGS.get(key, ""), _range(each, schema), default))
+            rows.append((f"`{key}`", each.get("description", ""), _range(each, schema), default))
         tables[title] = table(("key", "meaning", "range", "default"), rows)
-    inside = [(f"`{key}`", text) for key, text in MEANINGS.items() if "." in key]
-    return sections(**tables, Inside_others=table(("key", "meaning"), inside))
+    inside: dict[str, list[str]] = {}  # key of a mapping inside a recipe -> its meanings, by algorithm
+    for part in parts.values():
+        for outer, each in part["properties"].items():
+            for key, inner in _inside(each, schema).items():
+                told = inside.setdefault(f"`{outer}.{key}`", [])
+                told += [inner["description"]] if inner.get("description", "") not in ("", *told) else []
+    rows = [(key, "; or ".join(texts)) for key, texts in inside.items() if texts]
+    return sections(**tables, Inside_others=table(("key", "meaning"), rows))
+
+
+def _inside(value: Mapping[str, Any], schema: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Properties of the mapping that a key holds; none where it holds another kind of value, or a reward."""
+    name = str(value.get("$ref", "")).rpartition("/")[2]
+    return {} if name == "RewardParams" else schema["$defs"].get(name, {}).get("properties", {})
 
 
 # What an environment shows.

@@ -12,9 +12,11 @@ from ethbrake_marl.game.actions import action_to_command
 from ethbrake_marl.game.observations import Observations, ObservationSpec, observe
 from ethbrake_marl.physics.state import Floats, Worlds
 
+TRAINED_POLICY = "trained policy"  # name, in tables and figures, of the policy that a run trains
+
 
 class LearnedPolicy(Protocol):
-    """What an agent needs of a policy; ``ethbrake_marl.policies.network.Policy`` is one."""
+    """What an agent needs of a policy; ``ethbrake_marl.policies.policy.Policy`` is one."""
 
     @property
     def observation(self) -> ObservationSpec:

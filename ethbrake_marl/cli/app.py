@@ -20,18 +20,18 @@ from typer.exceptions import TyperException
 from typer.main import get_command
 
 from ethbrake_marl import __version__
-from ethbrake_marl.cli import doctor, evaluate, reproduce, scenario, study, train, watch
+from ethbrake_marl.cli import doctor, evaluate, scenario, train
 from ethbrake_marl.cli.command import EVERY_S, Out, example
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, describe_error, naming_extras
 from ethbrake_marl.kernel_store import is_temporary, on_first_compilation
-from ethbrake_marl.registry import Registry, giver, points
+from ethbrake_marl.registry import OURS, Registry, giver, points
 
 app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     help="Ethical emergency braking: train, shield, evaluate. Every command has its own --help with an example.",
-    epilog=example("run", "watch --agents full_brake,e_v2x_bm --output both.gif"),
+    epilog=example("run", "evaluate --agents full_brake,e_v2x_bm --episodes 1000"),
 )
 _NAMES = "What --set, recipes and scenarios may name: ethbrake scenario parts"
 for name, command, shown in (
@@ -41,15 +41,9 @@ for name, command, shown in (
     ("compare", evaluate.compare_command, "compare before/results.json after/results.json"),
     ("shield", evaluate.shield_command, "shield --agents ppo@shipped,full_brake --episodes 500"),
     ("doctor", doctor.doctor_command, "doctor"),
-    ("reproduce", reproduce.reproduce_command, "reproduce random-table harm-distance --quick --output runs/paper"),
-    ("watch", watch.watch_command, "watch --agents full_brake,e_v2x_bm --world 3 --output both.gif"),
 ):
     app.command(name, epilog=example(shown) + (f"\n\n{_NAMES}" if name in ("train", "evaluate") else ""))(command)
-for name, group in (
-    ("scenario", scenario.scenario_group),
-    ("agent", scenario.agent_group),
-    ("study", study.study_group),
-):
+for name, group in (("scenario", scenario.scenario_group), ("agent", scenario.agent_group)):
     app.add_typer(group, name=name)
 
 
@@ -193,16 +187,17 @@ def abandon_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def add_command(name: str, command: typer.Typer | Callable[..., Any]) -> None:
+def add_command(name: str, command: typer.Typer | Callable[..., Any], *, epilog: str | None = None) -> None:
     """Make ``ethbrake NAME`` known: a function, as ``app.command`` takes it, or a Typer with commands of its own.
 
-    An installed package does it with an entry point of the group ``ethbrake_marl.commands``.
+    An installed package, or an extension of ours, does it with an entry point of the group ``ethbrake_marl.commands``.
+    ``GROUP.NAME`` is a command of a group that another entry point gives. ``epilog``: the end of a function's help.
     """
     if isinstance(command, typer.Typer):
         given = command
     else:
         given = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-        given.command()(command)
+        given.command(epilog=epilog)(command)
     made = get_command(given)
     COMMANDS.add(name, made, lambda other: other is made)
 
@@ -220,28 +215,54 @@ COMMANDS: Registry[Any] = Registry("command", "commands", add_command, dict.from
 
 
 class Installed(TyperCommand):
-    """A command of an installed package, which is loaded when it is called."""
+    """A command of an extension or an installed package, which is loaded when it is called.
 
-    def __init__(self, name: str) -> None:
-        givers = [giver(point) for point in points(COMMANDS.group)[name]]
+    ``entry``: the name of its entry point, ``NAME`` or ``GROUP.NAME``.
+    """
+
+    def __init__(self, entry: str) -> None:
+        givers = [giver(point) for point in points(COMMANDS.group)[entry]]
         packages = f"package{'s' if len(givers) > 1 else ''} {' and '.join(givers)}"
-        super().__init__(name, help=f"Of the installed {packages}.", rich_markup_mode=None)
+        super().__init__(entry.rpartition(".")[2], help=f"Of the installed {packages}.", rich_markup_mode=None)
+        self.entry, self.is_ours = entry, givers == [OURS]
+
+    def command(self) -> Any:
+        """The command itself."""
+        found = COMMANDS[self.entry]
+        found.name = self.name
+        return with_installed(found, self.entry)
 
     def make_context(self, *given: Any, **settings: Any) -> Any:
         """The context of the command itself."""
-        return COMMANDS[str(self.name)].make_context(*given, **settings)
+        return self.command().make_context(*given, **settings)
+
+    def get_short_help_str(self, limit: int = 45) -> str:
+        """One line for the list of commands; of another package it names the package, and loads nothing of it."""
+        return str(self.command().get_short_help_str(limit) if self.is_ours else super().get_short_help_str(limit))
+
+
+def with_installed(group: Any, name: str) -> Any:
+    """The group with the commands that entry points ``NAME.COMMAND`` add to it."""
+    for entry in points(COMMANDS.group):
+        of, _, own = entry.rpartition(".")
+        if of == name:
+            group.commands[own] = Installed(entry)
+    return group
 
 
 def whole_command() -> Any:
-    """All commands, those of installed packages and of a user's program among them.
+    """All commands: of the core, of extensions and installed packages, and of a user's program.
 
     Raises ``AlreadyExists`` for a command of a program that would take the place of another one.
     """
-    added = [name for name in COMMANDS if name not in _OURS]
+    added = [name for name in COMMANDS if name not in _OURS and "." not in name]
     names = [*_names(), *added]
     for k, name in enumerate(names):
         if name in names[:k]:
             raise AlreadyExists(f"command {name!r} is there already; give yours another name: app.command('my-{name}')")
     whole: Any = get_command(app)
-    whole.commands |= {name: COMMANDS.loaded.get(name) or Installed(name) for name in [*points(COMMANDS.group), *added]}
+    for name in _OURS:
+        with_installed(whole.commands[name], name)
+    installed = [name for name in points(COMMANDS.group) if "." not in name]
+    whole.commands |= {name: COMMANDS.loaded.get(name) or Installed(name) for name in [*installed, *added]}
     return whole

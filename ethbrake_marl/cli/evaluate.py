@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -23,13 +22,13 @@ from ethbrake_marl.cli.command import (
     SettingsOption,
     say,
 )
+from ethbrake_marl.cli.pages import page_of
 from ethbrake_marl.errors import InvalidInput, need
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.files.store import check_folder, write_output
 
 if TYPE_CHECKING:
     from ethbrake_marl.agents.protocol import Driver
-    from ethbrake_marl.game.harm import HarmCount
     from ethbrake_marl.physics.left_out import LeftOutRows
     from ethbrake_marl.scenario.sample import Sample
     from ethbrake_marl.scenario.task import Task
@@ -107,6 +106,7 @@ def evaluate_command(
 
     with Out(as_json=as_json, force=force) as out:
         _check_outputs(out, output, per_world, report=report)
+        write_page = page_of("evaluation", "--report") if report else None
         given = training.read_settings(settings, of_agents=("harm_count", "measures"))
         if group := scenarios.group_of_scenarios(scenario):
             other = {"--per-world": per_world, "--report": report, "--jobs": jobs, "--ray": ray}
@@ -135,9 +135,13 @@ def evaluate_command(
             summary = evaluation.summarise(found)
             beside_it = _write_worlds(out, output, found, per_world)
             results = evaluation.results_to_json(summary, per_world=beside_it, settings=used)
-            if report and output is not None:
+            if write_page is not None and output is not None:
                 output.mkdir(parents=True, exist_ok=True)
-                _write_report(out, output / REPORT, found, summary, lineup.make(), task.harm_count)
+                write_page(
+                    output / REPORT, found, summary, lineup.make(), harm_count=task.harm_count, force=out.force,
+                    tell=lambda done, total: out.progress("report: episodes", done, total),
+                )  # fmt: skip
+                out.note(f"report: {output / REPORT}")
         _write_results(out, output, results, f"{WORLDS}.{per_world}", REPORT if report else "")
         out.result(results, *summary.tables())
         _tell_horizon(out, _moving(summary), summary[0].episodes, task.scenario.horizon_s)
@@ -259,47 +263,6 @@ def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: f
 def _moving(rows: Sequence[evaluation.SummaryRow]) -> dict[str, int]:
     """In how many worlds something still moves at the horizon, by shielded driver."""
     return {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
-
-
-def _write_report(
-    out: Out,
-    path: Path,
-    found: evaluation.Evaluation,
-    rows: Sequence[evaluation.SummaryRow],
-    agents: Mapping[str, Driver],
-    harm_count: HarmCount,
-) -> None:
-    """Write the page of an evaluation that has just been made."""
-    # matplotlib takes a second to load, and most evaluations draw nothing
-    from ethbrake_marl.extensions.report.report import Report
-
-    done: list[str] = []
-
-    def tell(agent: str) -> None:
-        done.append(agent)
-        out.progress("report: episodes", len(done), len(agents))
-
-    scenario, names, asked = found.scenario, ", ".join(row.agent for row in rows), rows[0].parameters
-    scripts = ", ".join(f"{vehicle} by {script}" for vehicle, script in asked["scripts"].items())
-    report = Report(
-        f"{scenario.name}: {names}" if len(names) <= 60 else f"{scenario.name}: {len(rows)} agents compared",
-        rows,
-        found,
-        harm_count=harm_count,
-        summary=scenario.title or "Agents on the same worlds.",
-        settings={
-            "Command": "ethbrake " + " ".join(sys.argv[1:]),
-            "Agents": names,
-            "Harm that agents minimise": "first impacts only" if harm_count == "first" else "every impact",
-            "Worlds": asked.line,
-            "Driven by the agents": asked.get("controlled_vehicle") or ", ".join(asked["controlled_vehicles"]),
-            "Driven by scripts": scripts or "none",
-            "Time step, horizon": f"{asked['time_step_s']:g} s, {asked['horizon_s']:g} s",
-        },
-        versions=rows[0].versions,
-    )
-    report.driven(agents, on_agent=tell).write(path, force=out.force)
-    out.note(f"report: {path}")
 
 
 _FILE = typer.Argument(

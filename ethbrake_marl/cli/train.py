@@ -55,13 +55,13 @@ def run_command(
 ) -> None:
     """Train a policy, shield it, compare with the baselines, report.
 
-    Writes the run's folder: the policy, results as CSV and JSON, every world, three figures, and report.html. After
-    one of the three tests (paper-random, -brake-only, -obstacle) the policy also drives the other two.
+    Writes the run's folder: the policy, results as CSV and JSON, every world, and what installed reports add: three
+    figures and report.html; after one of the three tests (paper-random, -brake-only, -obstacle) also the other two.
     Ctrl-C ends the training early, and what it has is evaluated; a second Ctrl-C stops at once.
     """
     with Out(as_json=as_json, force=force, kept=KEPT) as out:
         # torch takes seconds to load, here and in the other commands that learn
-        from ethbrake_marl.extensions.report.experiment import run_experiment
+        from ethbrake_marl.training.experiment import run_experiment
 
         plan = training.load_recipe(recipe)
         given = training.read_settings(settings, [plan])
@@ -86,8 +86,9 @@ def run_command(
             f" {trained.wall_s:.0f} s ({trained.status}). hybrid is the trained policy behind its shield. All minimise"
             f" {count} harm.\n"
         )
-        out.result(result.results, Text(told), result.brief, *result.rows.tables()[1:])
-        out.note(f"report, with every measure and the paper's rows: {result.report}")
+        out.result(result.results, Text(told), *result.tables)
+        for note in result.notes:
+            out.note(note)
         _end(out, result.trained)
 
 

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.policies.network import Policy, load_policy
+from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.scenario.schema import Scenario
 
 SHIPPED = "shipped"

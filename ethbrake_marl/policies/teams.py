@@ -9,7 +9,8 @@ from pathlib import Path
 
 from ethbrake_marl.errors import CorruptBundle
 from ethbrake_marl.files.store import new_folder
-from ethbrake_marl.policies.network import MANIFEST, Policy, load_policy
+from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.policies.policy import MANIFEST, Policy
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from ethbrake_marl.doors import front_door
 
 if TYPE_CHECKING:
+    from ethbrake_marl.training.callback import StopAt as StopAt
     from ethbrake_marl.training.recipe import (
         WORDS as WORDS,
         TrainingRecipe as TrainingRecipe,
@@ -12,13 +13,10 @@ if TYPE_CHECKING:
         load_recipe as load_recipe,
         register_algorithm as register_algorithm,
     )
-    from ethbrake_marl.training.run_folder import RunDirectory as RunDirectory, Training as Training
-    from ethbrake_marl.training.session import (
-        StopAt as StopAt,
-        TrainResult as TrainResult,
-        resume as resume,
-        train as train,
-    )
+    from ethbrake_marl.training.run_folder import RunDirectory as RunDirectory
+    from ethbrake_marl.training.session import TrainResult as TrainResult, resume as resume, train as train
     from ethbrake_marl.training.settings import Settings as Settings, read_settings as read_settings
+    from ethbrake_marl.training.team import load_team as load_team
+    from ethbrake_marl.training.training import Training as Training
 else:
     __getattr__ = front_door(__name__, __file__)

@@ -12,10 +12,12 @@ from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Driver, Source, Team
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.policies.network import Policy
+from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.shipped import SHIPPED, load_named_policy, shipped_name
 from ethbrake_marl.registry import Part
+from ethbrake_marl.training.recipe import ALGORITHMS
 from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.team import has_policy_each, load_team
 
 
 def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
@@ -36,9 +38,9 @@ def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
     agent: LearnedAgent | Team
     if name == "universal" and path.partition("/universal")[0] != SHIPPED:
         raise InvalidInput(f"agent {spec!r}: must be universal@{SHIPPED}; for another policy: ppo@PATH or sac@PATH")
-    if not ships and (name == "team" or (name != "universal" and RunDirectory(Path(path)).is_team)):
+    if not ships and (name == "team" or (name != "universal" and has_policy_each(RunDirectory(Path(path))))):
         vehicles = None if settings.role is None else (settings.role,)
-        agent = RunDirectory(Path(path)).load_team(settings.needed_scenario(), spec, vehicles)
+        agent = load_team(path, settings.needed_scenario(), spec, vehicles)
         first: Any = agent.drivers[min(agent.drivers)]
         policy: Policy = first.policy
     else:
@@ -48,7 +50,7 @@ def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
         policy = load_named_policy(path, kind, known, settings.harm_count)
         agent = LearnedAgent(policy, name=spec if path == f"{SHIPPED}/{kind}" else f"{kind}@{path}")
     trained_by = policy.manifest.algorithm
-    if name in ("ppo", "sac", "counterfactual", "options") and name != trained_by:
+    if name in ALGORITHMS and name != trained_by:
         raise InvalidInput(
             f"agent '{name}@{path}': that policy was trained by {trained_by.upper()}: {trained_by}@{path}"
         )

@@ -33,8 +33,6 @@ _KINDS = {
 
 KEPT = 2  # checkpoints of a running training; a torn last one leaves the one before
 
-COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining", "_total_timesteps")
-
 
 class TrainingState(NamedTuple):
     """What a training needs to go on."""

@@ -1,30 +1,43 @@
-"""From a training to its environment, its model, and from a model's present weights to policies."""
+"""Build the environment and the model of a training, and make policies of the model's weights."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import NamedTuple
 
-import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.logger import CSVOutputFormat, KVWriter, TensorBoardOutputFormat
-from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
-from ethbrake_marl.errors import EthBrakeError, InvalidInput
-from ethbrake_marl.policies.manifest import Float32s, NetworkSpec
-from ethbrake_marl.policies.network import Policy
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
+from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.teams import PolicyTeam, Trained
 from ethbrake_marl.scenario.observed import Appended
-from ethbrake_marl.training.checkpoint import TrainingState
+from ethbrake_marl.training.algorithm import Algorithm
+from ethbrake_marl.training.finite import refuse_gradients
 from ethbrake_marl.training.recipe import Scheme
-from ethbrake_marl.training.run_folder import Algorithm, RunDirectory, Training
+from ethbrake_marl.training.training import Training
 
 Model = BaseAlgorithm  # of Stable-Baselines3
 
 
+class Learner(NamedTuple):
+    """A model that learns, the algorithm that built it, and the training that it is built for."""
+
+    training: Training
+    algorithm: Algorithm
+    model: Model
+
+    def policies(self) -> Trained:
+        """Copy the present weights into one policy for all learners, or into one for each."""
+        actors = self.algorithm.actors(self.model)
+        return make_policies(
+            self.training, self.model.num_timesteps, lambda k, network: self.algorithm.tensors(actors[k], network)
+        )
+
+
 def make_environment(training: Training) -> EthBrakeVecEnv:
-    """The worlds of a training, in which its learners are the rows."""
+    """Build the worlds of a training. Each learner of each world is a row."""
     recipe = training.recipe
     appended: dict[Scheme, Appended] = {"independent": "number", "centralised": "state"}
     return make_sb3_vec_env(
@@ -39,31 +52,21 @@ def make_environment(training: Training) -> EthBrakeVecEnv:
 
 
 def make_model(algorithm: Algorithm, training: Training, environment: EthBrakeVecEnv) -> Model:
-    """The model of a training, whose optimisers refuse gradients that are not finite."""
+    """Build the model of a training. Its optimisers refuse gradients that are not finite."""
     model = algorithm.build(training, environment)
     if getattr(model, "get_vec_normalize_env", lambda: None)() is not None:
         raise InvalidInput(
             f"algorithm {training.recipe.algorithm!r}: its model is trained under VecNormalize, whose statistics are no"
             " part of a policy bundle; observations here are scaled already"
         )
-    hint = "learning_rate or max_grad_norm" if hasattr(model, "max_grad_norm") else "learning_rate"
-
-    def check(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-        sums = [p.grad.sum() for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
-        if not torch.isfinite(torch.stack(sums)).all():
-            raise TrainingDiverged(
-                f"training: the gradient of the loss is not finite at step {model.num_timesteps}; try a smaller {hint}"
-            )
-
-    for optimizer in algorithm.optimizers(model).values():
-        optimizer.register_step_pre_hook(check)
+    refuse_gradients(model, algorithm)
     return model
 
 
 def make_policies(
     training: Training, steps: int, tensors: Callable[[int, NetworkSpec], Mapping[str, Float32s]]
 ) -> Trained:
-    """One policy for all learners, or one for each; ``tensors(k, network)`` are those of the k-th."""
+    """One policy for all learners, or one for each; ``tensors(k, network)`` gives the weights of the k-th."""
     recipe, scenario = training.recipe, training.scenario
     names = tuple(training.drivers)
     apart = training.scheme == "independent"
@@ -86,32 +89,3 @@ def make_policies(
         )
         policies.append(policy)
     return PolicyTeam(dict(zip(names, policies, strict=True))) if apart else policies[0]
-
-
-def open_logs(run: RunDirectory, state: TrainingState | None) -> list[KVWriter]:
-    """``progress.csv`` and TensorBoard's events, which go on after the rows of ``state``; None: from the beginning."""
-    run.progress.unlink(missing_ok=True)  # it may be a link
-    if state is None:
-        for left in run.tensorboard.glob("events.out.tfevents.*"):
-            left.unlink()
-    table = CSVOutputFormat(str(run.progress))
-    events: Any = TensorBoardOutputFormat(str(run.tensorboard))  # whose writer torch declares as None
-    if state is not None:
-        table.file.write(state.numbers["progress"])
-        table.file.flush()
-        table.keys = [name for name in state.numbers["progress"].partition("\n")[0].split(",") if name]
-        restart = Event(step=state.steps + 1, session_log=SessionLog(status=SessionLog.START))
-        events.writer.file_writer.add_event(restart)  # TensorBoard forgets what was written from this step on
-    return [table, events]
-
-
-class TrainingDiverged(EthBrakeError, ArithmeticError):
-    """A reward, a loss or a weight is no longer a finite number; the last good policy was kept."""
-
-
-def weights_are_finite(model: Model, algorithm: Algorithm) -> bool:
-    """Whether every weight is finite, and the exploration noise a usable one."""
-    logarithm = algorithm.log_noise(model)
-    noise = torch.ones(1) if logarithm is None else torch.exp(logarithm)
-    usable = torch.isfinite(noise) & (noise > 0.0)
-    return bool(usable.all()) and all(bool(torch.isfinite(p).all()) for p in model.policy.parameters())

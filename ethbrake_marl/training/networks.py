@@ -6,18 +6,55 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.policies import BasePolicy
-from torch import nn
+from torch import Tensor, nn
 
-from ethbrake_marl.policies.manifest import Activation, Float32s, NetworkSpec
+from ethbrake_marl.policies.network_spec import Activation, Float32s, NetworkSpec
 from ethbrake_marl.training.recipe import NetworkShape
 
 ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh}
 
 
 def tensors_of(policy: BasePolicy, spec: NetworkSpec) -> dict[str, Float32s]:
-    """Copy the policy's weights under the names of our table."""
+    """Copy the weights of a policy of Stable-Baselines3's PPO or SAC under the names of a bundle."""
     state = policy.state_dict()
-    return {row.name: state[row.sb3_name].detach().cpu().numpy().astype(np.float32) for row in spec.tensors}
+    return {name: copy_of(state[theirs]) for name, theirs in sb3_names(spec).items()}
+
+
+def sb3_names(spec: NetworkSpec) -> dict[str, str]:
+    """Name of each tensor in a bundle -> its name in a policy of Stable-Baselines3: PPO's (``clip``) or SAC's.
+
+    Stable-Baselines3 counts activations too, so the number of a hidden layer there is twice ours.
+    """
+    if spec.output == "clip":
+        ours = {"policy": ("mlp_extractor.policy_net", "action_net"), "value": ("mlp_extractor.value_net", "value_net")}
+        noise = "log_std"
+    else:
+        ours, noise = {"policy": ("actor.latent_pi", "actor.mu")}, "actor.log_std"
+
+    def theirs(name: str) -> str:
+        network, layer, *kind = name.split(".")
+        hidden, output = ours[network]
+        layers = {"log_std": noise, "output": output}
+        return ".".join([layers.get(layer) or f"{hidden}.{2 * int(layer)}", *kind])
+
+    return {row.name: theirs(row.name) for row in spec.tensors}
+
+
+def tensors_of_layers(name: str, layers: nn.Sequential) -> dict[str, Float32s]:
+    """Copy the weights of a perceptron under the names that a bundle has for a network."""
+    linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
+    numbers = [*map(str, range(len(linear) - 1)), "output"]
+    pairs = {f"{name}.{k}": layer for k, layer in zip(numbers, linear, strict=True)}
+    return {
+        f"{where}.{kind}": copy_of(tensor)
+        for where, layer in pairs.items()
+        for kind, tensor in (("weight", layer.weight), ("bias", layer.bias))
+    }
+
+
+def copy_of(tensor: Tensor) -> Float32s:
+    """A copy of a tensor."""
+    return tensor.detach().cpu().numpy().astype(np.float32)
 
 
 def ppo_arguments(shape: NetworkShape) -> dict[str, Any]:

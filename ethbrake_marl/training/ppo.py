@@ -10,11 +10,12 @@ from stable_baselines3.common.policies import BasePolicy
 from torch.optim import Optimizer
 
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
+from ethbrake_marl.training.algorithm import Algorithm
 from ethbrake_marl.training.central_critic import CentralCriticPolicy
 from ethbrake_marl.training.independent import IndependentPPO
 from ethbrake_marl.training.networks import ppo_arguments
 from ethbrake_marl.training.recipes import PpoRecipe
-from ethbrake_marl.training.run_folder import Algorithm, Training
+from ethbrake_marl.training.training import Training
 
 
 class Ppo(Algorithm):

@@ -10,18 +10,10 @@ from typing import Any
 
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.policies.teams import Trained
-from ethbrake_marl.training.run_folder import RunDirectory, Training
-
-# Column of the log -> info of an episode's end; means over the episodes since the last row, exploration included.
-EPISODE_COLUMNS = {
-    "rollout/first_impact_harm": "world_first_impact_harm",
-    "rollout/total_harm": "world_total_harm",
-    "rollout/collision_rate": "collided",
-}
+from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.training import Training
 
 RETURN = "episode_return"
-
-AT_HORIZON = "horizon_rate"  # share of the fixed list's episodes in which something still moves at the horizon
 
 
 @dataclass
@@ -98,6 +90,3 @@ def objective_in_words(training: Training) -> str:
         return f"objective by {'first' if first else 'all'} impacts ({', '.join(names)})"
     what = "injuries in 1,000 lines" if kinds == {"injury"} else "harm"
     return f"{'first-impact' if first else 'total'} {what} ({', '.join(names)})"
-
-
-LOSSES = ("loss", "policy_loss", "value_loss", "policy_gradient_loss", "actor_loss", "critic_loss", "ent_coef_loss")

@@ -12,7 +12,6 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 from pydantic.json_schema import models_json_schema
-from pydantic_core import ErrorDetails
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.json_schema import FileSchema, schema_lines
@@ -20,11 +19,10 @@ from ethbrake_marl.files.model import NAME_PATTERN, FileModel, Wording, read_mod
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 from ethbrake_marl.game.features import ListedFeatures, listed_features
 from ethbrake_marl.game.rewards import RewardParams, setting_names
-from ethbrake_marl.policies.manifest import Activation, NetworkSpec
+from ethbrake_marl.policies.network_spec import Activation, NetworkSpec
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.scenario.catalogue import check_file_name, shipped_folder
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.training.recipe_text import MEANINGS
 
 WORDS = ("title", "description", "source")  # fields that tell about a recipe and change nothing
 
@@ -32,13 +30,13 @@ Scheme = Literal["single", "shared", "independent", "centralised"]
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 
-Averaging = Annotated[float, Field(ge=0.0, lt=1.0)]  # 1 would keep the first weights for ever
-
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
 Rate = Annotated[float, Field(gt=0.0, le=1.0)]
+
+ACTOR_LAYERS = "hidden layers of the actor"
 
 Layers = Annotated[tuple[Annotated[int, Field(ge=1, le=4096)], ...], Field(strict=False, min_length=1, max_length=8)]
 
@@ -48,7 +46,9 @@ class LearningRate(FileModel):
 
     start: Rate
     end: Rate
-    schedule: Literal["cosine"] = "cosine"
+    schedule: Literal["cosine"] = Field(
+        "cosine", description="end + (start - end) (1 + cos(pi p)) / 2, where p is the share of steps done"
+    )
 
     def at(self, remaining: float) -> float:
         """``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``, the share of steps done."""
@@ -57,8 +57,10 @@ class LearningRate(FileModel):
 
 
 class Shape(FileModel):
+    """Sizes of an algorithm's networks; a subclass lists them as keys."""
+
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """What a bundle holds for one action in [-1, 1]: the actor, and what ``more`` says."""
+        """The network of a policy bundle, for one action in [-1, 1]: the actor, and whatever ``more`` adds."""
         shape: Any = self  # its fields stand in an order of their own
         fields = {"policy_hidden": shape.policy, "value_hidden": (), "activation": shape.activation, "output": "clip"}
         return NetworkSpec(observation_size=observation_size, action_size=1, **(fields | more))
@@ -67,26 +69,16 @@ class Shape(FileModel):
 class NetworkShape(Shape):
     """Hidden layers of actor and critic, and the exploration noise they start with."""
 
-    policy: Layers
-    value: Layers
+    policy: Layers = Field(description=ACTOR_LAYERS)
+    value: Layers = Field(description="hidden layers of the critic")
     activation: Activation = "relu"
-    initial_log_std: Annotated[float, Field(ge=-10.0, le=2.0)] = 0.0
+    initial_log_std: Annotated[float, Field(ge=-10.0, le=2.0)] = Field(
+        0.0, description="logarithm of the exploration noise at the start"
+    )
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
         """Actor and critic."""
         return super().spec(observation_size, value_hidden=self.value, **more)
-
-
-class SquashedShape(Shape):
-    """Hidden layers of the actor and of each of the two critics; the actor's noise depends on what it sees."""
-
-    policy: Layers
-    value: Layers
-    activation: Activation = "relu"
-
-    def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """The actor, whose squashed mean is the action. Critics stay in the checkpoints."""
-        return super().spec(observation_size, output="tanh", **more)
 
 
 class EvaluationPlan(FileModel):
@@ -100,7 +92,8 @@ class EvaluationPlan(FileModel):
 class TrainingRecipe(FileModel):
     """How to train, whatever the algorithm: its name, reward, seed, and what is saved and measured on the way.
 
-    An update is one round of collecting and learning. The recipes of an algorithm are a class made from this one.
+    An update is one round of collecting and learning. The recipes of an algorithm are a class made from this one. Each
+    key says what it means in ``Field(description=...)``: new files, the JSON Schema and the documentation show it.
 
     >>> import ethbrake_marl as eb
     >>> recipe = eb.load_recipe("ppo").replace(seed=3, total_steps=100_000)
@@ -112,22 +105,28 @@ class TrainingRecipe(FileModel):
     schemes: ClassVar[tuple[Scheme, ...]] = ("single", "shared")  # under which the algorithm can learn
     most_decisions: ClassVar[float] = math.inf  # held in memory between two updates
 
-    name: str = Field(pattern=NAME_PATTERN)  # equal to the file's without .yaml
-    title: str = ""  # one line for lists
-    description: str = ""  # what it is for
-    source: str = ""  # where the values come from
-    algorithm: str  # a registered name
-    scheme: Scheme | None = None  # None: single for one learner, shared for several
-    total_steps: Annotated[int, Field(ge=1)]  # decisions of all learners
-    n_envs: Annotated[int, Field(ge=1)]  # worlds that are advanced together
-    learning_rate: LearningRate  # from its start to its end
-    gamma: Fraction  # discount of one time step
-    reward: RewardParams  # what is learned for
-    observation: Annotated[ListedFeatures | None, Field(exclude_if=not_)] = None  # of learners; None: the scenario's
-    horizon_is_end: bool = True  # nothing is expected beyond the horizon
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # of worlds, networks and exploration
-    evaluation: EvaluationPlan  # the fixed list, and how often
-    checkpoint_every_updates: Annotated[int, Field(ge=1)]  # updates
+    name: str = Field(pattern=NAME_PATTERN, description="equal to the file's name without .yaml")
+    title: str = Field("", description="one line for lists")
+    description: str = Field("", description="what it is for")
+    source: str = Field("", description="where the values come from")
+    algorithm: str = Field(description="a registered name: ppo, sac, or another one (ethbrake scenario parts)")
+    scheme: Scheme | None = Field(  # None: single for one learner, shared for several
+        None, description="how several learners train together: single, shared, independent, centralised"
+    )
+    total_steps: int = Field(ge=1, description="decisions of all learners")
+    n_envs: int = Field(ge=1, description="worlds that are advanced together")
+    learning_rate: LearningRate = Field(description="of the optimiser, from its start to its end")
+    gamma: Fraction = Field(description="discount of one time step; equal to reward.shaping_discount")
+    reward: RewardParams = Field(description="weights and constants of the reward's terms (docs/reference/rewards.md)")
+    observation: Annotated[ListedFeatures | None, Field(exclude_if=not_)] = Field(
+        None, description="groups and features that learners observe, [own, front_1, rear_1]; left out: the scenario's"
+    )
+    horizon_is_end: bool = Field(True, description="true: nothing is expected beyond the horizon")
+    seed: int = Field(0, ge=0, lt=2**32, description="of worlds, networks and exploration")
+    evaluation: EvaluationPlan = Field(
+        description="the fixed list on which the policy is measured while it learns, and how often"
+    )
+    checkpoint_every_updates: int = Field(ge=1, description="updates between two checkpoints")
 
     @field_validator("reward")
     @classmethod
@@ -163,8 +162,21 @@ class TrainingRecipe(FileModel):
         """Decisions of each learner between two updates: the recipe's ``n_steps``."""
         return int(vars(self)["n_steps"])
 
+    @property
+    def updates_per_row(self) -> int:
+        """Updates between two rows of the progress table."""
+        return 1
+
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` where the recipe does not fit a line with that many learners."""
+        """Raise ``InvalidInput`` if the recipe does not fit a line with that many learners."""
+
+    def begins(self, scenario: Scenario) -> str | None:
+        """What the weights begin as on a scenario, in words; None where the algorithm only knows random weights."""
+        return None
+
+    def derived(self) -> dict[str, float]:
+        """Figures that follow from the keys, for ``config.json``."""
+        return {}
 
     def scheme_for(self, scenario: Scenario) -> Scheme:
         """The recipe's scheme; where it names none, ``single`` for one learner and ``shared`` for several.
@@ -233,10 +245,10 @@ class TrainingRecipe(FileModel):
     def text(self, head: str) -> str:
         """A commented YAML file below ``head``: all keys written out, one that the recipe leaves out in a comment."""
         lines = [head, schema_lines("recipe", "train --schema")]
-        values = self.model_dump(mode="json")
+        values, meanings = self.model_dump(mode="json"), key_meanings(type(self))
         for key in type(self).model_fields:
             value = values.get(key)
-            lines.append(f"\n# {MEANINGS[key]}\n" if key in MEANINGS else "\n")
+            lines.append(f"\n# {meanings[key]}\n" if key in meanings else "\n")
             if value is None:
                 lines.append(f"# {key}:\n")
             elif isinstance(value, Mapping):
@@ -266,9 +278,7 @@ class TrainingRecipe(FileModel):
         parts = whole["$defs"]
         for name, recipe in classes.items():
             keys = parts[str(places[recipe, "validation"]["$ref"]).rpartition("/")[2]]["properties"]
-            for key in keys.keys() & MEANINGS.keys():
-                keys[key] = {"description": MEANINGS[key], **keys[key]}
-            keys["algorithm"]["const"] = name
+            keys["algorithm"] |= {"description": key_meanings(recipe)["algorithm"], "const": name}
         weight = {"type": "number", "minimum": 0, "description": "weight of a registered term"}
         properties = parts["RewardParams"]["properties"]
         properties |= {name: weight for name in setting_names() if name not in properties}
@@ -292,6 +302,15 @@ class TrainingRecipe(FileModel):
                 "$defs": parts,
             }
         )
+
+
+def key_meanings(recipe: type[TrainingRecipe]) -> dict[str, str]:
+    """Key -> what it means, for the recipes of one algorithm; a key without a meaning of its own has its parent's."""
+    found: dict[str, str] = {}
+    for each in reversed(recipe.__mro__):
+        for key, field in each.model_fields.items() if issubclass(each, TrainingRecipe) else ():
+            found |= {key: field.description} if field.description else {}
+    return found
 
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
@@ -345,7 +364,9 @@ def _checked(source: Path | Document) -> TrainingRecipe:
     name = document.content.get("algorithm", "ppo") if isinstance(document.content, dict) else "ppo"
     if not isinstance(name, str) or name not in ALGORITHMS:
         where, right = document.where(("algorithm",)), f"one of {', '.join(ALGORITHMS)}"
-        raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: must be {right}")
+        absent = "; the package or extension that gives it is not installed"
+        ships = isinstance(source, Path) and source in TrainingRecipe.shipped().values()
+        raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: must be {right}{absent if ships else ''}")
     shipped = f"; every key is in the shipped recipe {name}" if name in TrainingRecipe.shipped() else ""
     model = ALGORITHMS[name][0]
     wording = _RecipeWording(model, f"it is needed{shipped}")
@@ -353,11 +374,6 @@ def _checked(source: Path | Document) -> TrainingRecipe:
 
 
 class _RecipeWording(Wording):
-    def right(self, detail: ErrorDetails) -> str:
-        """A policy to start from, in words."""
-        right = "must be ppo@, counterfactual@ or universal@ and a policy, for instance ppo@shipped or ppo@runs/my-run"
-        return right if (detail["type"], detail["loc"][-1:]) == ("string_pattern_mismatch", ("start",)) else ""
-
     def known(self, path: YamlPath) -> list[str]:
         """Registered terms have their weights beside the others."""
         return setting_names() if path[:-1] == ("reward",) else super().known(path)

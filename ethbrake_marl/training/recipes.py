@@ -9,17 +9,24 @@ from pydantic import Field, field_validator, model_validator
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.model import refuse
+from ethbrake_marl.policies.network_spec import Activation, NetworkSpec
 from ethbrake_marl.registry import Part
 from ethbrake_marl.training.recipe import (
+    ACTOR_LAYERS,
     Fraction,
+    Layers,
     NetworkShape,
     NonNegative,
     Positive,
     Rate,
     Scheme,
-    SquashedShape,
+    Shape,
     TrainingRecipe,
 )
+
+BATCH_SIZE = "decisions in one step of the optimiser"
+
+NETWORK = "hidden layers of the actor, and of the critic if there is one, and their activation"
 
 
 class PpoRecipe(TrainingRecipe):
@@ -29,17 +36,19 @@ class PpoRecipe(TrainingRecipe):
     most_decisions = 2**24
 
     algorithm: Literal["ppo"]
-    batch_size: Annotated[int, Field(ge=2)]
-    n_steps: Annotated[int, Field(ge=2)]
-    n_epochs: Annotated[int, Field(ge=1, le=1000)]
-    gae_lambda: Fraction
-    clip_range: Rate
-    ent_coef: NonNegative
-    vf_coef: NonNegative
-    max_grad_norm: Positive
-    target_kl: Positive | None = None
-    turns: Annotated[int, Field(ge=1, le=1000)] | None = None  # of independent learners; None: all learn at once
-    network: NetworkShape
+    batch_size: int = Field(ge=2, description=BATCH_SIZE)
+    n_steps: int = Field(ge=2, description="decisions of each world between two updates")
+    n_epochs: int = Field(ge=1, le=1000, description="how often an update goes through what was collected")
+    gae_lambda: Fraction = Field(description="memory of the advantages, from 0 (one step) to 1 (all)")
+    clip_range: Rate = Field(description="how far the probability of an action may move in one update")
+    ent_coef: NonNegative = Field(description="weight of the policy's entropy")
+    vf_coef: NonNegative = Field(description="weight of the critic's loss")
+    max_grad_norm: Positive = Field(description="longest gradient")
+    target_kl: Positive | None = Field(None, description="an update stops beyond this divergence")
+    turns: Annotated[int, Field(ge=1, le=1000)] | None = Field(  # None: all learn at once
+        None, description="rounds in which independent learners learn one after the other"
+    )
+    network: NetworkShape = Field(description=NETWORK)
 
     @model_validator(mode="after")
     def _keys_fit(self) -> PpoRecipe:
@@ -60,22 +69,36 @@ class PpoRecipe(TrainingRecipe):
             )
 
 
+class SquashedShape(Shape):
+    """Hidden layers of the actor and of each of the two critics; the actor's noise depends on what it sees."""
+
+    policy: Layers = Field(description=ACTOR_LAYERS)
+    value: Layers = Field(description="hidden layers of each of the two critics")
+    activation: Activation = "relu"
+
+    def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
+        """The actor, whose squashed mean is the action. Critics stay in the checkpoints."""
+        return super().spec(observation_size, output="tanh", **more)
+
+
 class SacRecipe(TrainingRecipe):
     """SAC: collect ``steps_per_update`` decisions of every learner, then ``gradient_steps`` steps from the memory."""
 
     algorithm: Literal["sac"]
-    batch_size: Annotated[int, Field(ge=2)]
-    steps_per_update: Annotated[int, Field(ge=1, le=10_000)] = 1
-    gradient_steps: Annotated[int, Field(ge=1, le=100_000)] = 1
-    buffer_size: Annotated[int, Field(ge=1, le=10_000_000)]
-    learning_starts: Annotated[int, Field(ge=0)]
-    tau: Rate
-    ent_coef: float | str = "auto"
-    initial_ent_coef: Positive = 1.0  # where an automatic one starts
-    target_entropy: Annotated[float, Field(allow_inf_nan=False)] | None = None  # None: -1 per action
-    target_update_interval: Annotated[int, Field(ge=1)] = 1
-    network: SquashedShape
-    log_every_updates: Annotated[int, Field(ge=1)]
+    batch_size: int = Field(ge=2, description=BATCH_SIZE)
+    steps_per_update: int = Field(1, ge=1, le=10_000, description="decisions of each world between two updates")
+    gradient_steps: int = Field(1, ge=1, le=100_000, description="steps of the optimiser in one update")
+    buffer_size: int = Field(ge=1, le=10_000_000, description="decisions that the replay memory holds")
+    learning_starts: int = Field(ge=0, description="decisions before the first update")
+    tau: Rate = Field(description="share by which the target critic follows in one update")
+    ent_coef: float | str = Field("auto", description="weight of the policy's entropy: auto, or a number")
+    initial_ent_coef: Positive = Field(1.0, description="where an automatic ent_coef starts")
+    target_entropy: Annotated[float, Field(allow_inf_nan=False)] | None = Field(
+        None, description="what an automatic ent_coef keeps; without it -1 per action"
+    )
+    target_update_interval: int = Field(1, ge=1, description="updates between two of the target critic")
+    network: SquashedShape = Field(description=NETWORK)
+    log_every_updates: int = Field(ge=1, description="updates between two rows of the progress table")
 
     @field_validator("ent_coef", mode="plain")
     @classmethod
@@ -98,9 +121,18 @@ class SacRecipe(TrainingRecipe):
         return self.steps_per_update
 
     @property
+    def updates_per_row(self) -> int:
+        """Updates between two rows of the progress table."""
+        return self.log_every_updates
+
+    @property
     def update_ratio(self) -> float:
         """Gradient steps per decision of one learner in each world."""
         return self.gradient_steps / (self.n_envs * self.steps_per_update)
+
+    def derived(self) -> dict[str, float]:
+        """The update ratio."""
+        return {"update_ratio": self.update_ratio}
 
 
 PPO = Part(PpoRecipe, "ethbrake_marl.training.ppo:Ppo")

@@ -9,9 +9,10 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
+from ethbrake_marl.training.algorithm import Algorithm
 from ethbrake_marl.training.networks import ACTIVATIONS
 from ethbrake_marl.training.recipes import SacRecipe
-from ethbrake_marl.training.run_folder import Algorithm, Training
+from ethbrake_marl.training.training import Training
 
 
 class Sac(Algorithm):

@@ -25,7 +25,6 @@ from ethbrake_marl.evaluation.own_measures import load_measures
 from ethbrake_marl.evaluation.per_world import read_harms, write_per_world
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
-from ethbrake_marl.extensions.report.experiment import results_csv
 from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS, is_papers_test, summarise_beside_paper
 from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.extensions.search import limits
@@ -41,6 +40,7 @@ from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.tables import worlds_from_table
 from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.training.experiment import results_csv
 from tests.contract.interfaces import CRASH
 from tests.docs.site import load
 

@@ -21,8 +21,8 @@ from ethbrake_marl.evaluation.statistics import (
     relative_decrease,
     root,
 )
-from ethbrake_marl.extensions.report.experiment import results_csv
 from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.training.experiment import results_csv
 
 # ---------------------------------------------------------------- exact sums
 

@@ -23,16 +23,11 @@ from stable_baselines3.sac.policies import SACPolicy
 import ethbrake_marl as eb
 from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.learners.actors import (
-    Adam,
-    Tried,
-    limit_that_cuts,
-    smallest_offset,
-    trusted_targets,
-    widened,
-)
 from ethbrake_marl.extensions.learners.branches import visit
-from ethbrake_marl.extensions.learners.explored import (
+from ethbrake_marl.extensions.learners.gradient_limit import limit_that_cuts, smallest_offset
+from ethbrake_marl.extensions.learners.mixture_plan import ModesPlan
+from ethbrake_marl.extensions.learners.mixture_stages import stages_of
+from ethbrake_marl.extensions.learners.mixture_worlds import (
     NoOtherMode,
     Shown,
     drive_from,
@@ -40,20 +35,23 @@ from ethbrake_marl.extensions.learners.explored import (
     own_worlds,
     show_templates,
 )
-from ethbrake_marl.extensions.learners.recipes import ModesPlan
+from ethbrake_marl.extensions.learners.optimizer import Adam
 from ethbrake_marl.extensions.learners.scout import Scout, choose_rows, draw_rows
-from ethbrake_marl.extensions.learners.stages import stages_of
+from ethbrake_marl.extensions.learners.start_weights import widened
+from ethbrake_marl.extensions.learners.trust_radius import Tried, trusted_targets
 from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
 from ethbrake_marl.extensions.search.templates import best_templates
 from ethbrake_marl.game.objectives import scored
-from ethbrake_marl.policies.network import Actor, load_policy
+from ethbrake_marl.policies.actor import Actor
+from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.scenario.sampling import members_of
-from ethbrake_marl.training.models import TrainingDiverged, make_environment, make_model
+from ethbrake_marl.training.finite import TrainingDiverged
+from ethbrake_marl.training.models import make_environment, make_model
 from ethbrake_marl.training.networks import ppo_arguments, tensors_of
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
-from ethbrake_marl.training.run_folder import Training
 from ethbrake_marl.training.sac import sac_arguments
 from ethbrake_marl.training.session import resume, train
+from ethbrake_marl.training.training import Training
 from tests.learning.tiny import (
     MODES,
     TINY_COUNTERFACTUAL,
@@ -80,7 +78,7 @@ from stable_baselines3 import A2C
 
 from ethbrake_marl import TrainingRecipe, register_algorithm
 from ethbrake_marl.training.networks import ppo_arguments
-from ethbrake_marl.training.run_folder import Algorithm
+from ethbrake_marl.training.algorithm import Algorithm
 from ethbrake_marl.training.recipe import NetworkShape
 
 

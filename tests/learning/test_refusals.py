@@ -11,16 +11,18 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import script_agents
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, UnknownName
 from ethbrake_marl.evaluation.trial import load_runnable
-from ethbrake_marl.extensions.learners.actors import widened
+from ethbrake_marl.extensions.learners.start_weights import widened
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.files.store import hold_lock
-from ethbrake_marl.policies.network import load_policy
+from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.training.ppo import Ppo
 from ethbrake_marl.training.recipe import load_recipe, register_algorithm
 from ethbrake_marl.training.recipes import PpoRecipe
-from ethbrake_marl.training.run_folder import RunDirectory, Training
+from ethbrake_marl.training.run_folder import RunDirectory
 from ethbrake_marl.training.session import resume, train
 from ethbrake_marl.training.settings import read_settings
+from ethbrake_marl.training.team import load_team
+from ethbrake_marl.training.training import Training, check_same_training
 from tests.fixtures.policies import make_policy
 from tests.learning.test_algorithms import A2C, recipe_file
 from tests.learning.tiny import TINY_COUNTERFACTUAL, TINY_MODES, TINY_OPTIONS, TINY_PPO
@@ -201,9 +203,7 @@ TRAININGS: dict[str, Callable[[], object]] = {
     ),
     "recipe 'counterfactual': modes: are for one learner, not for 2": lambda: train(TINY_MODES, PAIR, Path("run")),
     ".: holds no training; give the folder of a run": lambda: resume(Path()),
-    ".: holds no team (team.json); give the folder of a run, or a bundle as ppo@.": lambda: RunDirectory(
-        Path()
-    ).load_team(PAIR),
+    ".: holds no team (team.json); give the folder of a run, or a bundle as ppo@.": lambda: load_team(Path(), PAIR),
 }
 
 
@@ -326,7 +326,7 @@ def test_folder__of_another_training_is_refused(
     training: Callable[[], Training], other: str, run: RunDirectory
 ) -> None:
     with refused(f"run: holds another training (here other: {other}); give another folder (--output)"):
-        run.check_same(training())
+        check_same_training(run, training())
 
 
 @pytest.mark.parametrize(
@@ -419,12 +419,12 @@ def team(empty_folder: Path) -> RunDirectory:
 
 
 def test_team__drives_a_line_of_its_length_and_vehicles_of_its_own(team: RunDirectory) -> None:
-    assert sorted(team.load_team(PAIR).drivers) == [1, 2]
-    assert sorted(team.load_team(PAIR.with_learners(["vehicle_3"])).drivers) == [2]
+    assert sorted(load_team(team.path, PAIR).drivers) == [1, 2]
+    assert sorted(load_team(team.path, PAIR.with_learners(["vehicle_3"])).drivers) == [2]
     with refused("team: is a team for a line of 3 vehicles, scenario 'cooperation-3-pair' has 4; only a shared policy"):
-        team.load_team(FOUR)
+        load_team(team.path, FOUR)
     with refused("team: drives vehicle_2, vehicle_3; scenario 'cooperation-3-pair' has nobody to drive"):
-        team.load_team(PAIR.with_learners([]))
+        load_team(team.path, PAIR.with_learners([]))
     with refused("team: each of its learners has a policy of its own; name one, for instance team/policy/vehicle_2"):
         load_policy(TEAM.parent)
     with refused("team: drives vehicle_2, vehicle_3; scenario 'cooperation-3-pair' has vehicle_1 to drive"):
@@ -456,13 +456,13 @@ def test_file_of_a_team__is_refused(content: Any, message: str, team: RunDirecto
     good = {"scheme": "independent", "vehicles": 3, "drivers": DRIVERS}
     TEAM.write_text(content if isinstance(content, str) else json.dumps(good | content))
     with refused(message, CorruptBundle):
-        team.load_team(PAIR)
+        load_team(team.path, PAIR)
 
 
 def test_policy_of_a_team__is_whole(team: RunDirectory) -> None:
     Path("team/policy/vehicle_3/weights.safetensors").unlink()
     with refused("team/policy/vehicle_3/weights.safetensors: is missing", CorruptBundle):
-        team.load_team(PAIR)
+        load_team(team.path, PAIR)
     Path("team/policy/vehicle_2/manifest.json").write_text("{}")
     with refused("team/policy/vehicle_2/manifest.json: algorithm: is missing", CorruptBundle):
-        team.load_team(PAIR)
+        load_team(team.path, PAIR)

@@ -29,16 +29,26 @@ from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.extensions.search import limits, regret
 from ethbrake_marl.files.store import new_folder, write_file
 from ethbrake_marl.game.objectives import objective_harm, objectives_of
-from ethbrake_marl.policies.network import Policy, dense, load_policy
+from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.policies.layers import dense
+from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.teams import Trained, read_trained
 from ethbrake_marl.progress import Progress
-from ethbrake_marl.training import models, progress as progress_module, random_state, session as train_module
+from ethbrake_marl.training import (
+    model_state,
+    models,
+    progress as progress_module,
+    random_state,
+    session as train_module,
+)
 from ethbrake_marl.training.checkpoint import ARRAYS, NUMBERS, TrainingState, read_checkpoint, write_checkpoint
-from ethbrake_marl.training.models import TrainingDiverged, open_logs
+from ethbrake_marl.training.finite import TrainingDiverged
+from ethbrake_marl.training.logs import open_logs
 from ethbrake_marl.training.progress import Course
 from ethbrake_marl.training.recipe import LearningRate, TrainingRecipe, load_recipe
-from ethbrake_marl.training.run_folder import RunDirectory, Training
+from ethbrake_marl.training.run_folder import RunDirectory
 from ethbrake_marl.training.session import TrainResult, resume
+from ethbrake_marl.training.training import Training
 from tests.docs.site import load
 from tests.learning.tiny import (
     MODES,
@@ -725,8 +735,8 @@ def test_restore__a_forged_replay_memory_of_sac_is_refused() -> None:
         model = models.make_model(algorithm, training, environment)
         model._last_obs, model._last_episode_starts = environment.reset(), np.ones(environment.num_envs)
         model.set_logger(Logger(None, []))
-        numbers, arrays = random_state.capture_model(model, algorithm)
-        restore = partial(random_state.restore_model, model, algorithm)
+        numbers, arrays = model_state.capture_model(model, algorithm)
+        restore = partial(model_state.restore_model, model, algorithm)
         restore(TrainingState(numbers, arrays))
         for forged in ([-1, False], [1.5, False], [1 << 40, True], [0, 1]):
             with pytest.raises(ValueError, match=r"replay = .*: is no place in its memory"):

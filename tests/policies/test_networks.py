@@ -27,8 +27,12 @@ from ethbrake_marl.extensions.report.three_tests import TESTS
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.game.observations import observe
 from ethbrake_marl.policies import shipped as shipped_module
-from ethbrake_marl.policies.manifest import NetworkSpec, content_sha256
-from ethbrake_marl.policies.network import Actor, Policy, load_policy, squash
+from ethbrake_marl.policies.actor import Actor
+from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.policies.layers import squash
+from ethbrake_marl.policies.manifest import content_sha256
+from ethbrake_marl.policies.network_spec import NetworkSpec
+from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.shipped import load_named_policy, shipped_name, shipped_policies
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
 from tests.docs.site import DOCS

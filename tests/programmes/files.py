@@ -28,8 +28,8 @@ from ethbrake_marl.evaluation.varying import states_of
 from ethbrake_marl.extensions.studies.named_worlds import NamedWorld, NamedWorlds
 from ethbrake_marl.extensions.studies.sweep import SweepPlan
 from ethbrake_marl.extensions.studies.tuning import TuningPlan
+from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.manifest import content_sha256
-from ethbrake_marl.policies.network import load_policy
 from ethbrake_marl.policies.shipped import shipped_policies
 from ethbrake_marl.scenario.tables import read_worlds
 from ethbrake_marl.training.checkpoint import NUMBERS

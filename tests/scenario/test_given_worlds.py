@@ -10,7 +10,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.scenario.sampling import uniform_numbers
 from ethbrake_marl.scenario.tables import read_worlds, table_columns, worlds_from_state, worlds_from_table
-from ethbrake_marl.training.run_folder import Training
+from ethbrake_marl.training.training import Training
 from tests.scenario.test_sampling import ALL_RANDOM, DELAYS, PAPER, bits, build, closing_pair, quantity, typed
 
 LINE = {"time_gaps_s": {"uniform": [0.2, 2]}, "line_speed_mps": {"uniform": [10, 38]}}

@@ -16,7 +16,7 @@ from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.progress import OnProgress
 from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield.episodes import drive_shielded
-from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.team import load_team
 
 
 def run_ablation(
@@ -45,7 +45,7 @@ def ablation_cost(plan: Plan) -> str:
     for level, algorithm, training, steps in left:
         decisions[level.name, algorithm] += steps
         if not steps:
-            RunDirectory(training.folder).load_team(level.scenario)
+            load_team(training.folder, level.scenario)
     lists = common_worlds(plan.levels, plan.episodes, plan.list_seed)
     samples = {level.name: sample for level, sample in zip(plan.levels, lists, strict=True)}
     kinds = {(level.name, algorithm): training for level, algorithm, training, _ in left}

@@ -28,7 +28,8 @@ from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield.episodes import Shielded, drive_shielded
-from ethbrake_marl.training.run_folder import RunDirectory, Training
+from ethbrake_marl.training.team import load_team
+from ethbrake_marl.training.training import Training
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +180,7 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
     trainings: dict[tuple[str, str], Training] = {}
     for level, algorithm, training in plan.trainings():
         trainings[level.name, algorithm] = training.training
-        team = RunDirectory(training.folder).load_team(level.scenario, training.folder.name)
+        team = load_team(training.folder, level.scenario, training.folder.name)
         teams.setdefault((level.name, algorithm), []).append(team)
     samples = common_worlds(plan.levels, plan.episodes, plan.list_seed)
     tables = search_all(plan, samples, jobs, say)

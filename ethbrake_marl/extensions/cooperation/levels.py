@@ -21,8 +21,8 @@ from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.recipe import WORDS, TrainingRecipe, load_recipe
-from ethbrake_marl.training.run_folder import Training
 from ethbrake_marl.training.settings import read_settings
+from ethbrake_marl.training.training import Training
 
 LADDER = (
     "cooperation-0-sensors",

@@ -24,6 +24,7 @@ from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.team import load_team
 
 _MOST, _USUAL, _LEAST = 3, 2, 2  # worlds in which most, as usual and least is saved
 
@@ -60,7 +61,7 @@ def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
             for recipe in plan.recipes:
                 folder = plan.training(level, recipe, 0).folder
                 name = level.name if len(plan.recipes) == 1 else f"{level.name}, {algorithm(recipe)}"
-                drivers[name] = RunDirectory(folder).load_team(level.scenario, name)
+                drivers[name] = load_team(folder, level.scenario, name)
         for name, team in drivers.items():
             Played.drive(played, worlds, name, team, level.scenario)
             driven[name] = level.scenario.learners

@@ -1,7 +1,7 @@
 """Branches of running episodes: the same moment, played on to the end in more than one way.
 
-A learner's action is moved by an offset for a few steps; then the policy goes on in closed loop. What two branches
-gain differs by nothing but the offset: everything else in them is the same, to the bit.
+A learner's action is moved by an offset for a few steps; then the policy goes on in closed loop. Two branches differ
+by the offset alone. Everything else in them is the same, to the bit.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ import numpy as np
 
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.state import State
+from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.columns import columns
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Bools, Floats, Ints
-from ethbrake_marl.policies.manifest import Float32s
+from ethbrake_marl.policies.network_spec import Float32s
 
 ROUNDING_MPS2 = 1e-5  # a command that differs by less is the same: networks round by the size of their batch
 
@@ -35,17 +36,17 @@ class Offsets(NamedTuple):
 
 
 def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) -> tuple[Floats, Floats]:
-    """Play every row to the end of its episode; what its learner of ``offsets`` gains, and how far it was moved.
+    """Play every row to the end of its episode. Return what its moved learner gains, and how far it was moved.
 
     Args:
         engine: branches, which this changes.
-        act: drives all learners, by nothing but what is seen.
-        offsets: whose actions are moved in each row, how far, and how long.
+        act: drives all learners, from their observations alone.
+        offsets: the learner whose actions are moved in each row, how far, and for how many steps.
         gamma: discount of one time step.
 
-    Returns the return [n] of that learner from now on (NaN for a row that could not be advanced), and the sum of the
-    offsets that its actions, which stay in [-1, 1], had room for [n]. Where the reward is of harm alone, a row ends as
-    soon as nothing can change any more.
+    Returns the return [n] of the moved learner from now on (NaN for a row that could not be advanced), and the sum of
+    its offsets [n], each cut so that the action stays in [-1, 1]. If the reward is harm alone, a row ends as soon as
+    nothing can change any more.
 
     """
     moved, most = np.zeros(engine.n), int(offsets.steps.max(initial=0))
@@ -65,9 +66,9 @@ def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) ->
 
 
 def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) -> Floats:
-    """Play every row to the end of its episode, ``at_least`` so many steps; what each learner gains, [n, L].
+    """Play every row to the end of its episode, and for ``at_least`` so many steps. Return each learner's gain [n, L].
 
-    ``decide`` gives the learners' actions. The rest is as for ``play_to_the_end``.
+    ``decide`` returns the learners' actions. The rest is as for ``play_to_the_end``.
     """
     vehicles = np.array(engine.learners, np.int64)
     gained, actions = np.zeros((engine.n, len(vehicles))), np.zeros((engine.n, len(vehicles)))
@@ -89,7 +90,7 @@ def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) 
 
 
 def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
-    """Play every row to its end by ``act``: what is seen at each decision [m, L, F], and those moments [m]."""
+    """Play every row to its end by ``act``. Return the observations at each decision [m, L, F], and the states [m]."""
     seen_then, moments = [], []
 
     def decide(seen: Observations, rows: Ints, number: int) -> Floats:
@@ -102,9 +103,9 @@ def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
 
 
 def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
-    """In which of ``rows`` everything stands as it stood ``before`` [rows], and the same is going to be done again.
+    """Whether everything in these ``rows`` stands as it stood ``before`` [rows], and will stay so.
 
-    A policy that sees the same does the same, and no latency or news is left that could change what it sees.
+    A policy that observes the same does the same. Rows count only if no latency or news can change the observation.
     """
     if engine.packed.has_messages or engine.in_pieces:
         return np.zeros(len(rows), np.bool_)  # what is still on its way may change what it sees, or what holds
@@ -131,3 +132,15 @@ def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, sta
                 known = column.latency <= c < column.mass or (by_link and c >= column.news)
                 same = same and (not known or params[k, c] < before[m, column.time] or np.isinf(params[k, c]))
         stands[m] = same
+
+
+def other_count(count: HarmCount) -> HarmCount:
+    """The harm count that is not ``count``."""
+    return "total" if count == "first" else "first"
+
+
+def moving_rows(moments: State) -> Bools:
+    """Whether some vehicle moves, for each row. A row in which everything stands teaches nothing."""
+    column = moments.packed.column
+    moving: Bools = (moments.motion[:, column.speed : column.command] != 0.0).any(axis=1)
+    return moving

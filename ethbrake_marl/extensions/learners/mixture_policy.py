@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 
-from ethbrake_marl.extensions.learners.actors import AveragedActor, Deterministic
-from ethbrake_marl.extensions.learners.gate import AveragedGate
-from ethbrake_marl.extensions.learners.recipes import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.averaged_actor import AveragedActor, Deterministic
+from ethbrake_marl.extensions.learners.gating_network import AveragedGate
+from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
 from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.policies.manifest import Float32s
+from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
+from ethbrake_marl.training.networks import tensors_of_layers
 
 
 class ModesPolicy(Deterministic):
-    """Several actors and a gate; under the names that ``NetworkSpec.tensors`` has for them."""
+    """A mixture of experts: the gating network chooses the actor that takes a decision."""
 
     def __init__(
         self, observation_space: Space[Any], action_space: Any, rate: Schedule, recipe: CounterfactualRecipe
@@ -33,7 +34,7 @@ class ModesPolicy(Deterministic):
         self.gate = AveragedGate(flatdim(observation_space), rate, recipe)
 
     def _chosen(self, observation: Float32s, ask: Callable[[AveragedActor, Float32s], NDArray[Any]]) -> Floats:
-        """What the actors answer where the gate chooses them, [rows]."""
+        """Answer [rows] of the actor that the gating network chooses for each row."""
         chosen, found = self.gate.choose(observation), np.empty(len(observation))
         for number, actor in enumerate(self.actors):
             rows = np.flatnonzero(chosen == number)
@@ -46,7 +47,15 @@ class ModesPolicy(Deterministic):
     def expect(self, observation: Float32s) -> Floats:
         return self._chosen(observation, AveragedActor.expect)
 
+    def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
+        found = tensors_of_layers("gate", self.gate.average)
+        for name, actor in zip(network.actors, self.actors, strict=True):
+            found |= tensors_of_layers(
+                name, nn.Sequential(*actor.mlp_extractor["policy_net"].children(), actor.action_net)
+            )
+        return found
+
     def forward(self, observation: Tensor) -> Tensor:
-        """Actions [rows, 1] of the averages."""
+        """Actions [rows, 1] of the average weights."""
         chosen = self.gate.average(observation).argmax(dim=1, keepdim=True)
         return torch.cat([actor(observation) for actor in self.actors], dim=1).gather(1, chosen)

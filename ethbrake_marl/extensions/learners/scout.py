@@ -1,7 +1,7 @@
-"""A scout: it learns at which decisions a difference is to be expected, so that most are tried where there is one.
+"""A scout learns which decisions matter, so that most branches are spent on those.
 
-Where nothing depends on what is done, a counterfactual says 0 and costs as much as any other. Decisions are drawn
-with unequal chances, and each counts the less, the likelier it was drawn: what is learned is the same on average.
+A branch of a decision that changes nothing costs as much as any other, and its gradient is 0. So decisions are drawn
+with unequal chances. A decision that was more likely to be drawn counts less: the average is the same.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import torch
 from torch import Tensor, nn
 
 from ethbrake_marl.physics.state import Floats, Ints
-from ethbrake_marl.policies.manifest import Float32s
+from ethbrake_marl.policies.network_spec import Float32s
 
 WIDTH = 64  # of its hidden layer
 
 
 class Scout(nn.Module):
-    """A small network for the size of the difference that is to be expected of an observation."""
+    """A small network that expects, from an observation, how large the measured difference will be."""
 
     def __init__(self, inputs: int) -> None:
         super().__init__()
@@ -30,28 +30,27 @@ class Scout(nn.Module):
         nn.init.zeros_(last.bias)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """The logarithm of what is to be expected [rows] of observations [rows, F]; at most 20."""
+        """Logarithm of the expected size [rows] for observations [rows, F], at most 20."""
         found: Tensor = self.layers(observation)[:, 0].clamp(max=20.0)
         return found
 
     def expect(self, observation: Float32s) -> Floats:
-        """What is to be expected [rows], above 0."""
+        """Expected size [rows], above 0."""
         with torch.no_grad():
             found: Floats = np.exp(self(torch.from_numpy(observation)).numpy().astype(np.float64))
         return found
 
     def loss(self, observation: Tensor, size: Tensor, importance: Tensor) -> Tensor:
-        """Least where it expects the mean size; of sizes [rows] >= 0, whose largest do not rule it as in a square."""
+        """Loss that is smallest at the mean of the sizes [rows]. Large sizes weigh less than in a squared error."""
         logarithm = self(observation)
         found: Tensor = (importance * (logarithm.exp() - size * logarithm)).mean()
         return found
 
 
 def draw_rows(expected: Floats, count: int, focus: float) -> tuple[Ints, Float32s]:
-    """Draw ``count`` of the rows: the share ``focus`` in proportion to ``expected`` [n] > 0, the others evenly.
+    """Draw ``count`` rows with replacement: a share ``focus`` in proportion to ``expected`` [n] > 0, the rest evenly.
 
-    A row stands several times where a difference is expected. Each counts 1 / (chance of the row x number of rows),
-    whose mean is 1 on average.
+    Returns the rows, and how much each counts: 1 / (chance of the row x number of rows), which is 1 on average.
     """
     n = len(expected)
     chance = (1.0 - focus) / n + focus * (expected / expected.sum())
@@ -62,7 +61,7 @@ def draw_rows(expected: Floats, count: int, focus: float) -> tuple[Ints, Float32
 def choose_rows(
     observed: Float32s, rows: Ints, count: int, focus: float, expect: Callable[[Float32s], Floats] | None
 ) -> tuple[Ints, Float32s]:
-    """Draw ``count`` of ``rows``: evenly and each once, or mostly where ``expect`` says that there is a difference."""
+    """Draw ``count`` of ``rows``: evenly and each once, or mostly those of which ``expect`` expects much."""
     if focus == 0.0 or expect is None or len(rows) == 0:
         some = rows[torch.randperm(len(rows))[:count].numpy()]
         return some, np.ones(len(some), np.float32)

@@ -1,37 +1,51 @@
-"""``vine``: gradients of the return from branches of the same moment, played on in two ways."""
+"""The algorithm ``vine``: gradients of the return, measured by playing on from the same moment in two ways.
+
+Vine is the sampling of Schulman et al. 2015 (TRPO): branches from visited states with common random numbers. Recipes
+call it ``algorithm: counterfactual``.
+"""
 
 from __future__ import annotations
+
+from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch.optim import Optimizer
 
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
-from ethbrake_marl.extensions.learners.actors import widened
-from ethbrake_marl.extensions.learners.mixture import ModesModel
-from ethbrake_marl.extensions.learners.recipes import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.mixture_model import ModesModel
+from ethbrake_marl.extensions.learners.start_weights import widened
 from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
+from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
+from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
 from ethbrake_marl.policies.shipped import load_named_policy
-from ethbrake_marl.training.run_folder import Algorithm, Training
+from ethbrake_marl.training.algorithm import Algorithm
+from ethbrake_marl.training.training import Training
 
 
 class Counterfactual(Algorithm):
-    """Gradients of the return by playing on from the same moment in two ways; one actor for all learners."""
+    """Vine, with one actor for all learners, or a mixture of experts for one."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> CounterfactualModel:
-        """The model, from the policy of the training's ``start`` if it has one."""
+        """The model, with the weights of the policy to start from, or random ones."""
         recipe = training.recipe
         assert isinstance(recipe, CounterfactualRecipe)
         environment.engine.branch(environment.engine.moment())  # refuses what cannot be branched before it begins
         model = (CounterfactualModel if recipe.modes is None else ModesModel)(environment, recipe)
-        if training.start is not None:
-            kind, _, path = training.start.partition("@")
+        start = recipe.policy_to_start_from(training.scenario)
+        if start is not None:
+            kind, _, path = start.partition("@")
             policy = load_named_policy(path, kind, training.scenario, recipe.reward.harm_count)
             first = model.policy.actors[0] if isinstance(model, ModesModel) else model.policy
             first.take_over(widened(policy, training))
         return model
 
+    def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
+        """Copy the running averages of the weights."""
+        found: dict[str, Float32s] = actor.tensors(network)
+        return found
+
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
-        """The optimiser of the actor, or that of each network and of the gate."""
+        """The optimiser of the actor, or of each expert and of the gating network."""
         if not isinstance(model, ModesModel):
             return {"policy": model.policy.optimizer}
         members = {f"network_{k + 1}": actor.optimizer for k, actor in enumerate(model.policy.actors)}

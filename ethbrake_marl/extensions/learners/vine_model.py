@@ -1,8 +1,7 @@
-"""The model of ``vine``: it visits decisions, tries some in two ways, and learns from all of them."""
+"""The model of vine: visit decisions, try some of them in two ways, learn from the difference."""
 
 from __future__ import annotations
 
-import inspect
 from typing import Any, Self
 
 import numpy as np
@@ -14,33 +13,20 @@ from torch import Tensor
 
 from ethbrake_marl.engine.state import State
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
-from ethbrake_marl.extensions.learners.actors import (
-    CUT,
-    REMEMBERED,
-    Adam,
-    AveragedActor,
-    Deterministic,
-    Tried,
-    descend,
-    follow,
-    limit_that_cuts,
-    moving_rows,
-    smallest_offset,
-    trusted_targets,
-)
-from ethbrake_marl.extensions.learners.branches import Act, Offsets, play_to_the_end
+from ethbrake_marl.extensions.learners.averaged_actor import AveragedActor, Deterministic
+from ethbrake_marl.extensions.learners.branches import Act, Offsets, moving_rows, play_to_the_end
+from ethbrake_marl.extensions.learners.gradient_limit import CUT, REMEMBERED, limit_that_cuts, smallest_offset
 from ethbrake_marl.extensions.learners.mixture_policy import ModesPolicy
-from ethbrake_marl.extensions.learners.recipes import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.optimizer import descend, follow
 from ethbrake_marl.extensions.learners.scout import choose_rows
+from ethbrake_marl.extensions.learners.trust_radius import Tried, trusted_targets
+from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
 from ethbrake_marl.physics.state import Floats, Ints
-from ethbrake_marl.policies.manifest import Float32s
-
-for _name in ("step", "add_param_group", "zero_grad", "state_dict", "load_state_dict"):
-    setattr(Adam, _name, torch.no_grad()(inspect.unwrap(getattr(torch.optim.Adam, _name))))
+from ethbrake_marl.policies.network_spec import Float32s
 
 
 class CounterfactualModel(BaseAlgorithm):
-    """Visits decisions by its deterministic actor, tries some of them in two ways, and learns from the difference."""
+    """Visit decisions by a deterministic actor, try some of them in two ways, and learn from the difference."""
 
     policy: AveragedActor
 
@@ -74,7 +60,7 @@ class CounterfactualModel(BaseAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
-        """Train for so many decisions of learners."""
+        """Train for a number of decisions of learners."""
         total, told = self._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         told.on_training_start(locals(), globals())
         while self.num_timesteps < total:
@@ -92,7 +78,7 @@ class CounterfactualModel(BaseAlgorithm):
         self._train(actor, self._try_out(seen, moments, actor))
 
     def _visit(self, told: BaseCallback, act: Act) -> tuple[Float32s, State]:
-        """Drive on for ``n_steps``; what was seen [n_steps, rows, F], and the worlds' moments, step by step."""
+        """Drive on for ``n_steps``. Return observations [n_steps, rows, F] and the worlds' states, step by step."""
         seen, moments, numbers = [], [], []
         for _ in range(self.recipe.n_steps):
             observations: Any = self._last_obs
@@ -109,7 +95,7 @@ class CounterfactualModel(BaseAlgorithm):
         return np.stack(seen), State.join(moments)
 
     def _try_out(self, seen: Float32s, moments: State, actor: Deterministic) -> Tried:
-        """Try some of the visited decisions with more and with less, each to the end of its episode."""
+        """Try some of the visited decisions with a higher and a lower action, each to the end of its episode."""
         recipe, learners = self.recipe, len(self.engine.learners)
         moving = np.flatnonzero(moving_rows(moments).repeat(learners))
         observed = seen.reshape(-1, seen.shape[2])
@@ -141,7 +127,7 @@ class CounterfactualModel(BaseAlgorithm):
         return Tried(then, actor.means(then), gradient[good].astype(np.float32), importance[good])
 
     def _train(self, actor: AveragedActor, tried: Tried) -> None:
-        """Regress the actor on actions that are better, within the trust radius; log what that was."""
+        """Regress the actor on better actions within the trust radius, and log the loss."""
         recipe = self.recipe
         self._update_learning_rate(actor.optimizer)
         target, weight = trusted_targets(tried, recipe.trust_radius, recipe.anchor)

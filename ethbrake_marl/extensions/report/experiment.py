@@ -1,77 +1,91 @@
-"""The main job, end to end: train a policy, shield it, measure both against the baselines, and show the result."""
+"""The report of ``ethbrake run``: three figures, a page, and the policy in the other two tests."""
 
 from __future__ import annotations
 
-import json
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from collections.abc import Mapping, Sequence
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.learned import TRAINED_POLICY
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.errors import Unfamiliar, check_one_learner
+from ethbrake_marl.errors import Unfamiliar
 from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.identity import EPISODES, LIST_SEED
-from ethbrake_marl.evaluation.lineup import make_agents
-from ethbrake_marl.evaluation.per_world import results_to_json, write_per_world
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
 from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.episode_figure import trajectories
 from ethbrake_marl.extensions.report.page import Part
-from ethbrake_marl.extensions.report.paper_rows import is_papers_test, summarise_beside_paper
+from ethbrake_marl.extensions.report.paper_rows import is_papers_test, with_paper_rows
 from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap, learning_curve
-from ethbrake_marl.extensions.report.shown_worlds import TRAINED_POLICY
 from ethbrake_marl.extensions.report.style import write_picture
 from ethbrake_marl.extensions.report.three_tests import TESTS, brief, other_tests
 from ethbrake_marl.files.plain import read_object
-from ethbrake_marl.files.sheet import Sheet, csv_text
-from ethbrake_marl.files.store import write_output
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.game.rewards import RewardParams
 from ethbrake_marl.policies.manifest import installed_versions
-from ethbrake_marl.policies.network import Policy
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shield.paper_hybrid import HybridAgent
-from ethbrake_marl.training.recipe import TrainingRecipe
-from ethbrake_marl.training.run_folder import RunDirectory
-from ethbrake_marl.training.session import TrainResult, train
+from ethbrake_marl.training.experiment import Experiment, RunReport, compared_agents, write_results
 
 BESIDE = ("full_brake", "e_v2x_bm")  # beside the policy: in its figures, and on the other two of the three tests
 
-
-def write_results(
-    folder: Path, name: str, rows: Sequence[SummaryRow], harm_count: HarmCount, per_world: Path | None = None
-) -> list[dict[str, Any]]:
-    """Write the rows as ``NAME.json`` and, flat, as ``NAME.csv``; gives what the JSON holds."""
-    results = results_to_json(rows, per_world=per_world, settings={"harm_count": harm_count})
-    content = json.dumps(results, indent=2, allow_nan=False) + "\n"
-    write_output(folder / f"{name}.json", content.encode(), force=True)
-    write_output(folder / f"{name}.csv", results_csv(rows).encode(), force=True)
-    return results
+MOST_WORLDS = 2_000  # of each of the other two tests
 
 
-def results_csv(rows: Sequence[SummaryRow]) -> str:
-    """One line per agent; the interval of column ``x`` is ``x_low`` and ``x_high``, what does not exist is empty."""
-    lines = []
-    for told in (row.to_json() for row in rows):
-        parameters = told.pop("parameters")
-        for name, value in told.items():
-            if isinstance(value, list | dict) and not name.endswith("_interval"):
-                told[name] = json.dumps(value, allow_nan=False)
-        lines.append({"scenario": parameters["scenario"], "seed": parameters["seed"], **told})
-    return csv_text(lines)
+def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
+    """Drive the other two tests, draw the figures, and write ``report.html``."""
+    evaluation, folder = experiment.evaluation, experiment.run.path
+    others, done = other_tests(evaluation.scenario), count()
+
+    def begin(stage: str) -> None:
+        """Tell that a stage of the report begins, or that all have ended."""
+        tell(Progress(f"report{stage and ': '}{stage}", next(done), 2 + len(others)))
+
+    is_papers = is_papers_test(evaluation.task, evaluation.seed)
+    rows = with_paper_rows(experiment.rows) if is_papers else experiment.rows
+    beside: dict[str, SummaryTable] = {}
+    for other in others:  # the policy was trained on the scenario of the run alone
+        begin(f"the same policy on {other.name}")
+        beside[other.name] = _drive_other_test(experiment, other)
+    if beside:
+        flat = [row for table in beside.values() for row in table]
+        write_results(folder, "other_tests", flat, experiment.harm_count)
+    begin("figures")
+    config = read_object(experiment.run.config)
+    figures = write_figures(
+        folder,
+        evaluation,
+        rows,
+        course=experiment.trained.evaluations,
+        course_caption=_caption(experiment, config),
+        agents=experiment.agents,
+        harm_count=experiment.harm_count,
+    )
+    begin("the page and its episodes")
+    page = folder / "report.html"
+    report = _page(experiment, rows, beside, figures, config)
+    report.driven(experiment.agents).write(page, force=True)
+    begin("")
+    return RunReport(
+        (brief(rows, beside), *rows.tables()[1:]), f"report, with every measure and the paper's rows: {page}"
+    )
+
+
+def _drive_other_test(experiment: Experiment, test: Scenario) -> SummaryTable:
+    """Evaluate the trained policy and its shield on another test."""
+    evaluation = experiment.evaluation
+    worlds = test.sample(min(evaluation.worlds.n, MOST_WORLDS), experiment.list_seed)
+    agents = compared_agents(experiment.trained.policy, test, experiment.harm_count, BESIDE)
+    with warnings.catch_warnings():  # the page says that the policy was not trained for this test
+        warnings.simplefilter("ignore", Unfamiliar)
+        return summarise(evaluate(worlds, agents, scenario=test, seed=experiment.list_seed))
 
 
 def write_figures(
@@ -126,135 +140,22 @@ def telling_world(evaluation: Evaluation, harm_count: HarmCount = "first") -> in
     return int(rows[order[(len(order) - 1) // 2]])
 
 
-@dataclass(frozen=True, slots=True)
-class ExperimentResult:
-    """What an experiment left behind."""
-
-    trained: TrainResult  # interrupted: the policy was not trained to the end, everything else is there
-    rows: SummaryTable
-    report: Path
-    results: list[dict[str, Any]]
-    beside: Mapping[str, SummaryTable] = field(default_factory=dict)  # by test: the other two of the three tests
-
-    @property
-    def brief(self) -> Sheet:
-        """The rows on one screen, with those of the other tests."""
-        return brief(self.rows, self.beside)
-
-
-def run_experiment(
-    scenario: Scenario,
-    directory: Path,
-    *,
-    recipe: TrainingRecipe,
-    steps: int | None = None,
-    seed: int | None = None,
-    episodes: int = EPISODES,
-    list_seed: int = LIST_SEED,
-    force: bool = False,
-    settings: Sequence[str] = (),
-    on_progress: OnProgress | None = None,
-) -> ExperimentResult:
-    """Train a policy on ``scenario``, evaluate it, its hybrid and the baselines on a fixed list, write everything.
-
-    Hybrid and baselines minimise the harm that the policy is trained for (``reward.harm_count`` of the recipe).
-    On one of the three tests the policy also drives the other two, which it was not trained for.
-
-    ``seed`` is the training's; the list is ``episodes`` worlds of ``list_seed``; ``settings`` are noted.
-    Ctrl-C during the training ends it
-    after the update in progress, and the policy so far is evaluated; a second one, or one during the evaluation,
-    raises ``KeyboardInterrupt``, and the folder keeps the policy. ``run.json`` always says which. Raises what
-    ``train`` and ``evaluate`` raise, ``AlreadyExists`` for an existing run before any work.
-    """
-    started = time.monotonic()
-    tell = on_progress or (lambda progress: None)
-    names = [scenario.vehicle_names[i] for i in scenario.learners]
-    check_one_learner(scenario.name, names, "say which vehicle the agents drive")
-    sample = scenario.sample(episodes, list_seed)
-    trained = train(
-        recipe, scenario, directory, steps=steps, seed=seed, force=force, settings=settings, on_progress=on_progress
+def _caption(experiment: Experiment, config: Mapping[str, Any]) -> str:
+    plan, seed = config["recipe"]["evaluation"], config["seeds"]["training"]
+    return (
+        f"{experiment.evaluation.scenario.name}: worlds 0 to {plan['worlds'] - 1} of the list of seed {plan['seed']} at"
+        f" every point; training seed {seed}. Level lines: {experiment.rows[0].parameters.line}."
     )
-    run = RunDirectory(trained.directory)
-    with _status(run, trained.status):
-        harm_count = recipe.reward.harm_count
-        agents = _agents(trained.policy, scenario, harm_count)
-        order, n = list(agents), sample.worlds.n
-        total = n * len(order)
-        if trained.status == "interrupted":
-            note = (
-                f"interrupted after {trained.steps:,} steps: evaluating the policy so far; Ctrl-C again stops at once"
-            )
-            tell(Progress("evaluation", 0, total, note=note))
-        evaluation = evaluate(
-            sample,
-            agents,
-            scenario=scenario,
-            seed=list_seed,
-            on_progress=lambda name, done: tell(Progress("evaluation", n * order.index(name) + done, total)),
-        )
-        others, done = other_tests(scenario), count()
-
-        def begin(stage: str) -> None:
-            """Tell that a stage of the report begins, or that all have ended."""
-            tell(Progress(f"report{stage and ': '}{stage}", next(done), 3 + len(others)))
-
-        begin("what nobody can avoid")
-        beside_paper = is_papers_test(evaluation.task, list_seed)
-        rows = summarise_beside_paper(evaluation) if beside_paper else summarise(evaluation)
-        beside: dict[str, SummaryTable] = {}
-        for other in others:  # the policy was trained on ``scenario`` alone
-            part = other.sample(min(episodes, 2_000), list_seed)
-            begin(f"the same policy on {other.name}")
-            with warnings.catch_warnings():  # of what the page says
-                warnings.simplefilter("ignore", Unfamiliar)
-                driven = evaluate(
-                    part, _agents(trained.policy, other, harm_count, BESIDE), scenario=other, seed=list_seed
-                )
-            beside[other.name] = summarise(driven)
-        begin("results and figures")
-        per_world = run.path / "per_world.csv"
-        write_per_world(per_world, evaluation, force=True)
-        results = write_results(run.path, "results", rows, harm_count, per_world)
-        if beside:
-            write_results(run.path, "other_tests", [row for rows in beside.values() for row in rows], harm_count)
-        wall_s = time.monotonic() - started
-        report = _show(run, evaluation, rows, beside, trained, agents, harm_count, begin, wall_s=wall_s)
-        begin("")
-    return ExperimentResult(trained, rows, report, results, beside)
 
 
-def _agents(
-    policy: Policy, scenario: Scenario, harm_count: HarmCount, baselines: Sequence[str] = (*BESIDE, "e_v2x_bm:pairwise")
-) -> dict[str, Agent]:
-    """The baselines, the trained policy alone, and the same behind its shield (``hybrid``)."""
-    alone = LearnedAgent(policy, TRAINED_POLICY)
-    learned: dict[str, Agent] = {TRAINED_POLICY: alone, "hybrid": HybridAgent(alone, scenario, harm_count=harm_count)}
-    return {**make_agents(baselines, scenario, harm_count=harm_count), **learned}
-
-
-def _show(
-    run: RunDirectory,
-    evaluation: Evaluation,
+def _page(
+    experiment: Experiment,
     rows: SummaryTable,
     beside: Mapping[str, SummaryTable],
-    trained: TrainResult,
-    agents: Mapping[str, Agent],
-    harm_count: HarmCount,
-    begin: Callable[[str], None],
-    *,
-    wall_s: float,
-) -> Path:
-    """Figures and page."""
-    config = read_object(run.config)
-    plan = config["recipe"]["evaluation"]
-    caption = (
-        f"{evaluation.scenario.name}: worlds 0 to {plan['worlds'] - 1} of the list of seed {plan['seed']} at every"
-        f" point; training seed {config['seeds']['training']}. Level lines: {rows[0].parameters.line}."
-    )
-    figures = write_figures(
-        run.path, evaluation, rows, course=trained.evaluations, course_caption=caption, agents=agents,
-        harm_count=harm_count,
-    )  # fmt: skip
+    figures: Sequence[Part],
+    config: Mapping[str, Any],
+) -> Report:
+    trained, evaluation, harm_count = experiment.trained, experiment.evaluation, experiment.harm_count
     reward = RewardParams(**config["recipe"]["reward"]).model_dump(exclude_defaults=True)
     told = {
         "Training": f"{config['recipe']['title'] or config['recipe']['name']}: {trained.steps:,} steps"
@@ -263,7 +164,7 @@ def _show(
         "Seeds": f"training {config['seeds']['training']}, evaluation list {evaluation.seed}",
         "Reward": ", ".join(f"{name} {value}" for name, value in reward.items()) or "minus the first-impact harm",
         "Harm that agents minimise": "first impacts only" if harm_count == "first" else "every impact",
-        "Whole run": f"{wall_s:.0f} s",
+        "Whole run": f"{time.monotonic() - experiment.started:.0f} s",
         "Settings": ", ".join(config.get("settings", ())),
     }
     manifest, name = trained.policy.manifest, evaluation.scenario.name
@@ -274,8 +175,7 @@ def _show(
     if beside:
         summary += f" {TESTS[name]} The other two tests stand below."
     stopped = f"The training was interrupted: this is the policy after {manifest.steps:,} steps."
-    begin("the page and its episodes")
-    report = Report(
+    return Report(
         f"ethbrake run: {name}",
         rows,
         evaluation,
@@ -288,25 +188,3 @@ def _show(
         settings={name: value for name, value in told.items() if value},
         versions=installed_versions(),
     )
-    path = run.path / "report.html"
-    report.driven(agents).write(path, force=True)
-    return path
-
-
-@contextmanager
-def _status(run: RunDirectory, status: str) -> Iterator[None]:
-    """Keep ``run.json`` true while the evaluation runs: ``running``, then the training's status or what went wrong."""
-    _note(run, "running", "evaluation", None)
-    try:
-        yield
-    except BaseException as error:
-        _note(run, "interrupted" if isinstance(error, KeyboardInterrupt) else "failed", "evaluation", repr(error))
-        raise
-    _note(run, status, "report", None)
-
-
-def _note(run: RunDirectory, status: str, stage: str, reason: str | None) -> None:
-    """Bring ``run.json`` up to date; its steps and ``wall_s`` stay those of the training."""
-    content = read_object(run.status)
-    ended = None if status == "running" else datetime.now(UTC).isoformat(timespec="seconds")
-    run.write_json(run.status, {**content, "status": status, "stage": stage, "ended_utc": ended, "reason": reason})

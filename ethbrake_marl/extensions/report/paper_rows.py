@@ -81,7 +81,12 @@ def check_papers_test(task: Task, seed: int | None) -> None:
 def summarise_beside_paper(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTable:
     """``summarise``, with the rows of the paper's tables below; ``InvalidInput`` where they are about another test."""
     check_papers_test(evaluation.task, evaluation.seed)
-    return SummaryTable(summarise(evaluation, baseline=baseline), _beside())
+    return with_paper_rows(summarise(evaluation, baseline=baseline))
+
+
+def with_paper_rows(table: SummaryTable) -> SummaryTable:
+    """The table with the rows of the paper's tables below it."""
+    return SummaryTable(table, _beside())
 
 
 def _beside() -> RowsBeside:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from ethbrake_marl.agents.learned import TRAINED_POLICY
 from ethbrake_marl.agents.protocol import Driver
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.conditions import Conditions
@@ -23,15 +25,7 @@ from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.harm_figures import harm_by_agent, harm_in_parts, regret_distribution
 from ethbrake_marl.extensions.report.page import Page, Part, Section
 from ethbrake_marl.extensions.report.player import Played
-from ethbrake_marl.extensions.report.shown_worlds import (
-    BASELINE,
-    NAMES,
-    ROUNDING,
-    TRAINED_POLICY,
-    WORDS,
-    choose_shown,
-    worst_rows,
-)
+from ethbrake_marl.extensions.report.shown_worlds import BASELINE, NAMES, ROUNDING, WORDS, choose_shown, worst_rows
 from ethbrake_marl.extensions.search.limits import Unproven
 from ethbrake_marl.extensions.search.regret import limits_of, regrets_of
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown
@@ -375,3 +369,46 @@ def _table(sheet: Sheet, caption: str, names: set[str]) -> Part:
         f"The paper's {row.removeprefix('paper, ')}, as printed" if isinstance(row, str) else row for row in some.rows
     ]
     return Part.table(replace(some, title=caption, rows=rows))
+
+
+def write_evaluation(
+    path: Path,
+    evaluation: Evaluation,
+    rows: SummaryTable,
+    agents: Mapping[str, Driver],
+    *,
+    harm_count: HarmCount,
+    force: bool = False,
+    tell: Callable[[int, int], None] | None = None,
+) -> None:
+    """The page of ``ethbrake evaluate --report``, with episodes that ``agents`` drive again.
+
+    ``tell`` hears how many agents of how many have driven theirs. Raises what ``Report.write`` raises.
+    """
+    done: list[str] = []
+
+    def on_agent(agent: str) -> None:
+        done.append(agent)
+        if tell is not None:
+            tell(len(done), len(agents))
+
+    scenario, names, asked = evaluation.scenario, ", ".join(row.agent for row in rows), rows[0].parameters
+    scripts = ", ".join(f"{vehicle} by {script}" for vehicle, script in asked["scripts"].items())
+    report = Report(
+        f"{scenario.name}: {names}" if len(names) <= 60 else f"{scenario.name}: {len(rows)} agents compared",
+        rows,
+        evaluation,
+        harm_count=harm_count,
+        summary=scenario.title or "Agents on the same worlds.",
+        settings={
+            "Command": "ethbrake " + " ".join(sys.argv[1:]),
+            "Agents": names,
+            "Harm that agents minimise": "first impacts only" if harm_count == "first" else "every impact",
+            "Worlds": asked.line,
+            "Driven by the agents": asked.get("controlled_vehicle") or ", ".join(asked["controlled_vehicles"]),
+            "Driven by scripts": scripts or "none",
+            "Time step, horizon": f"{asked['time_step_s']:g} s, {asked['horizon_s']:g} s",
+        },
+        versions=rows[0].versions,
+    )
+    report.driven(agents, on_agent=on_agent).write(path, force=force)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from ethbrake_marl.extensions.report.style import (
     new_figure,
     series_style,
     style_axes,
+    write_picture,
 )
 from ethbrake_marl.physics.state import Floats, Worlds
 from ethbrake_marl.scenario.fields import QUANTITY
@@ -39,6 +41,11 @@ _LABEL_CHARACTERS = 18  # of a line beside such a pair
 _MOST_NAMED = 8  # vehicles of a line whose gaps and speeds are written
 
 _SHOWN = {0.0: "shortest line", 0.5: "median line", 1.0: "longest line"}  # by the rank of the sum of gaps
+
+
+def write_worlds(path: Path, scenario: Scenario, sample: Sample, *, seed: int, force: bool = False) -> None:
+    """The picture of ``ethbrake scenario sample``; raises what ``write_picture`` raises."""
+    write_picture(path, worlds_figure(scenario, sample, seed=seed), force=force)
 
 
 def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:

@@ -26,8 +26,6 @@ ROUNDING = 1e-6  # m2/s2
 
 NAMES: dict[HarmCount, str] = {"first": "first_impact_harm", "total": "total_harm"}
 
-TRAINED_POLICY = "trained policy"  # the name of the policy that a run trains
-
 WORDS = {
     "Contact": "Two vehicles, or Vehicle 1 and an obstacle, touch: the gap between them is 0.",
     "Impact": "A contact with a closing speed above 0. The square of that speed is its harm.",

@@ -23,11 +23,12 @@ from ethbrake_marl.extensions.studies.trainings import TrainingJob, train_all
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.game.harm import HARM_COUNTS
-from ethbrake_marl.policies.network import load_policy
+from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.progress import OnProgress
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
-from ethbrake_marl.training.run_folder import RunDirectory, Training
+from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.training import Training
 
 _RETURNED = "return"  # what it is called here
 

@@ -17,7 +17,8 @@ from ethbrake_marl.extensions.reproduction.verdicts import LIST_SEED, PREDICTED,
 from ethbrake_marl.extensions.search.limits import Unproven
 from ethbrake_marl.extensions.search.regret import limits_of
 from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.policies.network import Policy, load_policy
+from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.shipped import load_shipped
 from ethbrake_marl.progress import Progress
 from ethbrake_marl.scenario.catalogue import load_scenario

@@ -10,10 +10,11 @@ from typing import Any
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.extensions.studies.trainings import TrainingJob
 from ethbrake_marl.files.store import remove_folder
-from ethbrake_marl.policies.network import Policy
+from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.teams import read_trained
+from ethbrake_marl.training.callback import StopAt
 from ethbrake_marl.training.run_folder import RunDirectory
-from ethbrake_marl.training.session import StopAt
+from ethbrake_marl.training.training import check_same_training
 
 _MEASURED = ("first_impact_harm", "total_harm", "collision_rate")
 
@@ -38,7 +39,7 @@ def is_done(job: TrainingJob) -> bool:
     run = RunDirectory(job.folder)
     if not run.is_finished:
         return False
-    run.check_same(job.training)
+    check_same_training(run, job.training)
     return all(Policy.stands_in(job.folder / place) for place in job.training.drivers.values())
 
 
@@ -51,7 +52,7 @@ def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
     run = RunDirectory(job.folder)
     if run.status.is_file():
         run.wait_for_others(60.0)  # a worker that has lost its driver may hold the folder for a moment
-        run.check_same(job.training)
+        check_same_training(run, job.training)
         if run.is_finished and not is_done(job):
             remove_folder(job.folder)  # a finished run has no checkpoint: it is trained anew
     try:

@@ -30,7 +30,7 @@ from ethbrake_marl.files.store import remove_unfinished, write_file
 from ethbrake_marl.files.yaml import YamlPath, flow_text
 from ethbrake_marl.parallel import LOCAL
 from ethbrake_marl.progress import OnProgress, Progress
-from ethbrake_marl.training.run_folder import Training
+from ethbrake_marl.training.training import Training
 
 MOST_JOBS = 10_000
 

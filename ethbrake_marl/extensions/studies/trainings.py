@@ -17,10 +17,12 @@ from ethbrake_marl.parallel import run_each
 from ethbrake_marl.physics.state import Worlds
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario.sample import Sample
-from ethbrake_marl.training.run_folder import RunDirectory, Training
+from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.team import load_team
+from ethbrake_marl.training.training import Training, check_same_training
 
 if TYPE_CHECKING:
-    from ethbrake_marl.training.session import StopAt
+    from ethbrake_marl.training.callback import StopAt
 
 
 def train_all(trainings: Sequence[TrainingJob], jobs: int = 1, tell: OnProgress | None = None) -> bool:
@@ -65,7 +67,7 @@ class TrainingJob:
             status = read_object(run.status)
         except InvalidInput as error:
             raise InvalidInput(f"{error}; delete its folder to train anew") from None
-        run.check_same(self.training)
+        check_same_training(run, self.training)
         if status.get("status") == "finished":
             return 0
         steps = status.get("steps", 0)
@@ -114,7 +116,7 @@ class TrainingJob:
 
     def world_seconds(self, sample: Sample) -> float:
         """Seconds per world that its team drives."""
-        team = {"team": RunDirectory(self.folder).load_team(self.training.scenario)}
+        team = {"team": load_team(self.folder, self.training.scenario)}
         drive = partial(evaluate, agents=team, scenario=self.training.scenario, aftermath=False)
         return Timed.each_s(sample.worlds, drive)
 

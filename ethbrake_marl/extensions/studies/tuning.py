@@ -44,8 +44,8 @@ from ethbrake_marl.progress import OnProgress
 from ethbrake_marl.scenario.catalogue import check_file_name
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
-from ethbrake_marl.training.run_folder import Training
 from ethbrake_marl.training.settings import read_settings
+from ethbrake_marl.training.training import Training
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

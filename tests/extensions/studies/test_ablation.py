@@ -42,9 +42,9 @@ from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.scenario.catalogue import load_scenario, scenario_path
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.shield.episodes import Shielded
+from ethbrake_marl.training.callback import RunCallback
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, load_recipe
-from ethbrake_marl.training.run_folder import Training
-from ethbrake_marl.training.session import train
+from ethbrake_marl.training.training import Training
 from tests.extensions.studies.conftest import ABLATE, LEVELS, study
 from tests.extensions.studies.counting import PROGRAM, end_when
 from tests.fixtures.page import Page
@@ -115,7 +115,7 @@ def test_ablate__goes_on_where_it_was_stopped_to_the_same_result(
     finished_ablation, tmp_path, tiny_total, monkeypatch, capsys
 ) -> None:
     """Stopped in the middle of a later training; ended by two processes."""
-    folder, original = tmp_path / "stopped", train.Session._after_update
+    folder, original = tmp_path / "stopped", RunCallback._between_updates
 
     def after_update(self, **options):
         original(self, **options)
@@ -123,7 +123,7 @@ def test_ablate__goes_on_where_it_was_stopped_to_the_same_result(
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(train.Session, "_after_update", after_update)
+        patch.setattr(RunCallback, "_between_updates", after_update)
         assert ablate(folder, tiny_total) == 130
     statuses = [json.loads(path.read_text())["status"] for path in folder.glob("trainings/*/run.json")]
     assert sorted(statuses) == ["finished", "interrupted"] and not (folder / "ablation.json").exists()

@@ -20,7 +20,7 @@ from ethbrake_marl.extensions.studies.folder import StudyFolder
 from ethbrake_marl.extensions.studies.trainings import TrainingJob, train_all
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.training.recipe import load_recipe
-from ethbrake_marl.training.run_folder import Training
+from ethbrake_marl.training.training import Training
 from tests.extensions.studies.conftest import ABLATE, LEVELS
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -22,8 +22,8 @@ from ethbrake_marl.extensions.studies.sweep import SweepFile, SweepPlan
 from ethbrake_marl.extensions.studies.tuning import TuningFile, TuningPlan
 from ethbrake_marl.files.yaml import read_yaml
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
-from ethbrake_marl.training.run_folder import Training
 from ethbrake_marl.training.settings import read_settings
+from ethbrake_marl.training.training import Training
 from tests.cli.conftest import rows_of as read
 from tests.extensions.studies.conftest import TRIALS, Write, study, write_yaml
 from tests.extensions.studies.counting import PROGRAM, ROOT, end_when, finished, holders

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.agents.learned import TRAINED_POLICY
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.report.report import Report
-from ethbrake_marl.extensions.report.shown_worlds import TRAINED_POLICY
 from ethbrake_marl.extensions.reproduction.folder import Reproduction
 from ethbrake_marl.scenario.catalogue import load_scenario
 from tests.extensions.report.browser.conftest import AGENTS, PAPER, wait_until

@@ -1,4 +1,4 @@
-"""The gating network of a mixture of experts: what it has learned, and the average that decides."""
+"""The gating network of a mixture of experts: weights that learn, and their average, which decides."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 
-from ethbrake_marl.extensions.learners.actors import adam
-from ethbrake_marl.extensions.learners.recipes import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.optimizer import adam
 from ethbrake_marl.extensions.learners.scout import Scout
-from ethbrake_marl.policies.manifest import Float32s
+from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
+from ethbrake_marl.policies.network_spec import Float32s
 from ethbrake_marl.training.networks import ACTIVATIONS
 
 
 class AveragedGate(nn.Module):
-    """A gate that learns (``learning``), and the running average of its weights (``average``), which decides.
+    """A gating network that learns (``learning``), and the running ``average`` of its weights, which decides.
 
-    It remembers the last decisions at which networks were compared: what was seen, and how much more than the best one
-    each of them costs.
+    It remembers the last decisions at which experts were compared: the observation, and how much more than the best
+    expert each of them costs.
     """
 
     seen: Tensor  # [M, F]
     more: Tensor  # [M, K]
-    compared: Tensor  # [1] so far; the newest take the places of the oldest
+    compared: Tensor  # [1] decisions so far; new ones replace the oldest
 
     def __init__(self, inputs: int, rate: Schedule, recipe: CounterfactualRecipe) -> None:
         super().__init__()
@@ -45,18 +45,18 @@ class AveragedGate(nn.Module):
         self.register_buffer("compared", torch.zeros(1, dtype=torch.int64))
 
     def remember(self, seen: Float32s, more: Float32s) -> None:
-        """Keep compared decisions."""
+        """Add compared decisions to the memory."""
         places = torch.arange(int(self.compared), int(self.compared) + len(seen)) % len(self.seen)
         self.seen[places], self.more[places] = torch.from_numpy(seen), torch.from_numpy(more)
         self.compared += len(seen)
 
     def recall(self, count: int) -> tuple[Tensor, Tensor]:
-        """Some of the kept ones, [count, F] and [count, K]."""
+        """Draw remembered decisions: observations [count, F] and extra costs [count, K]."""
         some = torch.randint(min(int(self.compared), len(self.seen)), (count,))
         return self.seen[some], self.more[some]
 
     def choose(self, observation: Float32s) -> NDArray[np.int64]:
-        """Which network acts on each of the observations [rows, F], [rows]."""
+        """Number of the expert that acts [rows] on observations [rows, F]."""
         with torch.no_grad():
             chosen: NDArray[np.int64] = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen

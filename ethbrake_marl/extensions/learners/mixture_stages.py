@@ -1,26 +1,26 @@
-"""The stages of a training of several experts: which updates do what."""
+"""The stages of training a mixture of experts: which updates do what."""
 
 from __future__ import annotations
 
 import math
 from typing import Literal, NamedTuple
 
-from ethbrake_marl.extensions.learners.recipes import ModesPlan
+from ethbrake_marl.extensions.learners.mixture_plan import ModesPlan
 
 ROUNDING = 1e-6  # of sums of shares, in updates
 
 
 class Stage(NamedTuple):
-    """What a stretch of updates is for."""
+    """A range of updates, and what is trained in it."""
 
     does: Literal["alone", "further", "gate", "together"]
-    network: int  # that of ``further``
+    network: int  # the expert that ``further`` trains
     first: int  # update, from 0
     end: int  # the first update after it
 
 
 def stages_of(plan: ModesPlan, updates: int) -> tuple[Stage, ...]:
-    """The stages of a training with so many updates, in order; some may be empty."""
+    """The stages of a training with this number of updates, in order; some may be empty."""
     shares, more = plan.shares, plan.networks - 1
     parts: list[tuple[Literal["alone", "further", "gate", "together"], int, float]] = [("alone", 0, shares.alone)]
     parts += [("further", k + 1, shares.further / more) for k in range(more)]

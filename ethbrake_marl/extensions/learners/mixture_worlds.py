@@ -12,19 +12,19 @@ from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.engine.state import State
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.extensions.learners.branches import Act, Offsets, play_on, play_to_the_end
-from ethbrake_marl.extensions.learners.recipes import ModesPlan
+from ethbrake_marl.extensions.learners.mixture_plan import ModesPlan
 from ethbrake_marl.extensions.search.templates import best_templates
 from ethbrake_marl.game.actions import command_to_action
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
-from ethbrake_marl.policies.manifest import Float32s
+from ethbrake_marl.policies.network_spec import Float32s
 
 NO_DIFFERENCE = 1e-2  # of returns: two networks that differ by less do the same
 
 
 class Explored(NamedTuple):
-    """Worlds of the training, and the best that networks do in them."""
+    """Worlds of the training, and the best that the experts do in them."""
 
     alert: Worlds
     start: State  # at the first decision
@@ -33,14 +33,14 @@ class Explored(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """What templates did at each decision, to be imitated."""
+    """Observations and actions of templates, to be imitated."""
 
     seen: Float32s  # [m, F]
     action: Float32s  # [m]
 
 
 def explore(engine: Engine, plan: ModesPlan, acts: Sequence[Act], gamma: float) -> Explored:
-    """The first worlds of the training, each driven by every network from its start to its end."""
+    """Let every expert drive the first worlds of the training from start to end."""
     alert, start = engine.first_moments(plan.worlds)
     gained, harm = np.full(plan.worlds, -np.inf), np.full(plan.worlds, np.inf)
     for act in acts:
@@ -52,9 +52,9 @@ def explore(engine: Engine, plan: ModesPlan, acts: Sequence[Act], gamma: float) 
 def drive_from(
     engine: Engine, start: State, act: Act, gamma: float, count: HarmCount | None = None
 ) -> tuple[Floats, Floats]:
-    """Return of the first learner [n], NaN for a row that could not be advanced, and harm of the world [n] (m2/s2).
+    """Return of the first learner [n] (NaN for a row that could not be advanced), and harm of the world [n] (m2/s2).
 
-    The harm is of the reward's count unless another one is given.
+    The harm has the reward's count unless ``count`` is given.
     """
     rows = engine.branch(start)
     nowhere = np.zeros(rows.n, np.int64)
@@ -63,7 +63,7 @@ def drive_from(
 
 
 def show_templates(engine: Engine, plan: ModesPlan, found: Explored, gamma: float, seed: int) -> Shown:
-    """What the best template does in each world in which it gains more, by ``plan.gain``, than every network."""
+    """Actions of the best template in each world where it gains more than every expert, by ``plan.gain``."""
     (vehicle,) = engine.learners
     problem = profile_problem(
         found.alert,
@@ -97,9 +97,9 @@ def show_templates(engine: Engine, plan: ModesPlan, found: Explored, gamma: floa
 
 
 def own_worlds(engine: Engine, plan: ModesPlan, found: Explored, act: Act, gamma: float) -> State:
-    """The starts of the worlds in which ``act`` is at most ``plan.margin`` worse than the networks before it.
+    """Starts of the worlds in which ``act`` is at most ``plan.margin`` worse than the experts before it.
 
-    Those where it makes no difference are left out, and those where the networks before do no harm: they teach nothing.
+    Worlds in which it makes no difference, or the experts before it do no harm, are left out: they teach nothing.
     """
     gained, _ = drive_from(engine, found.start, act, gamma)
     more = gained - found.gained
@@ -108,4 +108,4 @@ def own_worlds(engine: Engine, plan: ModesPlan, found: Explored, act: Act, gamma
 
 
 class NoOtherMode(EthBrakeError, ValueError):
-    """No template does better than the networks so far: there is no other mode to be learned."""
+    """No template does better than the experts so far: there is nothing for a further expert to learn."""

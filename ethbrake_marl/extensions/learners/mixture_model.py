@@ -1,4 +1,4 @@
-"""The model that trains a mixture of experts: one expert alone, further ones, the gating network, then all together."""
+"""Train a mixture of experts: one expert alone, further experts, the gating network, then all together."""
 
 from __future__ import annotations
 
@@ -12,17 +12,11 @@ from torch.nn.functional import mse_loss, softplus
 
 from ethbrake_marl.engine.state import State
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
-from ethbrake_marl.extensions.learners.actors import (
-    AveragedActor,
-    Tried,
-    adam,
-    descend,
-    follow,
-    moving_rows,
-    other_count,
-)
-from ethbrake_marl.extensions.learners.branches import visit
-from ethbrake_marl.extensions.learners.explored import (
+from ethbrake_marl.extensions.learners.averaged_actor import AveragedActor
+from ethbrake_marl.extensions.learners.branches import moving_rows, other_count, visit
+from ethbrake_marl.extensions.learners.mixture_policy import ModesPolicy
+from ethbrake_marl.extensions.learners.mixture_stages import Stage, stages_of
+from ethbrake_marl.extensions.learners.mixture_worlds import (
     NoOtherMode,
     Shown,
     drive_from,
@@ -30,17 +24,17 @@ from ethbrake_marl.extensions.learners.explored import (
     own_worlds,
     show_templates,
 )
-from ethbrake_marl.extensions.learners.mixture_policy import ModesPolicy
-from ethbrake_marl.extensions.learners.recipes import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.optimizer import adam, descend, follow
 from ethbrake_marl.extensions.learners.scout import choose_rows
-from ethbrake_marl.extensions.learners.stages import Stage, stages_of
+from ethbrake_marl.extensions.learners.trust_radius import Tried
 from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
+from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
 from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.policies.manifest import Float32s
+from ethbrake_marl.policies.network_spec import Float32s
 
 
 class ModesModel(CounterfactualModel):
-    """Learns a network alone, further ones in the worlds of their own modes, the gate, and then all together."""
+    """Train one expert alone, further experts in worlds of their own, the gating network, then all together."""
 
     policy: ModesPolicy  # type: ignore[assignment]
 
@@ -89,7 +83,7 @@ class ModesModel(CounterfactualModel):
         update_learning_rate(optimizers, rate)
 
     def _enter(self, stage: Stage, number: int) -> None:
-        """Prepare a stage. After a resume this finds the same again: it depends on finished networks alone."""
+        """Prepare a stage. After a resume the result is the same: it depends on finished experts alone."""
         self._stage, self._own = stage, None
         if stage.does != "further":
             return
@@ -111,7 +105,7 @@ class ModesModel(CounterfactualModel):
             self.policy.actors[stage.network].load_state_dict(pupil.state_dict())
 
     def _imitate(self, pupil: AveragedActor, shown: Shown, seed: int) -> None:
-        """Teach a network what templates do."""
+        """Teach an expert the actions of templates."""
         pupil.optimizer = adam(self.lr_schedule(1.0), pupil.learning)
         seen, wanted = torch.from_numpy(shown.seen), torch.from_numpy(shown.action)
         generator = torch.Generator().manual_seed(seed)
@@ -124,7 +118,7 @@ class ModesModel(CounterfactualModel):
         follow(pupil.average, pupil.learning, 0.0)
 
     def _compare(self, seen: Float32s, moments: State) -> tuple[Float32s, Floats, Float32s]:
-        """At some decisions: what is seen [B, F], what going on with each network costs [B, K], what each counts [B].
+        """Compare the experts at some decisions. Return observations [B, F], costs [B, K], and importance [B].
 
         Where all networks would do the same now nothing depends on the choice: the gate is asked again at the next one.
         """
@@ -145,7 +139,7 @@ class ModesModel(CounterfactualModel):
         return observed[rows[good]], costs[good], importance[good]
 
     def _train_gate(self, seen: Float32s, costs: Floats, importance: Float32s | None = None) -> None:
-        """Teach the gate which network costs least, each decision as much as the others would cost more."""
+        """Teach the gating network which expert costs least. A decision weighs as much as the others cost more."""
         importance = np.ones(len(seen), np.float32) if importance is None else importance
         gate = self.policy.gate
         self._update_learning_rate(gate.optimizer)

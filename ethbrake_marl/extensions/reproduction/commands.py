@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
-from ethbrake_marl.cli.command import ForceOption, JsonOption, Out
+from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, example
 from ethbrake_marl.errors import InvalidInput, need
 from ethbrake_marl.files.sheet import Column, Sheet
+from ethbrake_marl.registry import Part
 
 KEPT = "the same command goes on with what is in the folder"
 
@@ -72,3 +73,6 @@ def reproduce_command(
         out.note(f"page: {output / 'index.html'}")
         if not finished:
             out.interrupted(f"interrupted: items are made of the trainings that were finished; {KEPT}")
+
+
+REPRODUCE = Part(reproduce_command, epilog=example("reproduce random-table harm-distance --quick --output runs/paper"))

@@ -7,8 +7,17 @@ from typing import Annotated
 
 import typer
 
-from ethbrake_marl.cli.command import AgentsOption, ForceOption, Out, ScenarioOption, SeedOption, SettingsOption
+from ethbrake_marl.cli.command import (
+    AgentsOption,
+    ForceOption,
+    Out,
+    ScenarioOption,
+    SeedOption,
+    SettingsOption,
+    example,
+)
 from ethbrake_marl.cli.evaluate import make_drivers, read_task
+from ethbrake_marl.registry import Part
 
 
 def watch_command(
@@ -35,3 +44,6 @@ def watch_command(
         named = make_drivers(agents, task).items()
         titled = {f"{name}: world {world} of {task.scenario.name}": agent for name, agent in named}
         out.write(output, film(worlds, titled, output.suffix.lower(), scenario=task.scenario), what="film")
+
+
+WATCH = Part(watch_command, epilog=example("watch --agents full_brake,e_v2x_bm --world 3 --output both.gif"))

@@ -1,0 +1,50 @@
+"""The recipe's key ``modes``: how a mixture of experts is trained."""
+
+from __future__ import annotations
+
+from pydantic import Field, model_validator
+
+from ethbrake_marl.files.model import FileModel
+from ethbrake_marl.training.recipe import Fraction, Layers, NonNegative, Positive, Rate
+
+
+class Shares(FileModel):
+    """Share of all updates that each stage has, 1 in all."""
+
+    alone: Fraction  # the first network, in all worlds
+    further: Fraction  # each of the others in the worlds of its own mode, one after the other
+    gate: Fraction  # the gate between them
+    together: Fraction  # all networks and the gate, each network where the gate chooses it
+
+    @model_validator(mode="after")
+    def _everything(self) -> Shares:
+        total = self.alone + self.further + self.gate + self.together
+        if not abs(total - 1.0) <= 1e-9:
+            raise ValueError(f"alone, further, gate and together are {total:g} in all; must be 1")
+        return self
+
+
+class ModesPlan(FileModel):
+    """How many experts, how the worlds of each further expert are chosen, and how the gating network learns."""
+
+    networks: int = Field(ge=2, le=16, description="how many")
+    gate: Layers = Field(description="hidden layers of the gate")
+    worlds: int = Field(ge=1, le=1_000_000, description="worlds of the training in which a mode is looked for")
+    templates: int = Field(ge=1, le=100_000, description="how many templates are drawn in each of them")
+    gain: NonNegative = Field(
+        description="return by which a template must be better than every network before, to be imitated"
+    )
+    margin: Positive = Field(
+        description="return by which a network may be worse than those before it in a world of its own"
+    )
+    imitation_epochs: int = Field(ge=1, le=1000, description="how often the shown decisions are gone through")
+    gate_states: int = Field(
+        ge=1, le=1_000_000, description="decisions of an update at which the networks are compared"
+    )
+    gate_memory: int = Field(ge=1, le=1_000_000, description="how many compared decisions are remembered")
+    gate_steps: int = Field(ge=1, le=100_000, description="steps of the gate's optimiser in each update")
+    tie_break: NonNegative = Field(description="weight of the other count's harm in that comparison")
+    together_rate: Rate = Field(
+        description="share of the learning rate in the last stage, where noise undoes what was learned"
+    )
+    shares: Shares = Field(description="share of all updates that each stage has, 1 in all")

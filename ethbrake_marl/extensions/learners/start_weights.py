@@ -1,0 +1,49 @@
+"""Take over the weights of a trained policy that observes less."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.training.training import Training
+
+
+def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]]:
+    """The actor's tensors of ``policy``, with weights of 0 for features that only the training observes.
+
+    Raises ``InvalidInput`` if the training does not observe all that the policy does, or has another network.
+    """
+    recipe, wanted = training.recipe, training.recipe.network_spec(training.observation.size)
+    found = policy.manifest.network
+    if found.networks > 1:
+        raise InvalidInput(f"recipe {recipe.name!r}: start: has {found.networks} networks; give a policy of one")
+    for name in ("policy_hidden", "activation", "output"):
+        if getattr(found, name) != getattr(wanted, name):
+            raise InvalidInput(
+                f"recipe {recipe.name!r}: network: {name} is {getattr(wanted, name)}, but {getattr(found, name)} in the"
+                " policy to start from; they must be the same"
+            )
+    return padded(policy, training, "start")
+
+
+def padded(policy: Policy, training: Training, key: str) -> dict[str, NDArray[np.float32]]:
+    """All tensors of ``policy`` but the critic's, with weights of 0 for features that only the training observes.
+
+    Raises ``InvalidInput``, naming the recipe's ``key``, if the training does not observe all that the policy does.
+    """
+    names = [feature.name for feature in training.observation.features]
+    known = policy.manifest.observation.features
+    missing = [name for name in known if name not in names]
+    if missing:
+        raise InvalidInput(
+            f"recipe {training.recipe.name!r}: observation: lacks {', '.join(missing[:5])}, which the policy of {key}"
+            " observes; list what it observes, and more"
+        )
+    found = {name: tensor.copy() for name, tensor in policy.tensors.items() if not name.startswith("value.")}
+    for name in [name for name in found if name.endswith(".0.weight")]:
+        first = np.zeros((len(found[name]), len(names)), np.float32)
+        first[:, [names.index(feature) for feature in known]] = found[name]
+        found[name] = first
+    return found

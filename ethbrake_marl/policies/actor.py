@@ -1,0 +1,95 @@
+"""Run a policy's networks without torch: observations in, actions out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.policies.layers import Layers, dense, layers_of, squash
+from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
+
+BLOCK_ROWS = 256  # worlds handled together: their activations stay in the cache; changes no bit of any of them
+
+
+class Actor:
+    """The deterministic policy: observation [n, F] float32 -> action [n, A] float32 in [-1, 1].
+
+    Of several networks only the one that the gate chooses is computed in a row.
+    """
+
+    def __init__(self, spec: NetworkSpec, tensors: Mapping[str, Float32s], prefix: str = "") -> None:
+        """Take the layers out of ``tensors``, which must fit ``spec`` (see ``NetworkSpec.tensors``)."""
+        self.spec = spec
+        self._networks = [layers_of(prefix + name, len(spec.policy_hidden), tensors) for name in spec.actors]
+        self._gate = layers_of(f"{prefix}gate", len(spec.gate_hidden), tensors) if spec.networks > 1 else []
+        self._actions = spec.actions
+        self._among = [type(self)(each, tensors, f"among_{m}.") for m, each in enumerate(spec.among, 1)]
+
+    def __call__(self, observation: Float32s) -> Float32s:
+        """Return the action of each row; raises ``InvalidInput`` on a wrong shape, dtype or a non-finite entry."""
+        seen = self._check(observation)
+        action = np.empty((seen.shape[0], self.spec.action_size), dtype=np.float32)
+        for start in range(0, seen.shape[0], BLOCK_ROWS):
+            rows = slice(start, start + BLOCK_ROWS)
+            action[rows] = self._block(np.ascontiguousarray(seen[rows].T)).T
+        return action
+
+    def choose(self, x: Float32s) -> NDArray[np.int64]:
+        """[F, rows] -> which of several networks acts, [rows] from 0."""
+        chosen: NDArray[np.int64] = self._forward(self._gate, x).argmax(axis=0)
+        return chosen
+
+    def take(self, number: NDArray[np.int64], x: Float32s) -> Float32s:
+        """The actions with these numbers [rows], policies first, where [F, rows] is seen, [1, rows]."""
+        found = self._actions[np.newaxis, np.maximum(number - len(self._among), 0)]
+        for m, member in enumerate(self._among):
+            rows = np.flatnonzero(number == m)
+            if len(rows):
+                found[:, rows] = member._block(np.ascontiguousarray(x[:, rows]))
+        return found
+
+    def _block(self, x: Float32s) -> Float32s:
+        """[F, rows] -> [A, rows]."""
+        if len(self._networks) == 1:
+            y = self._forward(self._networks[0], x)
+            if self.spec.choices is not None:
+                return self.take(y.argmax(axis=0), x)
+        else:
+            chosen = self.choose(x)
+            y = np.empty((self.spec.action_size, x.shape[1]), dtype=np.float32)
+            for m, layers in enumerate(self._networks):
+                rows = np.flatnonzero(chosen == m)
+                y[:, rows] = self._forward(layers, np.ascontiguousarray(x[:, rows]))
+        if self.spec.output == "clip":
+            return np.clip(y, np.float32(-1.0), np.float32(1.0))
+        squash(y)
+        return y
+
+    def _forward(self, layers: Layers, x: Float32s) -> Float32s:
+        """[F, rows] -> [outputs, rows] of one network."""
+        for number, (weight, bias) in enumerate(layers, start=1):
+            y = np.empty((weight.shape[0], x.shape[1]), dtype=np.float32)
+            dense(weight, bias, x, y)
+            if number == len(layers):
+                break
+            if self.spec.activation == "relu":
+                x = np.maximum(y, np.float32(0.0))
+            else:
+                squash(y)
+                x = y
+        return y
+
+    def _check(self, observation: Float32s) -> Float32s:
+        wanted = (observation.shape[0] if observation.ndim else 0, self.spec.observation_size)
+        if observation.shape != wanted or observation.dtype != np.float32:
+            raise InvalidInput(
+                f"observation: {observation.dtype} of shape {observation.shape};"
+                f" this policy takes float32 [n, {self.spec.observation_size}]"
+            )
+        if not np.isfinite(observation).all():
+            row, column = np.argwhere(~np.isfinite(observation))[0]
+            raise InvalidInput(f"observation[{row}, {column}] = {observation[row, column]}: must be finite")
+        return observation

@@ -1,0 +1,130 @@
+"""The networks of a policy: their sizes, and the table of their tensors."""
+
+from __future__ import annotations
+
+from itertools import chain
+from operator import not_
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from ethbrake_marl.files.model import FileModel
+
+Activation = Literal["relu", "tanh"]
+
+Width = Annotated[int, Field(ge=1, le=4096)]
+
+PerhapsHidden = Annotated[tuple[Width, ...], Field(max_length=8)]
+
+
+class TensorRow(NamedTuple):
+    """One tensor of a bundle."""
+
+    name: str
+    shape: tuple[int, ...]
+
+    def inside(self, part: str) -> TensorRow:
+        """The same tensor, as one of a part of a larger policy."""
+        return self._replace(name=f"{part}.{self.name}")
+
+
+class NetworkSpec(FileModel):
+    """The networks of a policy: an actor, and perhaps a critic, both multilayer perceptrons on the same observation.
+
+    The action is ``output(actor(observation))`` in [-1, 1]. ``clip`` cuts the actor's mean at the bounds (PPO's
+    Gaussian, whose noise is one number per action). ``tanh`` squashes it (SAC's Gaussian, whose noise is a second head
+    of the actor). Without ``value_hidden`` there is no critic: a policy needs none to act.
+
+    ``networks`` above 1 is a mixture of experts: as many actors of this shape, and a gating network with
+    ``gate_hidden`` layers that scores them. The expert with the highest score acts, the first one if scores are equal.
+    The gating network is asked at every decision and has no memory. A mixture has neither noise nor critic.
+
+    Output ``choice`` scores actions: ``choices`` of them, evenly from -1 to 1. The action with the highest score is
+    taken, the lowest one if scores are equal. There is neither noise nor critic. The actor may also score whole
+    policies, ``among``; their scores come before the actions', and all see the same observation.
+    """
+
+    observation_size: Annotated[int, Field(ge=1, le=4096)]
+    action_size: Annotated[int, Field(ge=1, le=64)]
+    policy_hidden: Annotated[PerhapsHidden, Field(min_length=1)]
+    value_hidden: PerhapsHidden
+    activation: Activation
+    output: Literal["clip", "tanh", "choice"]
+    choices: Annotated[int | None, Field(ge=2, le=4096, exclude_if=lambda choices: choices is None)] = None
+    networks: Annotated[int, Field(ge=1, le=16, exclude_if=lambda networks: networks == 1)] = 1
+    gate_hidden: Annotated[PerhapsHidden, Field(exclude_if=not_)] = ()
+    among: Annotated[tuple[NetworkSpec, ...], Field(max_length=16, exclude_if=not_)] = ()
+
+    @model_validator(mode="after")
+    def _a_gate_between_several(self) -> NetworkSpec:
+        if (self.networks > 1) != bool(self.gate_hidden):
+            raise ValueError(
+                f"networks = {self.networks} with gate_hidden = {list(self.gate_hidden)}; several need a gate"
+            )
+        if self.networks > 1 and self.value_hidden:
+            raise ValueError(f"value_hidden = {list(self.value_hidden)}: must be empty beside several networks")
+        if (self.output == "choice") != (self.choices is not None):
+            raise ValueError(
+                f"choices = {self.choices} with output {self.output}; output choice needs a number of them"
+            )
+        if self.choices is not None and (self.value_hidden or self.networks > 1 or self.action_size > 1):
+            raise ValueError("output choice is for one network without a critic, and one action")
+        for m, member in enumerate(self.among):
+            if self.choices is None or member.among:
+                raise ValueError("among: is for output choice, and its policies choose among no others")
+            if (member.observation_size, member.action_size) != (self.observation_size, self.action_size):
+                raise ValueError(f"among[{m}]: observes or acts in another size; must be the same in all")
+        return self
+
+    @property
+    def actors(self) -> tuple[str, ...]:
+        """How the tensors' names of each actor begin."""
+        return ("policy",) if self.networks == 1 else tuple(f"network_{m + 1}" for m in range(self.networks))
+
+    @property
+    def actions(self) -> Float32s:
+        """Those among which output ``choice`` chooses, [choices]."""
+        found: Float32s = np.linspace(-1.0, 1.0, self.choices or 0).astype(np.float32)
+        return found
+
+    @property
+    def format_version(self) -> Literal[2, 3, 4, 5]:
+        """Of a bundle with this network."""
+        if self.choices is not None:
+            return 5 if self.among else 4
+        return 2 if self.networks == 1 else 3
+
+    @property
+    def tensors(self) -> tuple[TensorRow, ...]:
+        """Every tensor of a bundle, all float32. Weights are [outputs, inputs] as in ``y = W x + b``."""
+        actors = [row for name in self.actors for row in self._network(name, self.policy_hidden, self._outputs)]
+        if self.networks > 1:
+            return (*actors, *self._network("gate", self.gate_hidden, self.networks))
+        if self.choices is not None:
+            among = (row.inside(f"among_{m}") for m, each in enumerate(self.among, 1) for row in each.tensors)
+            return (*actors, *among)
+        if self.output == "clip":
+            actors.append(TensorRow("policy.log_std", (self.action_size,)))
+        else:
+            actors += _layer("policy.log_std", self.policy_hidden[-1], self.action_size)
+        critic = self._network("value", self.value_hidden, 1) if self.value_hidden else []
+        return (*actors, *critic)
+
+    @property
+    def _outputs(self) -> int:
+        """Outputs of each actor: actions, or scores."""
+        return self.action_size if self.choices is None else len(self.among) + self.choices
+
+    def _network(self, name: str, hidden: tuple[int, ...], outputs: int) -> list[TensorRow]:
+        sizes = [self.observation_size, *hidden]
+        layers = [_layer(f"{name}.{k}", sizes[k], sizes[k + 1]) for k in range(len(hidden))]
+        return [*chain(*layers), *_layer(f"{name}.output", sizes[-1], outputs)]
+
+
+def _layer(name: str, inputs: int, outputs: int) -> list[TensorRow]:
+    return [TensorRow(f"{name}.weight", (outputs, inputs)), TensorRow(f"{name}.bias", (outputs,))]
+
+
+Float32s = NDArray[np.float32]

@@ -1,0 +1,166 @@
+"""A policy in memory: its manifest, its tensors, and the actions that it takes."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import safetensors.numpy
+from pydantic import ValidationError
+from safetensors import SafetensorError
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.arrays import ArrayRow, check_arrays, safetensors_headers
+from ethbrake_marl.files.model import first_mistake
+from ethbrake_marl.files.store import new_folder, write_file
+from ethbrake_marl.game.observations import ObservationSpec
+from ethbrake_marl.policies.actor import Actor
+from ethbrake_marl.policies.manifest import Manifest, ObservationSchema, content_sha256, installed_versions
+from ethbrake_marl.policies.network_spec import Float32s
+from ethbrake_marl.policies.onnx_model import onnx_model
+
+MANIFEST = "manifest.json"
+
+WEIGHTS = "weights.safetensors"
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy in memory: its manifest, its tensors, and ``policy(observation)`` for the deterministic action.
+
+    >>> import ethbrake_marl as eb
+    >>> import numpy as np
+    >>> policy = eb.load_shipped("ppo")
+    >>> policy.manifest.algorithm, policy.observation.size
+    ('ppo', 27)
+    >>> policy(np.zeros((2, 27), np.float32)).shape
+    (2, 1)
+
+    """
+
+    manifest: Manifest
+    tensors: Mapping[str, Float32s]
+
+    def __repr__(self) -> str:
+        told, scenario = self.manifest, self.manifest.scenario.get("name")
+        return (
+            f"Policy({told.algorithm!r}, {self.observation.size} observations, {told.steps:,} steps on"
+            f" {scenario!r:.66}, sha256 {told.manifest_sha256[:12]})"
+        )
+
+    @cached_property
+    def _actor(self) -> Actor:
+        return Actor(self.manifest.network, self.tensors)
+
+    def __call__(self, observation: Float32s) -> Float32s:
+        """Map observation [n, F] float32 to action [n, A] float32 in [-1, 1]; row k depends on row k alone."""
+        return self._actor(observation)
+
+    @cached_property
+    def observation(self) -> ObservationSpec:
+        """What to observe for this policy, at the time steps of the scenario that it was trained on.
+
+        Found from the names at first use, which takes as long as to act. Raises ``UnknownName``.
+        """
+        spec, step = self.manifest.observation.spec, self.manifest.scenario.get("time_step_s")
+        return spec.at_steps_of(float(step)) if isinstance(step, int | float) else spec
+
+    @property
+    def policy_sha256(self) -> str:
+        """The hash in its manifest."""
+        return self.manifest.manifest_sha256
+
+    @property
+    def steps(self) -> int:
+        """Decisions of learners after which it was taken."""
+        return self.manifest.steps
+
+    @property
+    def drivers(self) -> dict[str, Policy]:
+        """The policy that drives each of its learners."""
+        return dict.fromkeys(self.manifest.learners, self)
+
+    @classmethod
+    def make(
+        cls, tensors: Mapping[str, Float32s], *, observation: ObservationSpec | ObservationSchema, **manifest: Any
+    ) -> Self:
+        """A policy from ``tensors`` and the fields of ``Manifest`` (all but hashes and format, which follow).
+
+        ``versions`` are the installed ones where they are not given. Raises ``InvalidInput`` naming the tensor or field
+        that does not fit.
+        """
+        data = _serialise(tensors)
+        seen = observation if isinstance(observation, ObservationSchema) else ObservationSchema.of(observation)
+        given = {"versions": installed_versions(), **manifest, "format_version": manifest["network"].format_version}
+        try:
+            weights = hashlib.sha256(data).hexdigest()
+            draft = Manifest(**given, observation=seen, weights_sha256=weights, manifest_sha256="0" * 64)
+            own = content_sha256(draft.model_dump(mode="json"))
+            checked = draft.model_copy(update={"manifest_sha256": own})
+            return cls(checked, checked_tensors(data, checked))
+        except ValidationError as error:
+            raise InvalidInput(f"policy: {first_mistake(error)}") from None
+        except ValueError as error:
+            raise InvalidInput(f"policy: {error}") from None
+
+    @property
+    def among(self) -> tuple[Policy, ...]:
+        """The policies among which it chooses; most choose among none."""
+        follows = {"network", "observation", "format_version", "weights_sha256", "manifest_sha256"}
+        fields = self.manifest.model_dump(exclude=follows)
+        found = []
+        for k, network in enumerate(self.manifest.network.among, start=1):
+            start = f"among_{k}."
+            tensors = {name.removeprefix(start): each for name, each in self.tensors.items() if name.startswith(start)}
+            found.append(Policy.make(tensors, network=network, observation=self.manifest.observation, **fields))
+        return tuple(found)
+
+    @staticmethod
+    def stands_in(folder: Path) -> bool:
+        """Whether the files of a bundle stand in ``folder``; they are not read."""
+        return all((folder / name).is_file() for name in (MANIFEST, WEIGHTS))
+
+    def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
+        """Write it as the new folder ``folder``, completely or not at all; raises ``AlreadyExists``.
+
+        With ``replace`` a folder that is there goes once the new one is written.
+        """
+        own = content_sha256(self.manifest.model_dump(mode="json"))  # an older version may have written keys that go
+        manifest = self.manifest.model_copy(update={"manifest_sha256": own})
+        with new_folder(Path(folder), replace=replace) as partial:
+            write_file(partial / WEIGHTS, _serialise(self.tensors))
+            write_file(partial / MANIFEST, manifest.model_dump_json(indent=2).encode() + b"\n")
+
+    def to_onnx(self) -> bytes:
+        """The ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
+
+        The acceleration is the action times the own braking (below 0) or driving capacity (above 0), both read from the
+        observation. Results agree with ours within rounding, not to the bit: products are summed in another order.
+        Raises ``MissingExtra`` if the package onnx is not installed.
+        """
+        return onnx_model(self.manifest, self.observation, self.tensors)
+
+
+def _serialise(tensors: Mapping[str, Float32s]) -> bytes:
+    return safetensors.numpy.save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()})
+
+
+def checked_tensors(data: bytes, manifest: Manifest) -> dict[str, Float32s]:
+    """Check ``data`` against the tensor table, then read it; raises ``ValueError`` naming the tensor."""
+    rows = [ArrayRow(row.name, "F32", row.shape) for row in manifest.network.tensors]
+    check_arrays(safetensors_headers(data), rows, "tensor")
+    try:
+        tensors = safetensors.numpy.load(data)
+    except SafetensorError as error:
+        raise ValueError(f"not a safetensors file ({error})") from None
+    for name, tensor in tensors.items():
+        if not np.isfinite(tensor).all():
+            raise ValueError(f"tensor {name!r} holds a number that is not finite")
+        tensor.setflags(write=False)
+    return tensors

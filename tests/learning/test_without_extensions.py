@@ -1,0 +1,69 @@
+"""Training where no extension is installed: PPO and SAC, and a clear word for every other algorithm."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl import registry
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.training.experiment import RUN_REPORTS, run_experiment
+from ethbrake_marl.training.recipe import ALGORITHMS, algorithm_names, load_recipe
+from tests.learning.tiny import TINY_PPO
+
+TINY = TINY_PPO.replace(total_steps=256)
+
+
+@pytest.fixture(autouse=True)
+def core_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hide the entry points of the extensions, and what was loaded from them."""
+    every: Callable[[str], dict[str, list[registry.EntryPoint]]] = registry.points
+
+    def points(group: str) -> dict[str, list[registry.EntryPoint]]:
+        core = {
+            name: [each for each in found if ".extensions." not in each.value] for name, found in every(group).items()
+        }
+        return {name: found for name, found in core.items() if found}
+
+    monkeypatch.setattr(registry, "points", points)
+    for parts in (ALGORITHMS, RUN_REPORTS):
+        core = {name: part for name, part in parts.loaded.items() if name in points(parts.group)}
+        monkeypatch.setattr(parts, "loaded", core)
+
+
+def test_algorithm__of_an_absent_extension_is_refused_by_name() -> None:
+    assert algorithm_names() == ("ppo", "sac")
+    with pytest.raises(InvalidInput) as error:
+        load_recipe("counterfactual")
+    told = "counterfactual.yaml, line 10: algorithm = counterfactual: must be one of ppo, sac; the package or extension"
+    assert told in str(error.value)
+    with pytest.raises(InvalidInput, match=r"recipe 'ppo': algorithm = options: must be one of ppo, sac$"):
+        TINY.replace(algorithm="options")
+
+
+def test_algorithm__of_an_absent_extension_leaves_a_run_that_says_so(tmp_path: Path) -> None:
+    eb.train(TINY, "paper-random", tmp_path / "run", measure=None, on_progress=None)
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    config["recipe"]["algorithm"] = "counterfactual"
+    (tmp_path / "run" / "config.json").write_text(json.dumps(config))
+    with pytest.raises(InvalidInput, match=r"config.json: recipe: algorithm = counterfactual: must be one of ppo, sac"):
+        eb.resume(tmp_path / "run", on_progress=None)
+
+
+def test_run__without_a_report_trains_shields_evaluates_and_writes_results(tmp_path: Path) -> None:
+    result = run_experiment(eb.load_scenario("paper-random"), tmp_path / "run", recipe=TINY, episodes=20)
+    rows = json.loads((tmp_path / "run" / "results.json").read_text())
+    assert rows == result.results and [row["agent"] for row in rows][-2:] == ["trained policy", "hybrid"]
+    assert {path.name for path in (tmp_path / "run").iterdir()} >= {"policy", "results.csv", "per_world.csv"}
+    assert not {"report.html", "other_tests.json"} & {path.name for path in (tmp_path / "run").iterdir()}
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "finished"
+    assert len(result.tables) > 0 and result.notes == (f"results, with every measure: {tmp_path}/run/results.json",)
+
+
+def test_policy__of_several_networks_drives_without_the_algorithm_that_trained_it() -> None:
+    scenario = eb.load_scenario("paper-random")
+    result = eb.evaluate(agents="full_brake,universal@shipped", scenario=scenario, episodes=20)
+    braking, universal = (result.outcome(name).total_harm.mean() for name in result.outcomes)
+    assert universal < braking
