@@ -24,23 +24,19 @@ from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.shield.certify import plan_harm
 from ethbrake_marl.shield.running import begin_running
+from tests.extensions.certified.estimates import ABOVE, INSIDE, LISTS, WAYS, shielded
 from tests.programmes import Cases, Given, Told
 from tests.shield.attacks import (
-    ABOVE,
     ADVERSARIES,
-    INSIDE,
     LEAKS,
-    LISTS,
     TEAM_ADVERSARIES,
     TEAMS,
     TOLERANCE,
-    WAYS,
     Attack,
     above_later,
     attack,
     line,
     search,
-    shielded,
 )
 from tests.shield.plays import INSIDE as WRAPPED, PLAYS, WRAPPERS, Tally, disturbed, played, wrapped
 
@@ -118,7 +114,7 @@ def attacks(given: Given) -> Cases:
         one.append((f"bound: N = {N}, {count}, {name}", share, line(N), case))
         rates.append((f"build-up: N = {N}, {count}, {name}", share, line(N).replace(**RATES), case))
         if name != "worst_case":  # which looks for one world
-            unsure = {**case, "uncertainty": UNSURE}
+            unsure = {**case, "uncertain": (RobustShield, parse_uncertainty(UNSURE))}
             rates.append(
                 (f"build-up: {UNSURE}, N = {N}, {count}, {name}", 0.25 * share, line(N).replace(**RATES), unsure)
             )

@@ -16,8 +16,6 @@ import numpy as np
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive, script_agents
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.extensions.certified.robust_step import RobustShield
-from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.episode import CLOCK
 from ethbrake_marl.physics.state import Floats, Worlds
@@ -156,18 +154,19 @@ class Attack(NamedTuple):
 
 def attack(
     scenario: eb.Scenario, worlds: Worlds, adversary: Adversary, *, hostile="all", harm_count="first", allowance=0.0,
-    cap=None, uncertainty: str | None = None, leak: Leak | None = None, seed=0,
+    cap=None, leak: Leak | None = None, seed=0, uncertain: Any = None,
 ) -> Attack:  # fmt: skip
     """Let the hostile learners propose in every step: ``all``, or ``one``, another one from world to world.
 
     Who is not hostile proposes what the plan says, or brakes fully. A ``leak`` changes the shield before each decision.
-    With an uncertainty the worlds are what the shield is told, and the truth is a corner.
+    ``uncertain`` is a class of shields and an uncertainty: the worlds are what such a shield is told, and the truth is
+    a corner.
     """
     rng, learners = np.random.default_rng(seed), scenario.learners
-    intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
-    truth = worlds if intervals is None else intervals.draw(worlds, rng, corners=True)
-    engine, sound = plain_engine(scenario, truth), leak is None and intervals is None
-    shield = begun(scenario, worlds, harm_count=harm_count, allowance=allowance, cap=cap, uncertainty=intervals)
+    truth = worlds if uncertain is None else uncertain[1].draw(worlds, rng, corners=True)
+    engine, sound = plain_engine(scenario, truth), leak is None and uncertain is None
+    kind, settings = (StepShield, {}) if uncertain is None else (uncertain[0], {"uncertainty": uncertain[1]})
+    shield = begun(scenario, worlds, kind, harm_count=harm_count, allowance=allowance, cap=cap, **settings)
     first_bound, told, decision = shield.first_bound.copy(), shield.bound, None
     rows = np.arange(worlds.n)[:, np.newaxis]
     who, obeys = rows % len(learners) == np.arange(len(learners)), rows % 4 < 2
@@ -192,10 +191,9 @@ def attack(
     return Attack(realised, first_bound, shield.bound, accepted, rises, over, decisions)
 
 
-def begun(scenario: eb.Scenario, worlds: Worlds, **settings) -> StepShield:
+def begun(scenario: eb.Scenario, worlds: Worlds, kind: type[StepShield] = StepShield, **settings) -> StepShield:
     """A shield of all learners in its episodes."""
     learners = scenario.learners
-    kind = RobustShield if "uncertainty" in settings else StepShield
     shield = kind(scenario, learners[0] if len(learners) == 1 else learners, **settings)
     shield.begin(worlds, np.arange(worlds.n))
     return shield
@@ -373,37 +371,6 @@ LEAKS: dict[str, Leak] = {
     "gaps are believed 1 cm longer": gaps_blurred,
 }
 
-# ---------------------------------------------------------------- corners of what a vehicle does not know
-
-# Every quantity of another vehicle that is open is one of two numbers, so each world of the lists is a member of what
-# is certified at its first decision. None of the numbers are round: in a world of equal gaps and equal speeds two
-# impacts fall on one moment, and the last bit decides which of them is first.
-WAYS = ("coast", "drive", "chance")
-ABOVE = 1e-6  # m2/s2; what is told is moved on with rounding
-
-_BASE = eb.load_scenario("cooperation-2-paper").replace(early_impacts="keep")
-NEVER_HEARD = _BASE.replace(
-    gaps_m=[{"choice": [5.13, 9.71]}, {"choice": [5.37, 9.58]}],
-    speeds_mps=[{"choice": [18.23, 21.87]}, {"choice": [18.11, 21.93]}, {"choice": [18.41, 22.19]}],
-    v2x={"preset": "paper", "hears": "front"},
-    mass_t=[4.5, 5.5, {"choice": [3.0, 9.0]}],
-)
-HEARD_LATE = NEVER_HEARD.replace(  # a while after the first decision, by messages 0.6 to 0.9 s old
-    v2x={"preset": "paper", "link_latency_s": 0.6, "persistence": "periodic", "senses": "front", "sensing_s": [3, 3]},
-    latency_s=[0.0, 0.2, 0.6],
-)
-LISTS = {"never heard": NEVER_HEARD, "heard late": HEARD_LATE}
-_INSIDE = {
-    "gaps_m": [{"uniform": [5.13, 9.71]}, {"uniform": [5.37, 9.58]}],
-    "speeds_mps": [{"uniform": [18.23, 21.87]}, {"uniform": [18.11, 21.93]}, {"uniform": [18.41, 22.19]}],
-    "mass_t": [4.5, 5.5, {"uniform": [3.0, 9.0]}],
-}
-INSIDE = {  # the same ranges, and worlds from between the corners
-    **{name: scenario.replace(**_INSIDE) for name, scenario in LISTS.items()},
-    "blocked": NEVER_HEARD.replace(**_INSIDE, v2x={"preset": "blocked", "persistence": "periodic"}),
-    "sensors-only": NEVER_HEARD.replace(**_INSIDE, v2x="sensors-only"),
-}
-
 
 class Hostile:
     """Proposes what does harm: full driving, nothing at all, or chance."""
@@ -420,14 +387,3 @@ class Hostile:
         if self.name == "chance":
             return self.rng.uniform(low, high)
         return high.copy() if self.name == "drive" else np.zeros(worlds.n)
-
-
-def shielded(
-    way: str, scenario: eb.Scenario, n: int, seed: int, *, robust: str | None = "corners"
-) -> tuple[Floats, Floats, int]:
-    """Harm realised and first bound of ``n`` worlds [n] m2/s2, and how many proposals were replaced."""
-    mode = {"mode": "step"} if robust is None else {"mode": "robust", "robust": robust}
-    driver = ShieldedDriver(Hostile(way, seed), scenario, believed=True, **mode)
-    episodes = drive(scenario.sample(n, seed).worlds, driver, scenario, 1)
-    shield = episodes.guarded.shield
-    return episodes.ledger.world_harm("first"), shield.predicted_harm, int(shield.interventions.sum())

@@ -49,6 +49,12 @@ def test_list__has_no_variants() -> None:
     assert not [form for form in forms if "believed" in form or "robust" in form]
 
 
+@pytest.mark.parametrize("setting", [{"allowance": 5.0}, {"logging": True}, {"shares": True}], ids=str)
+def test_episode__takes_none_of_what_step_takes(setting: dict[str, object]) -> None:
+    with refused("mode episode takes none; step does"):
+        eb.ShieldOptions(mode="episode", **setting)
+
+
 REFUSED: dict[str, Callable[[], object]] = {
     "unknown shield mode 'robust'; known: episode, step": lambda: eb.shield(
         eb.EthBrakeVectorEnv(2), mode="robust", uncertainty="gaps_m=0.2"

@@ -12,7 +12,8 @@ from ethbrake_marl.extensions.certified.enclosure import Boxes
 from ethbrake_marl.extensions.certified.estimated_shield import BelievedShield
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
-from tests.shield.attacks import ABOVE, HEARD_LATE, INSIDE, LISTS, NEVER_HEARD, WAYS, all_infos, shielded
+from tests.extensions.certified.estimates import ABOVE, HEARD_LATE, INSIDE, LISTS, NEVER_HEARD, WAYS, shielded
+from tests.shield.attacks import all_infos
 from tests.shield.plays import reported
 
 BASE = eb.load_scenario("cooperation-2-paper").replace(early_impacts="keep")

@@ -8,6 +8,7 @@ import pytest
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.extensions.certified.options import checked_uncertainty
+from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.certify import plan_harm
@@ -141,7 +142,7 @@ def test_bound_at_the_alert__is_that_of_the_best_constant_in_the_worst_corner() 
         roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "full_brake"},
     )  # fmt: skip
     worlds, uncertainty = scenario.sample(1, 0).worlds, parse_uncertainty("gaps_m=3")
-    shield = begun(scenario, worlds, uncertainty=uncertainty)
+    shield = begun(scenario, worlds, RobustShield, uncertainty=uncertainty)
     alone = [begun(scenario, uncertainty.members(worlds).take([m])).first_bound[0] for m in range(5)]
     tried = [plan_harm(shield.running, np.full((1, 81), -a))[0] for a in np.linspace(0.0, 1.0, 41)]
     assert shield.running.members == 5
@@ -151,7 +152,7 @@ def test_bound_at_the_alert__is_that_of_the_best_constant_in_the_worst_corner() 
 
 
 def test_seen__counts_from_then_on() -> None:
-    shield = begun(STANDING, STANDING.sample(1, 0).worlds, uncertainty=OPEN)
+    shield = begun(STANDING, STANDING.sample(1, 0).worlds, RobustShield, uncertainty=OPEN)
     decision = shield.decide(np.zeros(1), seen=np.array([[0.0, 14.0, 5.0, 0.0]]))
     assert (ShieldReason(decision.reason[0]).text, decision.applied[0]) == ("assumption broken", -1.0)
     assert decision.bound[0] == pytest.approx(14.0**2 - 2 * 5 * 5)
