@@ -418,14 +418,14 @@ def around_one_vehicle() -> list[str]:
             if entry.inner is inner and not entry.teams]  # fmt: skip
 
 
-def shield_names() -> tuple[str, ...]:
-    """The names of all that goes around an agent; nothing is loaded."""
-    return tuple(_SHIELDS)
-
-
-def shield_settings(name: object) -> type | None:
+def shield_settings(name: object) -> Any:
     """The class of settings of a shield that also goes around environments; None for any other name."""
     return _SHIELDS[name].options if isinstance(name, str) and name in _SHIELDS else None
+
+
+def shield_modes() -> dict[str, Any]:
+    """Name -> class of settings of every shield that also goes around environments, and can be loaded."""
+    return {name: entry.options for name, entry in _SHIELDS.usable().items() if entry.options is not None}
 
 
 def variants_of(name: str) -> tuple[str, ...]:

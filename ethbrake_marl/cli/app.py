@@ -215,23 +215,22 @@ COMMANDS: Registry[Any] = Registry("command", "commands", add_command, dict.from
 
 
 class Installed(TyperCommand):
-    """A command of an extension or an installed package, which is loaded when it is called."""
+    """A command of an extension or an installed package, which is loaded when it is called.
 
-    def __init__(self, name: str) -> None:
-        givers = [giver(point) for point in points(COMMANDS.group)[name]]
+    ``entry``: the name of its entry point, ``NAME`` or ``GROUP.NAME``.
+    """
+
+    def __init__(self, entry: str) -> None:
+        givers = [giver(point) for point in points(COMMANDS.group)[entry]]
         packages = f"package{'s' if len(givers) > 1 else ''} {' and '.join(givers)}"
-        super().__init__(name, help=f"Of the installed {packages}.", rich_markup_mode=None)
-        self.is_ours = givers == [OURS]
+        super().__init__(entry.rpartition(".")[2], help=f"Of the installed {packages}.", rich_markup_mode=None)
+        self.entry, self.is_ours = entry, givers == [OURS]
 
     def command(self) -> Any:
-        """The command itself; of a group with those that other entry points add to it."""
-        found = COMMANDS[str(self.name)]
-        for name in points(COMMANDS.group):
-            group, _, own = name.partition(".")
-            if own and group == self.name:
-                found.commands[own] = COMMANDS[name]
-                found.commands[own].name = own
-        return found
+        """The command itself."""
+        found = COMMANDS[self.entry]
+        found.name = self.name
+        return with_installed(found, self.entry)
 
     def make_context(self, *given: Any, **settings: Any) -> Any:
         """The context of the command itself."""
@@ -240,6 +239,15 @@ class Installed(TyperCommand):
     def get_short_help_str(self, limit: int = 45) -> str:
         """One line for the list of commands; of another package it names the package, and loads nothing of it."""
         return str(self.command().get_short_help_str(limit) if self.is_ours else super().get_short_help_str(limit))
+
+
+def with_installed(group: Any, name: str) -> Any:
+    """The group with the commands that entry points ``NAME.COMMAND`` add to it."""
+    for entry in points(COMMANDS.group):
+        of, _, own = entry.rpartition(".")
+        if of == name:
+            group.commands[own] = Installed(entry)
+    return group
 
 
 def whole_command() -> Any:
@@ -253,6 +261,8 @@ def whole_command() -> Any:
         if name in names[:k]:
             raise AlreadyExists(f"command {name!r} is there already; give yours another name: app.command('my-{name}')")
     whole: Any = get_command(app)
+    for name in _OURS:
+        with_installed(whole.commands[name], name)
     installed = [name for name in points(COMMANDS.group) if "." not in name]
     whole.commands |= {name: COMMANDS.loaded.get(name) or Installed(name) for name in [*installed, *added]}
     return whole

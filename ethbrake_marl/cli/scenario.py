@@ -6,7 +6,7 @@ import textwrap
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
@@ -16,7 +16,6 @@ from ethbrake_marl.cli.pages import page_of
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.sheet import Sheet
-from ethbrake_marl.files.store import new_file
 from ethbrake_marl.files.yaml import flow_text
 
 TRIED_WORLDS = 200  # by `scenario validate`
@@ -284,48 +283,6 @@ def scenario_parts(as_json: JsonOption = False) -> None:
         out.result(
             parts, Sheet("", ("What", "Names"), [(what, ", ".join(names)) for what, names in parts.items()], gap=2)
         )
-
-
-@scenario_group.command(
-    "from-data", epilog=example("scenario from-data highd/data --format highd --output my-motorway.yaml")
-)
-def scenario_from_data(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the recordings.")],
-    format: Annotated[Literal["highd", "ngsim", "openacc"], typer.Option(help="Format of the recordings.")],
-    output: Annotated[
-        Path, typer.Option(metavar="FILE", help="The .yaml to write; its rows stand in the .csv beside.")
-    ],
-    based_on: Annotated[
-        str,
-        typer.Option(metavar="NAME|PATH", help="Scenario for what is not recorded, and for the number of vehicles."),
-    ] = "realistic-motorway",
-    every: Annotated[float, typer.Option(help="Seconds between two moments that become rows.")] = 1.0,
-    draw: Annotated[
-        Literal["rows", "normal", "lognormal", "quantiles"],
-        typer.Option(help="Draw whole rows, or each quantity from a fit to it."),
-    ] = "rows",
-    force: ForceOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Make a scenario of recorded traffic: highD, NGSIM, OpenACC.
-
-    Vehicles that follow each other in a lane become rows: speeds, and gaps from bumper to bumper.
-    """
-    with Out(as_json=as_json, force=force) as out:
-        rows = output.with_suffix(".csv")
-        out.check(output, ".yaml", what="the scenario")
-        out.check(rows)
-        text, table, told = scenarios.scenario_from_data(
-            output.stem, folder, format, based_on=based_on, every_s=every, draw=draw, progress=out.progress
-        )
-        with new_file(output) as partial:
-            partial.write_text(text, "utf-8")
-            if draw == "rows":
-                out.write(rows, table, what="rows")
-            else:  # those of before would be left behind, unnamed
-                rows.unlink(missing_ok=True)
-        out.note(f"written: {output}; try it: ethbrake scenario validate {output}")
-        out.result({"scenario": str(output), "rows": str(rows) if draw == "rows" else None, "found": told}, *told)
 
 
 @scenario_group.command("schema", epilog=example("scenario schema > scenario.schema.json"))

@@ -1,4 +1,4 @@
-"""What is looked at beside harm while episodes are driven: how far Vehicle 1 is shoved, and the paper's sum over
+"""Watches beside harm while episodes are driven: how far Vehicle 1 is shoved, and the paper's sum over
 samples.
 """
 

@@ -1,7 +1,7 @@
-"""What an evaluation says of each agent: measures, the sets they come in, and the set of the episode itself.
+"""Measures of an agent, the sets they come in, and the core's set, which is about the episode.
 
 A measure is a formula from what an agent did in every world to a value per world. Measures that need to know the same
-thing of the worlds form a set. The core has one set, about the episode. Extensions add sets by entry points of the
+thing of the worlds form a set. Extensions add sets by entry points of the
 group ``ethbrake_marl.measure_sets``: tables, JSON and files show the measures of every set that is installed.
 """
 

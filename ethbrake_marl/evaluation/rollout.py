@@ -58,8 +58,7 @@ def evaluate(
     """Let each agent drive every world once, from the alert to the episode's end.
 
     The other vehicles follow the scenario's scripts. A world's outcome depends neither on ``chunk`` nor on the other
-    worlds. A world that cannot be advanced (a defect of the physics) is left out for all agents, and named in
-    ``left_out``.
+    worlds. A world that cannot be advanced (a defect of the physics) is left out for all agents; ``left_out`` names it.
 
     Args:
         worlds: at the alert, or a sample of the scenario's list; None: draw the first ``episodes`` of ``seed``.
@@ -74,9 +73,8 @@ def evaluate(
         aftermath: also measure how far Vehicle 1 is shoved, the paper's sum over samples, and registered measures;
             takes longer.
 
-    Warns (``Unfamiliar``) of policies that drive beyond their training. Raises ``PhysicsError`` if no world is left;
-    ``InvalidInput`` for worlds that do not fit the scenario or are not at the alert, no agents, no controlled vehicle,
-    a team of other vehicles, or a learner that nobody drives.
+    Warns (``Unfamiliar``) of policies beyond their training. Raises ``PhysicsError`` if no world is left;
+    ``InvalidInput`` for worlds of another scenario or after the alert, and if agents and vehicles do not fit.
 
     """
     scenario = load_scenario(scenario)

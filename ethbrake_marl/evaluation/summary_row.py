@@ -1,4 +1,4 @@
-"""What one agent achieved over a list of worlds: the estimate of every measure, and whose they are."""
+"""One agent's row of results: the estimate of every measure over a list of worlds, and how it was computed."""
 
 from __future__ import annotations
 

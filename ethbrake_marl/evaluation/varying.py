@@ -1,4 +1,4 @@
-"""What differs between the worlds of a list: their initial states, and the quantities that are drawn."""
+"""Differences between the worlds of a list: their initial states, and the quantities that are drawn."""
 
 from __future__ import annotations
 

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from ethbrake_marl.doors import front_door
 
 if TYPE_CHECKING:
-    from ethbrake_marl.extensions.recorded.traffic import scenario_from_data as scenario_from_data
     from ethbrake_marl.files.yaml import parse_yaml as parse_yaml
     from ethbrake_marl.scenario.catalogue import (
         check_file_name as check_file_name,

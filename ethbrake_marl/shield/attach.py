@@ -14,7 +14,7 @@ from ethbrake_marl.errors import InvalidInput, check_one_learner
 from ethbrake_marl.game.observations import ObservationSpec
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.shield.contract import Guarded, ShieldGuard
-from ethbrake_marl.shield.options import ShieldOptions, read_options
+from ethbrake_marl.shield.options import ShieldOptions
 
 
 def proposing_agent(policy: object, where: str) -> Agent:
@@ -88,7 +88,7 @@ class Attached:
     def __init__(
         self, env: object, interface: type, maker: str, policy: Proposing | None, where: str, options: Mapping[str, Any]
     ) -> None:
-        self.options, self._env = read_options(where, options), env
+        self.options, self._env = ShieldOptions(**options, where=where), env
         engine = self._reached()
         if isinstance(engine, Engine) and isinstance(engine.guard, ShieldGuard):
             first = engine.guard

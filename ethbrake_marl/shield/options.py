@@ -12,7 +12,7 @@ from dataclasses import KW_ONLY, dataclass, field, fields
 from typing import Any, get_args
 
 from ethbrake_marl.agents.protocol import Agent, Source
-from ethbrake_marl.agents.registry import shield_names, shield_settings
+from ethbrake_marl.agents.registry import shield_modes, shield_settings
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, unknown_name
@@ -63,15 +63,18 @@ class ShieldOptions:
     where: str = field(default="shield", compare=False)
 
     def __new__(cls, mode: str | None = None, **settings: Any) -> ShieldOptions:
-        """Of the class that has these settings, as ``pathlib.Path`` makes the path of the system that it runs on."""
-        return object.__new__(_class_with(mode, settings) if cls is ShieldOptions else cls)
+        """Make one of the class that has these settings, as ``pathlib.Path`` makes a path of the system it runs on."""
+        if cls is ShieldOptions:
+            cls = _class_with("step" if mode is None else check_mode(mode), settings)
+        return object.__new__(cls)
 
     def __post_init__(self) -> None:
         mode, where = check_mode("step" if self.mode is None else self.mode), self.where
         self.check_switches("logging", "shares")
         if mode == "episode":
             for name in (name for name in ("allowance", "logging", "shares") if getattr(self, name)):
-                raise misplaced(name, getattr(self, name), mode, [each for each in _modes() if each != mode], where)
+                others = sorted((each for each in shield_modes() if each != mode), key=lambda each: each != "step")
+                raise misplaced(name, getattr(self, name), mode, others, where)
         elif self.bound != "coupled":
             raise misplaced("bound", self.bound, mode, ["episode"], where)
         caps = get_args(Cap)
@@ -138,7 +141,7 @@ class ShieldOptions:
 def check_mode(mode: object) -> str:
     """The name of a mode; raises ``UnknownName`` for anything else."""
     if shield_settings(mode) is None:
-        raise unknown_name("shield mode", mode, _modes())
+        raise unknown_name("shield mode", mode, shield_modes())
     return str(mode)
 
 
@@ -159,31 +162,23 @@ def one_learner(scenario: Scenario) -> int | None:
     return scenario.learners[0] if len(scenario.learners) == 1 else None
 
 
-def read_options(where: str, given: Mapping[str, Any]) -> ShieldOptions:
-    """The options of an interface's keywords. Raises ``UnknownName`` for a keyword that no mode has."""
-    if unfit := [name for name in given if name not in _names(_class_with(given.get("mode"), given))]:
-        known = {name for mode in _modes() for name in _names(shield_settings(mode))}
-        raise unknown_name(f"{where} option", next((name for name in unfit if name not in known), unfit[0]), known)
-    return ShieldOptions(**given, where=where)
+def _class_with(mode: str, settings: Mapping[str, Any]) -> type[ShieldOptions]:
+    """The class of settings of a mode, or else the first of another mode, that has all these settings.
 
-
-def _class_with(mode: str | None, settings: Mapping[str, Any]) -> type[ShieldOptions]:
-    """The class of settings of a mode, or the first other one that has all these settings."""
-    for name in ("step" if mode is None else mode, *_others()):
-        each = shield_settings(name)
-        if each is not None and {*settings} <= {*_names(each), "where"}:
+    Raises ``UnknownName`` for a setting that no mode has.
+    """
+    own: type[ShieldOptions] = shield_settings(mode)
+    if {*settings} <= _names(own):
+        return own
+    modes: dict[str, type[ShieldOptions]] = shield_modes()
+    for each in modes.values():
+        if {*settings} <= _names(each):
             return each
-    return ShieldOptions
+    known = {name for each in modes.values() for name in _names(each)} - {"where"}
+    unfit = [name for name in settings if name not in _names(own)]
+    wrong = next((name for name in unfit if name not in known), unfit[0])
+    raise unknown_name(f"{settings.get('where', 'shield')} option", wrong, known)
 
 
 def _names(options: Any) -> set[str]:
-    return {each.name for each in fields(options)} - {"where"}
-
-
-def _modes() -> list[str]:
-    """The modes of all shields that are installed or registered, the core's own first."""
-    return [name for name in ("episode", "step", *_others()) if shield_settings(name) is not None]
-
-
-def _others() -> list[str]:
-    return [name for name in shield_names() if name not in ("episode", "step")]
+    return {each.name for each in fields(options)}

@@ -53,7 +53,7 @@ def copy_core(folder: Path) -> Path:
     for name in ("ethbrake_marl/extensions", "tests/extensions"):
         shutil.rmtree(folder / name, ignore_errors=True)
     project = folder / "pyproject.toml"
-    text = re.sub(r'(?m)^["\w.]+ = "ethbrake_marl\.extensions\..*"\n', "", project.read_text("utf-8"))
+    text = re.sub(r'(?m)^["\w.-]+ = "ethbrake_marl\.extensions\..*"\n', "", project.read_text("utf-8"))
     project.write_text(text, "utf-8")
     write_metadata(folder, tomllib.loads(text)["project"])
     return folder

@@ -13,4 +13,5 @@ if TYPE_CHECKING:
     from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap as harm_against_total_gap
     from ethbrake_marl.extensions.report.style import write_picture as write_picture
 
-__getattr__ = front_door(__name__, __file__)
+else:
+    __getattr__ = front_door(__name__, __file__)

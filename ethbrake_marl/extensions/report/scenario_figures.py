@@ -44,7 +44,7 @@ _SHOWN = {0.0: "shortest line", 0.5: "median line", 1.0: "longest line"}  # by t
 
 
 def write_worlds(path: Path, scenario: Scenario, sample: Sample, *, seed: int, force: bool = False) -> None:
-    """The picture of ``ethbrake scenario worlds``; raises what ``write_picture`` raises."""
+    """The picture of ``ethbrake scenario sample``; raises what ``write_picture`` raises."""
     write_picture(path, worlds_figure(scenario, sample, seed=seed), force=force)
 
 
