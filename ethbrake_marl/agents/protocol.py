@@ -166,7 +166,7 @@ def policy_sha256(agent: object) -> str | None:
     has the hash of its weights.
     """
     ask = getattr(agent, "policy_sha256", None)
-    return ask() if callable(ask) else None
+    return None if ask is None else ask()
 
 
 class AgentAround(ByPolicy):

@@ -131,16 +131,16 @@ def compare_modes(
     cannot be advanced with one of them is left out for all, and named in ``left_out``.
 
     ``behind``: of what is behind a shield among these agents, and nothing where nobody has one. Agents whose shield
-    does not know the world (``+robust``) are left out then: their modes are another question.
+    does not know the world are left out then: their modes are another question.
 
     Raises ``InvalidInput`` where a shield refuses the scenario, ``PhysicsError`` where no world is left.
     """
     if behind:
-        shields = {name: agent.shield if isinstance(agent, Team) else agent for name, agent in agents.items()}
+        shields = [agent.shield if isinstance(agent, Team) else agent for agent in agents.values()]
         agents = {
             shield.policy.name: shield.policy
-            for name, shield in shields.items()
-            if isinstance(shield, HybridAgent) or (isinstance(shield, ShieldedDriver) and "+robust" not in name)
+            for shield in shields
+            if isinstance(shield, HybridAgent) or (isinstance(shield, ShieldedDriver) and shield.options.mode == "step")
         }
         if not agents:
             return ShieldModes()

@@ -71,7 +71,6 @@ class Policy:
         spec, step = self.manifest.observation.spec, self.manifest.scenario.get("time_step_s")
         return spec.at_steps_of(float(step)) if isinstance(step, int | float) else spec
 
-    @property
     def policy_sha256(self) -> str:
         """The hash in its manifest."""
         return self.manifest.manifest_sha256

@@ -324,8 +324,8 @@ def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[
 
     Args:
         name: 1 to 64 of ``a-z``, digits, ``-`` and ``_``.
-        recipe: the class of its recipes, made from ``learning.training.TrainingRecipe``; it checks the YAML file.
-        algorithm: the class of the algorithm, made from ``learning.training.Algorithm``; or ``"module:class"``, so
+        recipe: the class of its recipes, made from ``TrainingRecipe``; it checks the YAML file.
+        algorithm: the class of the algorithm, made from ``training.algorithm.Algorithm``; or ``"module:class"``, so
             that recipes are read without importing it, since torch takes seconds.
 
     Raises ``InvalidInput`` for a name that is taken or is no such name, or a class that lacks what is needed.
