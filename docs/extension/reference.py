@@ -11,7 +11,7 @@ from typing import Any
 from ethbrake_marl import ethbrake_v0
 from ethbrake_marl.agents.protocol import Source
 from ethbrake_marl.agents.registry import agent_entries
-from ethbrake_marl.cli.app import whole_command
+from ethbrake_marl.cli.app import Installed, whole_command
 from ethbrake_marl.evaluation.measures import measures
 from ethbrake_marl.game.features import Feature
 from ethbrake_marl.game.objectives import OBJECTIVES
@@ -65,6 +65,7 @@ def command_line() -> str:
 def _commands(group: Any, context: Any, level: int) -> Iterator[str]:
     for name in group.list_commands(context):
         command = group.commands[name]
+        command = command.command() if isinstance(command, Installed) else command
         inside = command.context_class(command, info_name=name, parent=context)
         path = inside.command_path.removeprefix("ethbrake ")
         yield f"{'#' * level} {path}\n"
