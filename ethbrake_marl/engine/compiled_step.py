@@ -13,11 +13,12 @@ import numpy as np
 from ethbrake_marl.game.actions import command_of
 from ethbrake_marl.game.rewards import RewardParams
 from ethbrake_marl.physics.columns import columns
-from ethbrake_marl.physics.episode import AT_HORIZON, AT_REST, GOES_ON, onset_s, step_end_s, step_episode
+from ethbrake_marl.physics.episode import onset_s, stands, step_end_s
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.motion import BOUND, command_acts
 from ethbrake_marl.physics.pieces import force_at
 from ethbrake_marl.physics.rows import FLAG, ROW, place_forces, place_obstacle, rows_for
+from ethbrake_marl.physics.segment import advance_table
 from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 # columns of clock
@@ -144,7 +145,7 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     P, obstacle = N - 1, column.obstacle
     worst, worst_status = -1, FLAG.DONE
     at = 1 if state.shape[1] > obstacle else 0  # vehicle i stands in column at + i, behind an obstacle
-    table = np.zeros((rows_for(pieces.shape[1]) if builds_up else ROW.OF_EPISODE, N + at))
+    table = np.zeros((rows_for(pieces.shape[1]) if builds_up else ROW.OF_SEGMENT, N + at))
     for k in range(n):
         if clock[k, ENDED] == 1.0:
             for f in range(OUTCOME_ROWS):
@@ -156,6 +157,7 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
             i = learners[c]
             wanted[k, i] = command_of(actions[k, c], params[k, braking + i], params[k, driving + i])
         clock[k, STEP] += 1.0
+        at_horizon = clock[k, STEP] >= clock[k, LAST_STEP]
         time = state[k, column.time]
         until = step_end_s(clock[k, STEP], clock[k, LAST_STEP], clock[k, START], settings[TIME_STEP], settings[HORIZON])
         if at == 1:
@@ -174,15 +176,13 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         for p in range(P):
             table[ROW.GAP, at + p] = state[k, gap + p]
             table[ROW.HIT, at + p] = state[k, gap + P + p]
-            table[ROW.SUM_FIRST_HARM, at + p] = state[k, harm + p]
-            table[ROW.SUM_TOTAL_HARM, at + p] = state[k, harm + P + p]
-        ends = step_episode(table, params[k, column.restitution], time, until, settings[HORIZON], no_rows)
+        status = advance_table(table, params[k, column.restitution], until - time, time, k, no_rows, 0)[1]
         outcome[FAILED, k] = 0.0
-        if ends < GOES_ON:
-            worst, worst_status = k, -ends
+        if status != FLAG.DONE:
+            worst, worst_status = k, status
             for f in range(OUTCOME_ROWS):
                 outcome[f, k] = 0.0
-            outcome[TRUNCATED, k], outcome[FAILED, k] = 1.0, worst_status
+            outcome[TRUNCATED, k], outcome[FAILED, k] = 1.0, status
             clock[k, ENDED] = 1.0
             clock[k, STEP] -= 1.0
             for i in range(N):
@@ -190,10 +190,14 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
                 reward[k, i] = 0.0
             continue
         state[k, column.time] = until
+        at_rest = True
         for i in range(N):
             state[k, speed + i] = table[ROW.SPEED, at + i]
-            if builds_up:
+            at_rest = at_rest and stands(table[ROW.SPEED, at + i], wanted[k, i])
+        if builds_up:
+            for i in range(N):
                 state[k, command + i] = force_at(table, at + i, wanted[k, i], params[k, latency + i], until)
+                at_rest = at_rest and state[k, command + i] <= 0.0
         impacts, first_harm, total_harm = 0.0, 0.0, 0.0
         if at == 1 and state[k, obstacle] < math.inf:
             state[k, obstacle] = table[ROW.GAP, 0]
@@ -207,18 +211,19 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         for p in range(P):
             state[k, gap + p] = table[ROW.GAP, at + p]
             state[k, gap + P + p] = table[ROW.HIT, at + p]
-            state[k, harm + p] = table[ROW.SUM_FIRST_HARM, at + p]
-            state[k, harm + P + p] = table[ROW.SUM_TOTAL_HARM, at + p]
+            state[k, harm + p] += table[ROW.FIRST_HARM, at + p]
+            state[k, harm + P + p] += table[ROW.TOTAL_HARM, at + p]
             state[k, harm + 2 * P + p] += table[ROW.COUNT, at + p]
             first_harm += table[ROW.FIRST_HARM, at + p]
             total_harm += table[ROW.TOTAL_HARM, at + p]
             impacts += state[k, harm + 2 * P + p]
         outcome[STEP_FIRST_HARM, k] = first_harm
         outcome[STEP_TOTAL_HARM, k] = total_harm
-        clock[k, ENDED] = 1.0 if ends != GOES_ON else 0.0
-        outcome[TERMINATED, k] = 1.0 if ends == AT_REST else 0.0
-        outcome[TRUNCATED, k] = 1.0 if ends == AT_HORIZON else 0.0
-        outcome[SAFE_END, k] = 1.0 if ends != GOES_ON and impacts == 0.0 else 0.0
+        over = at_rest or at_horizon
+        clock[k, ENDED] = 1.0 if over else 0.0
+        outcome[TERMINATED, k] = 1.0 if at_rest else 0.0
+        outcome[TRUNCATED, k] = 1.0 if over and not at_rest else 0.0
+        outcome[SAFE_END, k] = 1.0 if over and impacts == 0.0 else 0.0
         shared = settings[TERMINAL_WEIGHT] if outcome[SAFE_END, k] == 1.0 else 0.0
         shared -= settings[HARM_WEIGHT] * (total_harm if settings[HARM_IS_TOTAL] == 1.0 else first_harm)
         for i in range(N):
