@@ -313,7 +313,8 @@ class Engine:
         if not self._alike and len({self.observations[i] for i in vehicles.tolist()}) > 1:
             names = ", ".join(self.scenario.vehicle_names[i] for i in vehicles.tolist())
             raise InvalidInput(f"observe_all: {names} observe different features; use observe for each")
-        motion, params, clock, *_ = self._now.state
+        state = self._now.state
+        motion, params, clock = state.motion, state.params, state.clock
         plan: Plan = self._plans[0 if self._alike else int(vehicles[0])]
         if rows is not None:
             motion, params = motion.take(rows, axis=0), params.take(rows, axis=0)
@@ -436,9 +437,10 @@ class Engine:
         """Advance every running episode by one time step, in the arrays that are there."""
         asked = self._ask_scripts()
         harm_before = self._terms.objective_harm(self.state) if self._terms.by_objective else None
-        step = self._move(columns)
-        self._change(memories=self.memories | asked)
-        if step.outcome[FAILED].any():
+        step, some_failed = self._move(columns)
+        if asked:
+            self._change(memories=self.memories | asked)
+        if some_failed:
             times = self.state.motion[:, 0]
             self.roster.mark(step.failed, times, np.minimum(times + self.scenario.time_step_s, self.scenario.horizon_s))
         if self._terms.add_something:
@@ -461,22 +463,25 @@ class Engine:
                 wanted[:, vehicle] = within_capacity(command, worlds, vehicle, script)
         return asked
 
-    def _move(self, columns: Floats) -> Step:
-        """Move the worlds under the actions [n, L], and hear what messages bring."""
-        self._now = self._now._replace(stops=())
+    def _move(self, columns: Floats) -> tuple[Step, bool]:
+        """Move the worlds under the actions [n, L], and hear what messages bring. Also: whether a world failed."""
+        if self._now.stops:
+            self._now = self._now._replace(stops=())
         way = self._start_on_own_grid(columns) if self._on_own_grid else None
         state = self.state
         was = state.motion.copy() if state.packed.has_messages else None
         reward, outcome = np.empty(state.wanted.shape), np.empty((OUTCOME_ROWS, self.n))
-        if self._step_worlds(columns, reward, outcome) == BAD_ACTION:  # nothing was moved
-            self._step_worlds(self._in_range(columns), reward, outcome)
+        status = self._step_worlds(columns, reward, outcome)
+        if status == BAD_ACTION:  # nothing was moved
+            status = self._step_worlds(self._in_range(columns), reward, outcome)
         if was is not None:
             hear_rows(
                 was, state.params, state.wanted, state.time_s, state.time_s, self.scenario.time_step_s, self._now.pieces
             )
         if way is not None:
             self._add_way(way, reward, outcome)
-        return Step(reward, outcome, self.reward, {})
+        some_failed = status != FLAG.DONE or (way is not None and bool(way.failed.any()))
+        return Step(reward, outcome, self.reward, {}), some_failed
 
     def _columns(self, actions: Actions) -> Floats:
         """The learners' actions as [n, L]; their range is checked where they are used."""
@@ -502,10 +507,10 @@ class Engine:
 
     def _step_worlds(self, columns: Floats, reward: Floats, outcome: Floats) -> int:
         """The compiled step, in place. Returns a status."""
-        motion, params, clock, wanted, *_ = self.state
+        now, state = self._now, self._now.state
         _, status = step_worlds(
-            motion, params, clock, columns, self._learner_index, self._settings, NO_ROWS, self._now.builds_up,
-            self._now.pieces, wanted, reward, outcome,
+            state.motion, state.params, state.clock, columns, self._learner_index, self._settings, NO_ROWS,
+            now.builds_up, now.pieces, state.wanted, reward, outcome,
         )  # fmt: skip
         return status
 

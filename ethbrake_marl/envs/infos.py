@@ -77,14 +77,15 @@ class Report(NamedTuple):
     @classmethod
     def of(cls, engine: Engine, step: Step | None = None, rows: Ints | None = None) -> Report:
         """The engine's worlds as they are now, before any of them is renewed; only the worlds ``rows`` if given."""
-        (state, params), wanted, world = engine.packed, engine.wanted_mps2, engine.roster.numbers
+        now, world = engine.state, engine.roster.numbers
+        motion, params, wanted = now.motion, now.params, now.wanted
         if rows is not None:
-            state, params, wanted = (array.take(rows, axis=0) for array in (state, params, wanted))
+            motion, params, wanted = (array.take(rows, axis=0) for array in (motion, params, wanted))
             world = world.take(rows)
         values = np.empty((*wanted.shape, len(COLUMNS)))
-        _report_rows(state, params, wanted, values)
+        _report_rows(motion, params, wanted, values)
         N = wanted.shape[1]
-        shown = Packed(state, params)
+        shown = Packed(motion, params)
         known = shown.known_from_s if shown.has_news else None
         cost = np.zeros(len(world))
         terms = dict.fromkeys(engine.reward_terms, cost)
@@ -94,7 +95,7 @@ class Report(NamedTuple):
             cost = step.counted_harm
             if rows is not None:
                 cost, terms = cost.take(rows), {name: term.take(rows, axis=0) for name, term in terms.items()}
-        time_s, messages = state[:, shown.column.time], params[:, shown.column.messages :]
+        time_s, messages = motion[:, shown.column.time], params[:, shown.column.messages :]
         age = Messages(messages, N).age_s(time_s) if shown.has_messages else None
         return cls(values, cost, terms, engine.roster.seed, world, known, age, shield_columns(engine, rows))
 
