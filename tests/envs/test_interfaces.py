@@ -26,11 +26,13 @@ from ethbrake_marl.envs.pettingzoo import env, parallel_env
 from ethbrake_marl.envs.registration import GYMNASIUM_ID, PETTINGZOO_ID, register_environments
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.learners.branches import play_to_the_end
 from ethbrake_marl.game.features import Feature
 from ethbrake_marl.scenario.observed import full_state, state_features
 from tests.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial_state, line
 from tests.engine.test_engine import act, no_offsets
+from tests.fixtures.extensions import of
+
+play_to_the_end = of("learners.branches", "play_to_the_end")
 
 near = pytest.approx
 ROOT = Path(__file__).resolve().parents[2]

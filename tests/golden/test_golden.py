@@ -13,15 +13,17 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.evaluation.identity import worlds_sha256
-from ethbrake_marl.extensions.certified.robust_step import RobustShield
-from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.game.harm import empty_ledger
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 from ethbrake_marl.shield.step import StepShield
+from tests.fixtures.extensions import of
 from tests.physics.random_worlds import Draws, driving_lines
 from tests.shield.attacks import line
+
+RobustShield = of("certified.robust_step", "RobustShield")
+parse_uncertainty = of("certified.uncertainty", "parse_uncertainty")
 
 GOLDEN = Path(__file__).with_name("physics_worlds.json")
 LINES = {  # by name: vehicles and worlds

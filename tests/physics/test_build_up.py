@@ -15,8 +15,6 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
-from ethbrake_marl.extensions.search.regret import limits_of
 from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.motion import stopping_distances
@@ -27,8 +25,12 @@ from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.tables import worlds_from_table
 from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield.drivers import ShieldedDriver
+from tests.fixtures.extensions import of
 from tests.physics.random_worlds import Draws, line
 from tests.reference.small_steps import run
+
+parse_uncertainty = of("certified.uncertainty", "parse_uncertainty")
+limits_of = of("search.regret", "limits_of")
 
 SWITCHES_S = (0.0, 0.75, 1.5, 6.0)
 

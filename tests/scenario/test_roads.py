@@ -13,14 +13,16 @@ from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.evaluation.varying import states_of
-from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
-from ethbrake_marl.extensions.search.limits import prove
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.ranges import ranges
 from ethbrake_marl.scenario.sampling import middle_world
 from ethbrake_marl.scenario.tables import worlds_from_state, worlds_from_table
 from ethbrake_marl.scenario.task import Task
+from tests.fixtures.extensions import of
 from tests.refused import refused
+
+parse_uncertainty = of("certified.uncertainty", "parse_uncertainty")
+prove = of("search.limits", "prove")
 
 PAPER = eb.load_scenario("paper-random")
 FIXED = PAPER.replace(gaps_m=40, speeds_mps=20, latency_s=0, early_impacts="keep", horizon_s=30)

@@ -15,13 +15,15 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.evaluation.identity import worlds_sha256
-from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.physics.state import Vehicles
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.channel import PRESETS
 from ethbrake_marl.scenario.distributions import Choice, LogUniform, Normal, Uniform, support, values
 from ethbrake_marl.scenario.fields import BLOCK, QUANTITY
 from ethbrake_marl.shield.drivers import ShieldedDriver
+from tests.fixtures.extensions import of
+
+parse_uncertainty = of("certified.uncertainty", "parse_uncertainty")
 
 near = pytest.approx
 PAPER = eb.load_scenario("paper-random")

@@ -9,7 +9,6 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.engine.profiles import profile_problem
-from ethbrake_marl.extensions.search.around import Searched
 from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield import episodes as episodes_module
 from ethbrake_marl.shield.certify import Backup, certify, plan_harm
@@ -23,8 +22,11 @@ from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts
 from ethbrake_marl.shield.running import begin_running
 from ethbrake_marl.shield.step import StepShield
 from tests.fixtures.asked import Acts
+from tests.fixtures.extensions import of
 from tests.shield.attacks import ADVERSARIES, LEAKS, TEAM_ADVERSARIES, TEAMS, all_infos, attack, begun, line, search
 from tests.shield.plays import reported
+
+Searched = of("search.around", "Searched")
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::RuntimeWarning",  # uncompiled, a division by 0 warns
