@@ -20,13 +20,14 @@ from ethbrake_marl.extensions.certified.estimating_agents import Odometer
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.game.actions import action_to_command, command_to_action
 from ethbrake_marl.physics.columns import Packed
-from ethbrake_marl.physics.messages import CHANNEL, LINK, Messages, link_at, place_at, ring_at
-from ethbrake_marl.physics.state import Bools, Floats
+from ethbrake_marl.physics.messages import Messages
+from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.scenario.channel import PRESETS
 from ethbrake_marl.shield.comparison import seen_columns
 from ethbrake_marl.shield.drivers import ShieldedDriver
 from ethbrake_marl.shield.rollouts import Proposer, proposed_action
 from tests.fixtures.asked import Acts
+from tests.fixtures.knowledge import alter_unreceived
 from tests.fixtures.policies import make_policy
 
 
@@ -95,76 +96,6 @@ class Hosted:
                 proposed, seen=seen_columns(Packed.of(worlds))[:, : 3 * worlds.N - 2], proposer=proposer
             ).applied
         return action_to_command(applied, worlds.vehicles, vehicle), (memory[0], policy)
-
-
-def alter_unreceived(worlds: eb.Worlds, vehicle: int, rng: np.random.Generator) -> eb.Worlds:
-    """The same worlds with random numbers for all that has not reached ``vehicle`` by now, the future included."""
-    vehicles, now = worlds.vehicles, worlds.time_s[:, np.newaxis]
-    n, N = worlds.speeds_mps.shape
-    unknown = vehicles.known_from_s[:, vehicle] > now
-    unknown[:, vehicle] = False  # of itself it knows
-    stale = unknown.copy()  # whose present it does not know
-    if Messages.of(worlds).periodic.all():
-        stale |= Messages.of(worlds).age_s(worlds.time_s)[:, vehicle] > 0.0
-    far = np.array([pair if pair < vehicle else pair + 1 for pair in range(N - 1)])  # of each pair, seen from here
-
-    def other(values: Floats, low: float, high: float, where: Bools) -> Floats:
-        return np.where(where, rng.uniform(low, high, values.shape), values)
-
-    own = vehicles.own_latency_s
-    waits = (vehicles.latency_s > now) & ((vehicles.latency_s > own) | (np.arange(N) == vehicle))  # for its own news
-    latency = np.where(waits, np.maximum(own, now) + rng.uniform(0.01, 1.0, (n, N)), vehicles.latency_s)
-    latency = np.where(unknown, rng.uniform(0.0, 2.0, (n, N)), latency)
-    news = vehicles.known_from_s
-    heard = np.zeros(news.shape, np.bool_)  # by this vehicle: what others have heard it is not told
-    heard[:, vehicle] = ~unknown
-    changed = replace(
-        vehicles,
-        braking_capacity_mps2=other(vehicles.braking_capacity_mps2, 3.0, 9.0, unknown),
-        driving_capacity_mps2=other(vehicles.driving_capacity_mps2, 0.0, 9.0, unknown),
-        mass_t=other(vehicles.mass_t, 1.0, 40.0, unknown),
-        speed_limit_mps=other(vehicles.speed_limit_mps, 30.0, 60.0, unknown),
-        latency_s=latency,
-        own_latency_s=other(own, 0.0, 2.0, unknown),
-        known_from_s=np.where(heard | np.eye(N, dtype=np.bool_), news, _altered_news(now, news.shape, vehicle, rng)),
-    )
-    hit = stale[:, far]
-    beside = [pair for pair in (vehicle - 1, vehicle) if 0 <= pair < N - 1]
-    hit[:, beside] &= unknown[:, far[beside]]  # an own impact with somebody who is known is felt
-    gaps = other(worlds.gaps_m, 2.0, 15.0, stale[:, far])
-    return replace(
-        worlds,
-        vehicles=changed,
-        messages=_alter_messages(worlds, vehicle, rng),
-        gaps_m=gaps,
-        obstacle_gap_m=other(worlds.obstacle_gap_m, 5.0, 80.0, unknown[:, 0] & np.isfinite(worlds.obstacle_gap_m)),
-        speeds_mps=other(worlds.speeds_mps, 5.0, 30.0, stale),
-        command_mps2=other(worlds.command_mps2, -6.0, 6.0, stale),
-        pair_hit=worlds.pair_hit ^ (hit & (now > 0.0)),  # at the alert nobody has hit anything
-    )
-
-
-def _altered_news(now: Floats, shape: tuple[int, ...], vehicle: int, rng: np.random.Generator) -> Floats:
-    """When who is known of by whom, [n, N, N] s; often never. Of what this vehicle waits for, not before now."""
-    since = np.zeros((len(now), shape[1], 1))
-    since[:, vehicle] = now
-    return np.where(rng.random(shape) < 0.25, np.inf, since + rng.uniform(0.01, 2.0, shape))
-
-
-def _alter_messages(worlds: eb.Worlds, vehicle: int, rng: np.random.Generator) -> Floats:
-    """The columns of messages with all altered that is unheard: chance, what is on its way, what others know."""
-    columns, N = worlds.messages.copy(), worlds.N
-    if not columns.shape[1]:
-        return columns
-    kept = Messages.of(worlds).links[:, vehicle].copy()
-    own = columns[:, place_at(N) + vehicle].copy()
-    columns[:, [CHANNEL.KEY, CHANNEL.TAKEN]] += 5.0
-    columns[:, place_at(N) :] += rng.uniform(0.5, 3.0, columns[:, place_at(N) :].shape)
-    links = columns[:, link_at(0, 0, N) : ring_at(N)].reshape(-1, N, N, LINK.WIDTH)
-    heard = (worlds.vehicles.known_from_s[:, vehicle] <= worlds.time_s[:, np.newaxis])[..., np.newaxis]
-    links[:, vehicle] = np.where(heard & (np.arange(LINK.WIDTH) >= LINK.TOLD_S), kept, links[:, vehicle])
-    columns[:, place_at(N) + vehicle] = own
-    return columns
 
 
 PAPER = eb.load_scenario("paper-random")

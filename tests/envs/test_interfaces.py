@@ -21,7 +21,7 @@ import ethbrake_marl as eb
 from ethbrake_marl import ethbrake_v0
 from ethbrake_marl.engine.stream import Stream
 from ethbrake_marl.envs.gymnasium import EthBrakeEnv
-from ethbrake_marl.envs.making import IgnoredAction, action_box, feature_box, make_engine
+from ethbrake_marl.envs.making import IgnoredAction, action_box, feature_box
 from ethbrake_marl.envs.pettingzoo import env, parallel_env
 from ethbrake_marl.envs.registration import GYMNASIUM_ID, PETTINGZOO_ID, register_environments
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
@@ -29,10 +29,6 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.features import Feature
 from ethbrake_marl.scenario.observed import full_state, state_features
 from tests.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial_state, line
-from tests.engine.test_engine import act, no_offsets
-from tests.fixtures.extensions import of
-
-play_to_the_end = of("learners.branches", "play_to_the_end")
 
 near = pytest.approx
 ROOT = Path(__file__).resolve().parents[2]
@@ -709,16 +705,6 @@ def test_shares_of_the_steps__add_up_to_those_of_the_episode() -> None:
     for count, share in shares.items():
         assert np.allclose(share, engine.ledger.since(begun).vehicle_harm(count))
     assert np.allclose(cost, shares["first"].sum(axis=1))
-
-
-def test_branch__tells_nothing_of_a_row_that_cannot_be_advanced() -> None:
-    engine = make_engine("paper-random", 3, seed=3)
-    moment = engine.moment()
-    moment.motion[1, -1 - 5] = np.nan
-    new = engine.branch(moment)
-    new.roster.failed[1] = "a contact was missed"
-    gained, _ = play_to_the_end(new, act, no_offsets(3), 1.0)
-    assert np.isnan(gained).tolist() == [False, True, False]
 
 
 def test_stream__gives_every_world_of_its_list_once_and_in_order() -> None:

@@ -19,7 +19,7 @@ from ethbrake_marl.physics.messages import CHANNEL, Messages, chance
 from ethbrake_marl.scenario.channel import CHANNELS, PER_LINK, PRESETS, V2X, Channel, Equipage, Equipped, burst_periods
 from ethbrake_marl.scenario.observed import full_state, state_features
 from ethbrake_marl.scenario.tables import worlds_from_state
-from tests.agents.test_knowledge import alter_unreceived
+from tests.fixtures.knowledge import alter_unreceived
 
 PAPER = eb.load_scenario("paper-random")
 
