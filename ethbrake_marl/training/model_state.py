@@ -159,7 +159,8 @@ def _try_step(optimizer: torch.optim.Optimizer) -> None:
 def check_counter(name: str, value: object, kind: type) -> None:
     """Raise ``ValueError`` unless the value is of this type, and at least 0 if it is a whole number."""
     if type(value) is not kind or (kind is int and not 0 <= value < 1 << 53):  # type: ignore[operator]  # an int
-        raise ValueError(f"{name} = {value!r:.60}: must be of type {kind.__name__}, and a whole number at least 0")
+        right = "a whole number, at least 0" if kind is int else f"of type {kind.__name__}"
+        raise ValueError(f"{name} = {value!r:.60}: must be {right}")
 
 
 def _like(model: NDArray[Any], arrays: Arrays, name: str) -> NDArray[Any]:
