@@ -47,7 +47,7 @@ if TYPE_CHECKING:
         ObservationSpec as ObservationSpec,
         choose_observation as choose_observation,
     )
-    from ethbrake_marl.scenario.observed import observation_for as observation_for
+    from ethbrake_marl.game.observed import observation_for as observation_for
     from ethbrake_marl.game.rewards import RewardParams as RewardParams
 
     # Agents, teams and policies

@@ -21,7 +21,7 @@ from ethbrake_marl.policies.shipped import load_shipped, shipped_policies
 from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 from ethbrake_marl.scenario.channel import CHANNELS, V2X
 from ethbrake_marl.scenario.fields import QUANTITY
-from ethbrake_marl.scenario.observed import state_features
+from ethbrake_marl.game.observed import state_features
 from ethbrake_marl.scenario.schema import Scenario, scenario_json_schema
 from ethbrake_marl.training.recipe import TrainingRecipe
 

@@ -50,8 +50,8 @@ from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.physics.messages import hear_rows
 from ethbrake_marl.physics.rows import FLAG
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
-from ethbrake_marl.scenario.observed import common_observation, observations_of
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.game.observed import common_observation, observations_of
+from ethbrake_marl.game.definition import Game
 
 SNAPSHOT = ("state", "params", "clock", "wanted", "potential")  # names of the arrays of a state in a snapshot
 
@@ -168,7 +168,7 @@ class Engine:
 
     def __init__(
         self,
-        scenario: Scenario,
+        scenario: Game,
         n: int,
         *,
         learners: Sequence[int],

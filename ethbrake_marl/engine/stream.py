@@ -20,7 +20,7 @@ from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.physics.left_out import Impacts, leaving_out_failed
 from ethbrake_marl.physics.rows import FLAG, LISTED
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.game.definition import Game
 
 
 class Start(NamedTuple):
@@ -89,7 +89,7 @@ class Stream:
     Learners and scripts with a memory coast until then: whoever uses them moves their worlds anew (``moved``).
     """
 
-    def __init__(self, scenario: Scenario, deciders: Sequence[int], scripts: Mapping[int, Script], seed: int) -> None:
+    def __init__(self, scenario: Game, deciders: Sequence[int], scripts: Mapping[int, Script], seed: int) -> None:
         self._scenario = scenario
         self._deciders = list(deciders)
         self._state_free = {i: script for i, script in scripts.items() if is_state_free(script)}

@@ -11,7 +11,7 @@ from ethbrake_marl.engine.state import State
 from ethbrake_marl.game.objectives import objective_harm
 from ethbrake_marl.game.rewards import Reward, StepOutcome, reward_params
 from ethbrake_marl.physics.state import Floats, Worlds
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.game.definition import Game
 
 
 class Terms:
@@ -24,7 +24,7 @@ class Terms:
 
     """
 
-    def __init__(self, reward: Reward, scenario: Scenario, learners: Sequence[int]) -> None:
+    def __init__(self, reward: Reward, scenario: Game, learners: Sequence[int]) -> None:
         self.params, self._objectives = reward_params(reward).settled(scenario.objective, scenario.vehicles)
         self._learners, self._learner_index = tuple(learners), np.array(learners, np.int64)
         self._moving, self._own = self.params.moving, self.params.registered
@@ -41,7 +41,7 @@ class Terms:
         """What the objective of each vehicle makes of the harm so far, [n, N]; only where there are objectives."""
         return objective_harm(state.ledger, self.params.harm_count, self._objectives)
 
-    def add(self, step: Step, state: State, scenario: Scenario, before: Floats | None, worlds: Worlds | None) -> State:
+    def add(self, step: Step, state: State, scenario: Game, before: Floats | None, worlds: Worlds | None) -> State:
         """Add what a step has brought to its reward; nothing for rows that stood still. Returns the state after it.
 
         ``before`` is ``objective_harm`` before the step, None without objectives; ``worlds`` are those of the state
@@ -82,7 +82,7 @@ class Terms:
         step.reward[:] += extra
         return state
 
-    def potentials(self, worlds: Worlds, scenario: Scenario) -> Floats:
+    def potentials(self, worlds: Worlds, scenario: Game) -> Floats:
         """Potential of every learner, 0 for other vehicles, [n, N]."""
         potentials = np.zeros(worlds.speeds_mps.shape)
         shared = self.params.potential(worlds, self._learners, scenario.horizon_s)

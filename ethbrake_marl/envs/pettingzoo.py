@@ -23,7 +23,7 @@ from ethbrake_marl.game.actions import checked_action
 from ethbrake_marl.game.observations import Observation, Observations
 from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.state import Ints
-from ethbrake_marl.scenario.observed import full_state, state_features
+from ethbrake_marl.game.observed import full_state, state_features
 
 
 class SeededInside:

@@ -31,7 +31,7 @@ from ethbrake_marl.game.observations import Observation, Observations
 from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.state import Bools, Ints, Worlds
-from ethbrake_marl.scenario.observed import Appended, full_state, row_features
+from ethbrake_marl.game.observed import Appended, full_state, row_features
 from ethbrake_marl.scenario.tables import worlds_from_state
 
 Rewards = NDArray[np.float32]

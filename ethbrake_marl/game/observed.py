@@ -12,10 +12,10 @@ from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.game.features import GROUPS, Feature
 from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec, choose_observation, observe
 from ethbrake_marl.physics.state import Vehicles, Worlds
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.game.definition import Game
 
 
-def observation_for(scenario: Scenario, vehicle: str | None = None) -> ObservationSpec:
+def observation_for(scenario: Game, vehicle: str | None = None) -> ObservationSpec:
     """What a vehicle, or any learner, observes in this scenario unless somebody says otherwise: what it declares.
 
     Where it declares nothing: one neighbour on each side; where Vehicle 1 has an obstacle ahead, also the own place in
@@ -29,7 +29,7 @@ def observation_for(scenario: Scenario, vehicle: str | None = None) -> Observati
     return observations[scenario.vehicle_names.index(vehicle)]
 
 
-def observations_of(scenario: Scenario, given: Observation | None = None) -> tuple[ObservationSpec, ...]:
+def observations_of(scenario: Game, given: Observation | None = None) -> tuple[ObservationSpec, ...]:
     """What each vehicle observes, front to rear, [N]: what is given, or else what the scenario declares.
 
     Both say it of all vehicles, or by name of some: ``{"vehicle_2": ["own", "front_1"]}``. Raises ``UnknownName`` for a
@@ -52,7 +52,7 @@ def observations_of(scenario: Scenario, given: Observation | None = None) -> tup
     return tuple(each.values())
 
 
-def common_observation(observations: tuple[ObservationSpec, ...], scenario: Scenario) -> ObservationSpec:
+def common_observation(observations: tuple[ObservationSpec, ...], scenario: Game) -> ObservationSpec:
     """What all learners observe, of what each vehicle does; of all vehicles where nobody learns.
 
     Raises ``InvalidInput`` naming two that observe different features.
@@ -89,7 +89,7 @@ _OBSTACLE_FEATURES = tuple(
 _PAIR_FEATURES = tuple(replace(f, meaning=_PAIR_MEANING[f.name]) for f in GROUPS.neighbour if f.name in _PAIR_MEANING)
 
 
-def state_features(scenario: Scenario) -> tuple[Feature, ...]:
+def state_features(scenario: Game) -> tuple[Feature, ...]:
     """Every number of the state in order: each vehicle's own features, each pair's gap and hit flag, the time.
 
     Where there is an obstacle ahead of Vehicle 1, its gap and hit flag follow.
@@ -101,7 +101,7 @@ def state_features(scenario: Scenario) -> tuple[Feature, ...]:
     return (*vehicles, *pairs, time, *obstacle)
 
 
-def full_state(worlds: Worlds, scenario: Scenario) -> Observations:
+def full_state(worlds: Worlds, scenario: Game) -> Observations:
     """State of every world, [n, S] float32 in its own memory; S = 7 N + 2 P + 1, and 2 more with an obstacle ahead."""
     latency = worlds.vehicles.latency_s  # whole, with what a channel has drawn
     whole_latency = replace(worlds.vehicles, own_latency_s=latency, known_from_s=Vehicles.known_at_once(latency))
@@ -116,7 +116,7 @@ def full_state(worlds: Worlds, scenario: Scenario) -> Observations:
     return np.concatenate([*vehicles, np.stack(rest, axis=1)], axis=1, dtype=np.float32)
 
 
-def row_features(own: tuple[Feature, ...], appended: Appended | None, scenario: Scenario) -> tuple[Feature, ...]:
+def row_features(own: tuple[Feature, ...], appended: Appended | None, scenario: Game) -> tuple[Feature, ...]:
     """Every number of a learner's row in order; raises ``InvalidInput`` for another word than ``Appended`` has."""
     if appended not in (None, *get_args(Appended)):
         raise InvalidInput(f"appended = {appended!r}: must be {' or '.join(get_args(Appended))}, or None")
