@@ -18,10 +18,11 @@ from ethbrake_marl.engine.memory import Memory, checked_memory, map_memory, take
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import AgentFailed, InvalidInput, describe_error, naming_extras
 from ethbrake_marl.game.actions import LARGEST, action_to_command
+from ethbrake_marl.game.full_state import Appended, full_state, row_features
 from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec, choose_observation, observe
+from ethbrake_marl.game.observed import observation_for
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.game.observed import Appended, full_state, observation_for, row_features
 from ethbrake_marl.scenario.schema import Scenario
 
 State = Any  # arrays whose first axis is the world, or tuples, lists and mappings of such

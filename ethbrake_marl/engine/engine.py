@@ -42,16 +42,16 @@ from ethbrake_marl.engine.stream import NO_ROWS, Roster, Start, Stream, check_al
 from ethbrake_marl.engine.terms import Terms
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep, renumbered
 from ethbrake_marl.game.actions import checked_action
+from ethbrake_marl.game.definition import Game
 from ethbrake_marl.game.harm import Ledger, empty_ledger
 from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec, Plan
+from ethbrake_marl.game.observed import common_observation, observations_of
 from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.physics.messages import hear_rows
 from ethbrake_marl.physics.rows import FLAG
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
-from ethbrake_marl.game.observed import common_observation, observations_of
-from ethbrake_marl.game.definition import Game
 
 SNAPSHOT = ("state", "params", "clock", "wanted", "potential")  # names of the arrays of a state in a snapshot
 

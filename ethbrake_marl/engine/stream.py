@@ -13,6 +13,7 @@ from ethbrake_marl.engine.compiled_step import CLOCK_WIDTH, LAST_STEP, START
 from ethbrake_marl.engine.memory import ask_script, begin_script, is_state_free, within_capacity
 from ethbrake_marl.engine.scripts import SAMPLED_AT_ONCE, Script
 from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of
+from ethbrake_marl.game.definition import Game
 from ethbrake_marl.game.harm import Ledger
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.columns import Packed
@@ -20,7 +21,6 @@ from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.physics.left_out import Impacts, leaving_out_failed
 from ethbrake_marl.physics.rows import FLAG, LISTED
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
-from ethbrake_marl.game.definition import Game
 
 
 class Start(NamedTuple):

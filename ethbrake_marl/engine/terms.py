@@ -8,10 +8,10 @@ import numpy as np
 
 from ethbrake_marl.engine.compiled_step import Step
 from ethbrake_marl.engine.state import State
+from ethbrake_marl.game.definition import Game
 from ethbrake_marl.game.objectives import objective_harm
 from ethbrake_marl.game.rewards import Reward, StepOutcome, reward_params
 from ethbrake_marl.physics.state import Floats, Worlds
-from ethbrake_marl.game.definition import Game
 
 
 class Terms:

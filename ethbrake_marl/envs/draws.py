@@ -16,6 +16,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.state import Ints
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.schema import as_scenario
 
 _MOST_APART = 1024  # numbers between two worlds that are still drawn in one go
 
@@ -56,10 +57,10 @@ def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
     """These worlds of the training stream, in the order of ``numbers``; ``InvalidInput`` if they do not run here."""
     ordered, places = np.unique(numbers, return_inverse=True)
     breaks = np.flatnonzero(np.diff(ordered) > _MOST_APART) + 1
-    parts = []
+    parts, scenario = [], as_scenario(engine.scenario)
     for run in np.split(ordered, breaks):
         first = int(run[0])
-        span = engine.scenario.sample(int(run[-1]) - first + 1, engine.roster.seed, first=first, channel="training")
+        span = scenario.sample(int(run[-1]) - first + 1, engine.roster.seed, first=first, channel="training")
         parts.append(span.take(run - first))
     sample = Sample.join(parts, 0).take(places)
     rows = np.flatnonzero(engine.roster.numbers >= 0)

@@ -19,7 +19,7 @@ from ethbrake_marl.game.observations import Observation, ObservationSpec
 from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.state import Floats, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.schema import Scenario, as_scenario
 from ethbrake_marl.scenario.tables import worlds_from_state
 
 AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping: what a file would say
@@ -149,7 +149,9 @@ def wanted_worlds(engine: Engine, options: Mapping[str, Any]) -> Worlds | None:
     if LISTED_WORLD not in options:
         if INITIAL_STATE not in options:
             return None
-        return worlds_from_state(engine.scenario, options[INITIAL_STATE]).take(np.zeros(engine.n, np.int64))
+        return worlds_from_state(as_scenario(engine.scenario), options[INITIAL_STATE]).take(
+            np.zeros(engine.n, np.int64)
+        )
     if INITIAL_STATE in options:
         raise InvalidInput(f"reset: {INITIAL_STATE} and {LISTED_WORLD} are both given; an episode has one start")
     wanted = options[LISTED_WORLD]

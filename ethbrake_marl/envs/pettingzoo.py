@@ -20,10 +20,10 @@ from ethbrake_marl.envs.making import AnyScenario, IgnoredAction, action_box, fe
 from ethbrake_marl.envs.motion import Viewer
 from ethbrake_marl.errors import InvalidInput, check_whole_number, unknown_name
 from ethbrake_marl.game.actions import checked_action
+from ethbrake_marl.game.full_state import full_state, state_features
 from ethbrake_marl.game.observations import Observation, Observations
 from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.state import Ints
-from ethbrake_marl.game.observed import full_state, state_features
 
 
 class SeededInside:

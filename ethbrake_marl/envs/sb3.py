@@ -27,11 +27,12 @@ from ethbrake_marl.envs.making import (
 from ethbrake_marl.envs.motion import Viewer
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.actions import own_actions
+from ethbrake_marl.game.full_state import Appended, full_state, row_features
 from ethbrake_marl.game.observations import Observation, Observations
 from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.state import Bools, Ints, Worlds
-from ethbrake_marl.game.observed import Appended, full_state, row_features
+from ethbrake_marl.scenario.schema import as_scenario
 from ethbrake_marl.scenario.tables import worlds_from_state
 
 Rewards = NDArray[np.float32]
@@ -300,7 +301,11 @@ class EthBrakeVecEnv(Begun, VecEnv):
             return None
         width, starts = len(self.engine.learners), list[Worlds]()
         for k, row in enumerate(options):
-            start = worlds_from_state(self.engine.scenario, row[INITIAL_STATE]) if INITIAL_STATE in row else None
+            start = (
+                worlds_from_state(as_scenario(self.engine.scenario), row[INITIAL_STATE])
+                if INITIAL_STATE in row
+                else None
+            )
             if start is None or (k % width and bytes_of(start) != bytes_of(starts[-1])):
                 raise InvalidInput(
                     f"set_options: row {k} has {row!r}; if one row has an {INITIAL_STATE}, every row needs one, and the"

@@ -14,6 +14,7 @@ from ethbrake_marl.files.json_schema import FileSchema
 from ethbrake_marl.files.model import Wording, explain, suggestion
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text
+from ethbrake_marl.game.definition import Game
 from ethbrake_marl.scenario.checks import check_whole
 from ethbrake_marl.scenario.declared import ScenarioFields
 from ethbrake_marl.scenario.distributions import DISTRIBUTIONS
@@ -189,6 +190,13 @@ class Scenario(ScenarioFields):
                 f" from 0 to {self.vehicles - 1}"
             )
         return self.vehicle_names[vehicle]
+
+
+def as_scenario(game: Game) -> Scenario:
+    """Return a game that is a scenario; raise ``InvalidInput`` for any other game."""
+    if not isinstance(game, Scenario):
+        raise InvalidInput(f"game {game.name!r}: is a {type(game).__name__}; a Scenario is needed here")
+    return game
 
 
 def scenario_json_schema() -> dict[str, Any]:

@@ -17,7 +17,7 @@ from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.schema import Scenario, as_scenario
 from ethbrake_marl.shield.checks import check_amount
 from ethbrake_marl.shield.contract import ShieldGuard
 from ethbrake_marl.shield.guard import StepGuard
@@ -132,9 +132,9 @@ class ShieldOptions:
         """
         if self.mode == "episode":
             (policy,) = policies.values()
-            hybrid = HybridAgent(policy, engine.scenario, bound=self.bound, harm_count=self.harm_count)
+            hybrid = HybridAgent(policy, as_scenario(engine.scenario), bound=self.bound, harm_count=self.harm_count)
             return EpisodeGuard(engine, hybrid, where=self.where)
-        shield = self.shield(engine.scenario, shielded_vehicle(engine, several), engine.scripts)
+        shield = self.shield(as_scenario(engine.scenario), shielded_vehicle(engine, several), engine.scripts)
         return StepGuard(engine, policies, shield, where=self.where, shares=self.shares, **how)
 
 

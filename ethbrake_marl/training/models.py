@@ -9,10 +9,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.game.full_state import Appended
 from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.teams import PolicyTeam, Trained
-from ethbrake_marl.game.observed import Appended
 from ethbrake_marl.training.algorithm import Algorithm
 from ethbrake_marl.training.finite import refuse_gradients
 from ethbrake_marl.training.recipe import Scheme

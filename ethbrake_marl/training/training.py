@@ -13,9 +13,9 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.game.observations import ObservationSpec, choose_observation
+from ethbrake_marl.game.observed import common_observation, observations_of
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.game.observed import common_observation, observations_of
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.recipe import WORDS, Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.training.run_folder import RunDirectory

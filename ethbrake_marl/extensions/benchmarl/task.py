@@ -18,9 +18,10 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ethbrake_marl.envs.making import feature_box, make_engine
+from ethbrake_marl.game.full_state import full_state, state_features
+from ethbrake_marl.game.observed import observation_for
 from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.game.observed import full_state, observation_for, state_features
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.attach import guard_of
 from ethbrake_marl.shield.options import ShieldOptions

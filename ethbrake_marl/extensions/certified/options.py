@@ -15,7 +15,7 @@ from ethbrake_marl.extensions.certified.estimated_shield import BelievedShield
 from ethbrake_marl.extensions.certified.guards import BelievedGuard, RobustGuard, RobustMode
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import UNCERTAINTY_EXAMPLE, Uncertainty, parse_uncertainty
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.schema import Scenario, as_scenario
 from ethbrake_marl.shield.contract import ShieldGuard, ShieldMode
 from ethbrake_marl.shield.options import ShieldOptions, check_mode, misplaced, one_learner, shielded_vehicle
 
@@ -100,7 +100,7 @@ class RobustOptions(ShieldOptions):
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent], *, several: bool = False, **how: Any) -> ShieldGuard:
         """The guard of these settings, for all learners of an engine."""
-        scenario, scripts, where = engine.scenario, engine.scripts, self.where
+        scenario, scripts, where = as_scenario(engine.scenario), engine.scripts, self.where
         if self.believed:
             if len(engine.learners) > 1:
                 raise InvalidInput(

@@ -41,10 +41,10 @@ from ethbrake_marl.extensions.datasets.recording import Recording, Task, record_
 from ethbrake_marl.files.store import check_target, check_writable, new_folder
 from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.game.observations import Observation, choose_observation
+from ethbrake_marl.game.observed import observation_for
 from ethbrake_marl.game.rewards import Reward, reward_params
 from ethbrake_marl.physics.left_out import leaving_out_failed
 from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.game.observed import observation_for
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
 

@@ -19,6 +19,7 @@ from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.state import Floats, Ints
 from ethbrake_marl.policies.network_spec import Float32s
 from ethbrake_marl.scenario.sampling import members_of
+from ethbrake_marl.scenario.schema import as_scenario
 
 FOR_GOOD = 2**31  # steps: more than any episode has
 
@@ -42,7 +43,7 @@ class OptionsModel(CounterfactualModel):
     def _setup_model(self) -> None:
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
-        members = len(self.engine.scenario.members) or 1
+        members = len(as_scenario(self.engine.scenario).members) or 1
         self.policy = ChoosingActor(
             self.observation_space, self.action_space, self.lr_schedule, self.recipe, self._among, members
         )
@@ -132,7 +133,11 @@ class OptionsModel(CounterfactualModel):
         numbers = self._numbers[rows]
         first = int(numbers.min())
         drawn = members_of(
-            self.engine.scenario, int(numbers.max()) - first + 1, self.engine.seed, first=first, channel="training"
+            as_scenario(self.engine.scenario),
+            int(numbers.max()) - first + 1,
+            self.engine.seed,
+            first=first,
+            channel="training",
         )
         member, usual = drawn[numbers - first], self.policy.usual.numpy()
         for m in np.unique(member):
