@@ -6,20 +6,21 @@ Worlds are rows of ``physics.batch``; ``clock`` [n, 4] holds what an episode nee
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from ethbrake_marl.game.actions import command_of
 from ethbrake_marl.game.rewards import RewardParams
-from ethbrake_marl.physics.columns import columns
+from ethbrake_marl.physics.columns import Packed, columns
 from ethbrake_marl.physics.episode import onset_s, stands, step_end_s
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.motion import BOUND, command_acts
 from ethbrake_marl.physics.pieces import force_at
-from ethbrake_marl.physics.rows import FLAG, ROW, place_forces, place_obstacle, rows_for
+from ethbrake_marl.physics.rows import FLAG, LISTED, ROW, place_forces, place_obstacle, rows_for
 from ethbrake_marl.physics.segment import advance_table
-from ethbrake_marl.physics.state import Bools, Floats, Ints
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
 # columns of clock
 START = 0  # time of the first decision (s)
@@ -229,3 +230,33 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         for i in range(N):
             reward[k, i] = shared
     return worst, worst_status
+
+
+NO_ROWS = np.empty((0, LISTED.WIDTH))  # no list of impacts is kept
+
+
+class Rules(NamedTuple):
+    """What all steps of an engine have in common, and the compiled step under it."""
+
+    learners: Ints  # [L] indices of the learners
+    settings: Floats  # [5] TIME_STEP, HORIZON, HARM_WEIGHT, HARM_IS_TOTAL, TERMINAL_WEIGHT
+    builds_up: bool  # whether the brakes of some world may build up, or follow ``pieces``
+    pieces: Floats  # [N, 2 K] braking profile of each scripted vehicle, as in ``Vehicles``; K may be 0
+
+    def step(
+        self, worlds: Packed, clock: Floats, actions: Floats, wanted: Floats, reward: Floats, outcome: Floats
+    ) -> int:
+        """Advance every running world by one step, in place; return a status. See ``step_worlds``."""
+        _, status = step_worlds(
+            *worlds, clock, actions, self.learners, self.settings, NO_ROWS, self.builds_up, self.pieces, wanted,
+            reward, outcome,
+        )  # fmt: skip
+        return status
+
+    def unpack(self, packed: Packed) -> Worlds:
+        """The worlds of these rows, in their own memory, with the pieces in which their scripts brake."""
+        worlds = packed.worlds()
+        if self.pieces.shape[1] == 0:
+            return worlds
+        pieces = np.repeat(self.pieces[np.newaxis], worlds.n, axis=0)
+        return replace(worlds, vehicles=replace(worlds.vehicles, pieces=pieces))

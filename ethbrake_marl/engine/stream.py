@@ -19,7 +19,7 @@ from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.physics.left_out import Impacts, leaving_out_failed
-from ethbrake_marl.physics.rows import FLAG, LISTED
+from ethbrake_marl.physics.rows import FLAG
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 
 
@@ -185,6 +185,3 @@ def packed_with(worlds: Worlds, harm: Impacts | Ledger) -> Packed:
         obstacle = (harm.obstacle_first_harm, harm.obstacle_total_harm, harm.obstacle_count)
         packed.state[:, column.obstacle + 2 :] = np.column_stack(obstacle)
     return packed
-
-
-NO_ROWS = np.empty((0, LISTED.WIDTH))  # no list of impacts is kept

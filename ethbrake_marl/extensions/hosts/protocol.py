@@ -23,7 +23,6 @@ from numpy.typing import ArrayLike
 
 from ethbrake_marl.agents.driving import Episodes, episode_engine
 from ethbrake_marl.agents.protocol import Driver, Team, check_agent
-from ethbrake_marl.engine.engine import ROUNDING
 from ethbrake_marl.engine.memory import (
     ask_script,
     begin_script,
@@ -32,6 +31,7 @@ from ethbrake_marl.engine.memory import (
     take_memory,
     within_capacity,
 )
+from ethbrake_marl.engine.own_grid import ROUNDING
 from ethbrake_marl.engine.stream import check_alert
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
 from ethbrake_marl.evaluation.outcome import Outcome
