@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
+from functools import cached_property
 from operator import not_
 from typing import Annotated, Any, Literal, Self
 
@@ -277,7 +278,7 @@ class ScenarioFields(FileModel):
         """The scenarios of a mixture, whole; none for any other scenario."""
         return self._members
 
-    @property
+    @cached_property
     def vehicle_names(self) -> tuple[str, ...]:
         """``vehicle_1`` (front) to ``vehicle_N`` (rear)."""
         return tuple(f"vehicle_{i + 1}" for i in range(self.vehicles))
