@@ -1,0 +1,83 @@
+"""The actors of a training loop of one's own, written as a team that drives as ``team@FOLDER``."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Protocol
+
+from torch import Tensor, nn
+
+from ethbrake_marl.envs.pettingzoo import EthBrakeParallelEnv
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.store import write_file
+from ethbrake_marl.policies.network_spec import NetworkSpec
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.training.networks import ACTIVATIONS, copy_of, tensors_of_layers
+from ethbrake_marl.training.recipe import Scheme
+from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.team import TeamFile, bundle_of
+
+
+class GaussianActor(Protocol):
+    """A perceptron gives the mean of the action; the environment gets it clipped to [-1, 1]."""
+
+    mean: nn.Sequential  # linear layers with ReLU or Tanh between them, one output
+    log_std: nn.Parameter  # [1] logarithm of the standard deviation that it explored with
+
+
+def save_team(
+    folder: str | os.PathLike[str],
+    actors: Mapping[str, GaussianActor],
+    env: EthBrakeParallelEnv,
+    *,
+    seed: int,
+    steps: int,
+) -> None:
+    """Write the actor of each learner, by the vehicle's name, into ``folder``.
+
+    ``env`` says what they were trained on: scenario, observations, reward. One and the same actor for several learners
+    is written once, as a shared policy. Raises ``InvalidInput`` for layers that a bundle cannot hold, or for learners
+    that share an actor and observe different features.
+    """
+    engine, names = env.unwrapped.engine, list(actors)
+    scenario = engine.scenario
+    shared = len(names) > 1 and all(actor is actors[names[0]] for actor in actors.values())
+    scheme: Scheme = "shared" if shared else "independent" if len(names) > 1 else "single"
+    drivers = {name: bundle_of(scheme, name) for name in names}
+    for bundle in dict.fromkeys(drivers.values()):
+        driven = tuple(name for name in names if drivers[name] == bundle)
+        layers, log_std = actors[driven[0]].mean, actors[driven[0]].log_std
+        place = scenario.vehicle_names.index(driven[0])
+        Policy.make(
+            {**tensors_of_layers("policy", layers), "policy.log_std": copy_of(log_std)},
+            algorithm="ppo",
+            network=network_of(layers),
+            observation=engine.observation if shared else engine.observations[place],
+            learners=driven,
+            scenario=scenario.model_dump(mode="json"),
+            reward=engine.reward.model_dump(mode="json"),
+            seeds={"training": seed},
+            steps=steps,
+        ).save(Path(folder) / bundle)
+    team = TeamFile(scheme=scheme, vehicles=scenario.vehicles, drivers=drivers)
+    write_file(RunDirectory(Path(folder)).team, team.model_dump_json(indent=2).encode() + b"\n")
+
+
+def network_of(layers: nn.Sequential) -> NetworkSpec:
+    """The shape of an actor's layers; raises ``InvalidInput`` naming what is not a perceptron's."""
+    linear, between = list(layers)[::2], list(layers)[1::2]
+    known = {kind: name for name, kind in ACTIVATIONS.items()}
+    kinds = {type(layer) for layer in between}
+    if not all(isinstance(layer, nn.Linear) for layer in linear) or len(kinds) != 1 or not kinds <= known.keys():
+        raise InvalidInput(f"actor {layers}: must be linear layers, with ReLU or with Tanh between them")
+    sizes: list[Tensor] = [layer.weight for layer in linear if isinstance(layer, nn.Linear)]
+    return NetworkSpec(
+        observation_size=sizes[0].shape[1],
+        action_size=sizes[-1].shape[0],
+        policy_hidden=tuple(weight.shape[0] for weight in sizes[:-1]),
+        value_hidden=(),
+        activation=known[kinds.pop()],
+        output="clip",
+    )

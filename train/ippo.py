@@ -1,0 +1,192 @@
+"""Independent PPO (IPPO) for several learners, in PettingZoo and torch. Read it from top to bottom.
+
+    python train/ippo.py --scenario cooperation-3-pair --output runs/ippo
+    ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,e_v2x_bm,team@runs/ippo
+
+Each learner has an actor, a critic and an optimiser of its own, and sees the others as part of its environment. All
+learn at once, from the same episodes. In `train/mappo.py` one critic sees the whole line instead.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.distributions import Normal
+
+import ethbrake_marl as eb
+from ethbrake_marl.errors import EthBrakeError, check_whole_number
+from ethbrake_marl.files.store import new_folder
+from ethbrake_marl.training.own_team import save_team
+
+# 1. Settings. Each of them is an option of the command as well.
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What to train, and the numbers of PPO."""
+
+    scenario: str = "cooperation-3-pair"  # a shipped name, or the path of a YAML file
+    steps: int = 1_500_000  # decisions of all learners together
+    seed: int = 0
+    output: Path = Path("runs/ippo")  # a new folder
+    harm_count: str = "first"  # which impacts the reward counts: the "first" of each pair, or "total"
+    copies: int = 64  # episodes side by side
+    rollout: int = 64  # time steps of each copy between two updates
+    epochs: int = 4
+    minibatch: int = 512
+    hidden: int = 64  # width of each of the two hidden layers
+    learning_rate: float = 2e-3  # at the start; falls linearly to 0
+    gamma: float = 1.0  # later harm counts in full
+    gae_lambda: float = 0.95
+    clip: float = 0.2
+    log_std: float = -0.5  # of the actions, at the start
+
+
+# 2. Networks. An actor gives the mean of a Gaussian. The environment takes actions in [-1, 1]: collect() clips them.
+
+
+def perceptron(inputs: int, hidden: int, last_gain: float) -> nn.Sequential:
+    """Two hidden layers and one output, with the initial weights that are usual for PPO."""
+    layers = [nn.Linear(inputs, hidden), nn.Linear(hidden, hidden), nn.Linear(hidden, 1)]
+    for layer, gain in zip(layers, (2**0.5, 2**0.5, last_gain), strict=True):
+        nn.init.orthogonal_(layer.weight, gain)
+        nn.init.zeros_(layer.bias)
+    return nn.Sequential(layers[0], nn.ReLU(), layers[1], nn.ReLU(), layers[2])
+
+
+class Learner(nn.Module):
+    """Actor, critic and optimiser of one vehicle."""
+
+    def __init__(self, features: int, settings: Settings) -> None:
+        super().__init__()
+        self.mean = perceptron(features, settings.hidden, last_gain=0.01)
+        self.log_std = nn.Parameter(torch.full((1,), settings.log_std))
+        self.critic = perceptron(features, settings.hidden, last_gain=1.0)
+        self.optimiser = torch.optim.Adam(self.parameters(), settings.learning_rate, eps=1e-5)
+
+    def actions(self, seen: Tensor) -> Normal:
+        """The distribution of actions [..., 1] for observations [..., F]."""
+        return Normal(self.mean(seen), self.log_std.exp())
+
+
+# 3. Collect T time steps of C copies of the environment. A copy whose episode is over begins the next one at once.
+#    The horizon ends an episode like any other end: harm after it does not count.
+
+
+class Rollout:
+    """What one learner saw, did and got."""
+
+    def __init__(self, features: int, settings: Settings) -> None:
+        steps, copies = settings.rollout, settings.copies
+        self.seen = torch.zeros(steps + 1, copies, features)  # the last row is seen after the last step
+        self.actions = torch.zeros(steps, copies, 1)  # before they are clipped
+        self.rewards = torch.zeros(steps, copies)
+        self.ended = torch.zeros(steps, copies)  # 1 where the episode ended with this step
+
+
+class Copies:
+    """Copies of the environment, each with worlds of its own. Their only agents are the learners."""
+
+    def __init__(self, settings: Settings) -> None:
+        reward = {"harm": 0.05, "harm_count": settings.harm_count, "terminal": 0.02}  # returns are of order 1
+        numbers = range(settings.seed * settings.copies, (settings.seed + 1) * settings.copies)
+        self.envs = [eb.parallel_env(settings.scenario, agents="learners", reward=reward) for _ in numbers]
+        self.seen = [env.reset(seed=k)[0] for k, env in zip(numbers, self.envs, strict=True)]
+        self.harm = "world_total_harm" if settings.harm_count == "total" else "world_first_impact_harm"
+
+    @torch.no_grad()
+    def collect(self, learners: dict[str, Learner], settings: Settings) -> tuple[dict[str, Rollout], list[float]]:
+        """A rollout of each learner, and the harm of each episode that ended."""
+        rollouts = {name: Rollout(self.seen[0][name].size, settings) for name in learners}
+        harms: list[float] = []
+        for t in range(settings.rollout):
+            for name, own in rollouts.items():
+                own.seen[t] = self.observations(name)
+                own.actions[t] = learners[name].actions(own.seen[t]).sample()
+            clipped = {name: own.actions[t].clamp(-1.0, 1.0).numpy() for name, own in rollouts.items()}
+            after = [env.step({name: clipped[name][c] for name in learners}) for c, env in enumerate(self.envs)]
+            for name, own in rollouts.items():
+                own.rewards[t] = torch.tensor([rewards[name] for _, rewards, *_ in after])
+                own.ended[t] = torch.tensor([not env.agents for env in self.envs])
+            harms += [each[4][name][self.harm] for env, each in zip(self.envs, after, strict=True) if not env.agents]
+            self.seen = [each[0] if env.agents else env.reset()[0] for env, each in zip(self.envs, after, strict=True)]
+        for name, own in rollouts.items():
+            own.seen[-1] = self.observations(name)
+        return rollouts, harms
+
+    def observations(self, name: str) -> Tensor:
+        """What a learner sees in every copy, [C, F]."""
+        return torch.from_numpy(np.stack([seen[name] for seen in self.seen]))
+
+
+# 4. Update: generalised advantage estimation, and PPO's clipped loss (Schulman et al. 2016, 2017).
+
+
+def advantages(own: Rollout, values: Tensor, settings: Settings) -> Tensor:
+    """A_t = r_t - V_t + gamma (V_t+1 + lambda A_t+1), [T, C]; without the bracket where the episode ended."""
+    result, after = torch.zeros_like(own.rewards), torch.zeros_like(own.rewards[0])
+    for t in reversed(range(len(result))):
+        ahead = settings.gamma * (values[t + 1] + settings.gae_lambda * after)
+        result[t] = after = own.rewards[t] - values[t] + (1.0 - own.ended[t]) * ahead
+    return result
+
+
+def update(learner: Learner, own: Rollout, settings: Settings) -> None:
+    """Learn from one rollout."""
+    seen, actions = own.seen[:-1].flatten(0, 1), own.actions.flatten(0, 1)
+    with torch.no_grad():
+        values = learner.critic(own.seen)[..., 0]
+        gains = advantages(own, values, settings)
+        targets, gains = (gains + values[:-1]).flatten(), gains.flatten()
+        before = learner.actions(seen).log_prob(actions)[:, 0]
+    for _ in range(settings.epochs):
+        for rows in torch.split(torch.randperm(len(gains)), settings.minibatch):
+            ratio = (learner.actions(seen[rows]).log_prob(actions[rows])[:, 0] - before[rows]).exp()
+            gain = (gains[rows] - gains[rows].mean()) / (gains[rows].std() + 1e-8)
+            clipped = ratio.clamp(1.0 - settings.clip, 1.0 + settings.clip)
+            actor_loss = -torch.minimum(ratio * gain, clipped * gain).mean()
+            critic_loss = nn.functional.mse_loss(learner.critic(seen[rows])[:, 0], targets[rows])
+            learner.optimiser.zero_grad()
+            (actor_loss + 0.5 * critic_loss).backward()
+            nn.utils.clip_grad_norm_(learner.parameters(), 0.5)
+            learner.optimiser.step()
+
+
+# 5. Train all learners of the scenario, and save them.
+
+
+def train(settings: Settings, folder: Path) -> None:
+    """Train for at least `steps` decisions, and write the team into `folder`."""
+    torch.set_num_threads(1)
+    torch.manual_seed(settings.seed)
+    copies = Copies(settings)
+    learners = {name: Learner(seen.size, settings) for name, seen in copies.seen[0].items()}
+    decisions = settings.copies * settings.rollout * len(learners)  # between two updates
+    updates = -(-settings.steps // decisions)
+    for k in range(updates):
+        rollouts, harms = copies.collect(learners, settings)
+        for name, learner in learners.items():
+            learner.optimiser.param_groups[0]["lr"] = settings.learning_rate * (1.0 - k / updates)
+            update(learner, rollouts[name], settings)
+        if harms:
+            print(f"{(k + 1) * decisions:,} decisions: mean harm of an episode {np.mean(harms):.2f}", flush=True)
+    save_team(folder, learners, copies.envs[0], seed=settings.seed, steps=updates * decisions)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for field in fields(Settings):
+        parser.add_argument(f"--{field.name.replace('_', '-')}", type=type(field.default), default=field.default)
+    settings = Settings(**vars(parser.parse_args()))
+    try:
+        check_whole_number("steps", settings.steps, 1)
+        with new_folder(settings.output) as folder:
+            train(settings, folder)
+    except (EthBrakeError, OSError) as error:
+        parser.exit(2, f"{parser.prog}: error: {error}\n")
+    print(f"ethbrake evaluate --scenario {settings.scenario} --agents full_brake,e_v2x_bm,team@{settings.output}")

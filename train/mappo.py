@@ -1,0 +1,200 @@
+"""Multi-agent PPO (MAPPO) for several learners, in PettingZoo and torch. Read it from top to bottom.
+
+    python train/mappo.py --scenario cooperation-3-pair --output runs/mappo
+    ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,e_v2x_bm,team@runs/mappo
+
+Each learner has an actor of its own, which sees what its vehicle knows. One critic, for training alone, sees the full
+state of the line, `state()`, and predicts the return of each learner. The rest is as in `train/ippo.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.distributions import Normal
+
+import ethbrake_marl as eb
+from ethbrake_marl.errors import EthBrakeError, check_whole_number
+from ethbrake_marl.files.store import new_folder
+from ethbrake_marl.training.own_team import save_team
+
+# 1. Settings. Each of them is an option of the command as well.
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What to train, and the numbers of PPO."""
+
+    scenario: str = "cooperation-3-pair"  # a shipped name, or the path of a YAML file
+    steps: int = 1_000_000  # decisions of all learners together
+    seed: int = 0
+    output: Path = Path("runs/mappo")  # a new folder
+    harm_count: str = "first"  # which impacts the reward counts: the "first" of each pair, or "total"
+    copies: int = 64  # episodes side by side
+    rollout: int = 64  # time steps of each copy between two updates
+    epochs: int = 4
+    minibatch: int = 512
+    hidden: int = 64  # width of each of the two hidden layers
+    learning_rate: float = 2e-3  # at the start; falls linearly to 0
+    gamma: float = 1.0  # later harm counts in full
+    gae_lambda: float = 0.95
+    clip: float = 0.2
+    log_std: float = -0.5  # of the actions, at the start
+
+
+# 2. Networks. An actor gives the mean of a Gaussian. The environment takes actions in [-1, 1]: collect() clips them.
+
+
+def perceptron(inputs: int, hidden: int, outputs: int, last_gain: float) -> nn.Sequential:
+    """Two hidden layers, with the initial weights that are usual for PPO."""
+    layers = [nn.Linear(inputs, hidden), nn.Linear(hidden, hidden), nn.Linear(hidden, outputs)]
+    for layer, gain in zip(layers, (2**0.5, 2**0.5, last_gain), strict=True):
+        nn.init.orthogonal_(layer.weight, gain)
+        nn.init.zeros_(layer.bias)
+    return nn.Sequential(layers[0], nn.ReLU(), layers[1], nn.ReLU(), layers[2])
+
+
+class Actor(nn.Module):
+    """The distribution of actions [..., 1] for observations [..., F]."""
+
+    def __init__(self, features: int, settings: Settings) -> None:
+        super().__init__()
+        self.mean = perceptron(features, settings.hidden, 1, last_gain=0.01)
+        self.log_std = nn.Parameter(torch.full((1,), settings.log_std))
+
+    def forward(self, seen: Tensor) -> Normal:
+        return Normal(self.mean(seen), self.log_std.exp())
+
+
+# 3. Collect T time steps of C copies of the environment. A copy whose episode is over begins the next one at once.
+
+
+@dataclass
+class Rollout:
+    """What the learners saw, did and got."""
+
+    seen: dict[str, Tensor]  # [T, C, F] of each learner
+    states: Tensor  # [T + 1, C, S] the last row is the state after the last step
+    actions: Tensor  # [T, C, L] before they are clipped
+    rewards: Tensor  # [T, C, L]
+    ended: Tensor  # [T, C, 1] 1 where this step ended the episode; the horizon is an end like any other
+
+
+class Copies:
+    """Copies of the environment, each with worlds of its own. Their only agents are the learners."""
+
+    def __init__(self, settings: Settings) -> None:
+        reward = {"harm": 0.05, "harm_count": settings.harm_count, "terminal": 0.02}  # returns are of order 1
+        numbers = range(settings.seed * settings.copies, (settings.seed + 1) * settings.copies)
+        self.envs = [eb.parallel_env(settings.scenario, agents="learners", reward=reward) for _ in numbers]
+        self.seen = [env.reset(seed=k)[0] for k, env in zip(numbers, self.envs, strict=True)]
+        self.harm = "world_total_harm" if settings.harm_count == "total" else "world_first_impact_harm"
+
+    @torch.no_grad()
+    def collect(self, actors: dict[str, Actor], steps: int) -> tuple[Rollout, list[float]]:
+        """A rollout, and the harm of each episode that ended."""
+        seen: dict[str, list[Tensor]] = {name: [] for name in actors}
+        states, actions, rewards, ended, harms = [self.states()], [], [], [], []
+        for _ in range(steps):
+            for name in actors:
+                seen[name].append(torch.from_numpy(np.stack([each[name] for each in self.seen])))
+            actions.append(torch.cat([actor(seen[name][-1]).sample() for name, actor in actors.items()], dim=1))
+            clipped = [dict(zip(actors, row[:, None], strict=True)) for row in actions[-1].clamp(-1.0, 1.0).numpy()]
+            after = [env.step(each) for env, each in zip(self.envs, clipped, strict=True)]
+            rewards.append(torch.tensor([list(each.values()) for _, each, *_ in after]))
+            ended.append(torch.tensor([[float(not env.agents)] for env in self.envs]))
+            harms += [each[4][name][self.harm] for env, each in zip(self.envs, after, strict=True) if not env.agents]
+            self.seen = [each[0] if env.agents else env.reset()[0] for env, each in zip(self.envs, after, strict=True)]
+            states.append(self.states())
+        stacked = {name: torch.stack(rows) for name, rows in seen.items()}
+        return Rollout(stacked, *map(torch.stack, (states, actions, rewards, ended))), harms
+
+    def states(self) -> Tensor:
+        """The full state of every copy, [C, S]."""
+        return torch.from_numpy(np.stack([env.state() for env in self.envs]))
+
+
+# 4. Update: generalised advantage estimation, and PPO's clipped loss (Schulman et al. 2016, 2017).
+
+
+def advantages(rollout: Rollout, values: Tensor, settings: Settings) -> Tensor:
+    """A_t = r_t - V_t + gamma (V_t+1 + lambda A_t+1), [T, C, L]; without the bracket where the episode ended."""
+    result, after = torch.zeros_like(rollout.rewards), torch.zeros_like(rollout.rewards[0])
+    for t in reversed(range(len(result))):
+        ahead = settings.gamma * (values[t + 1] + settings.gae_lambda * after)
+        result[t] = after = rollout.rewards[t] - values[t] + (1.0 - rollout.ended[t]) * ahead
+    return result
+
+
+class Team:
+    """The actors, the critic and their optimiser."""
+
+    def __init__(self, copies: Copies, settings: Settings) -> None:
+        self.actors = {name: Actor(seen.size, settings) for name, seen in copies.seen[0].items()}
+        self.critic = perceptron(copies.states().shape[1], settings.hidden, len(self.actors), last_gain=1.0)
+        self.networks = nn.ModuleList([*self.actors.values(), self.critic])
+        self.optimiser = torch.optim.Adam(self.networks.parameters(), settings.learning_rate, eps=1e-5)
+
+    def log_prob(self, seen: dict[str, Tensor], actions: Tensor, rows: Tensor) -> Tensor:  # [rows, L]
+        own = zip(self.actors, torch.split(actions[rows], 1, dim=-1), strict=True)
+        return torch.cat([self.actors[name](seen[name][rows]).log_prob(action) for name, action in own], dim=-1)
+
+    def update(self, rollout: Rollout, settings: Settings) -> None:
+        """Learn from one rollout."""
+        seen = {name: rows.flatten(0, 1) for name, rows in rollout.seen.items()}
+        states, actions = rollout.states[:-1].flatten(0, 1), rollout.actions.flatten(0, 1)
+        with torch.no_grad():
+            values = self.critic(rollout.states)
+            gains = advantages(rollout, values, settings)
+            targets, gains = (gains + values[:-1]).flatten(0, 1), gains.flatten(0, 1)
+            before = self.log_prob(seen, actions, torch.arange(len(actions)))
+        for _ in range(settings.epochs):
+            for rows in torch.split(torch.randperm(len(gains)), settings.minibatch):
+                ratio = (self.log_prob(seen, actions, rows) - before[rows]).exp()
+                gain = (gains[rows] - gains[rows].mean(0)) / (gains[rows].std(0) + 1e-8)
+                clipped = ratio.clamp(1.0 - settings.clip, 1.0 + settings.clip)
+                actor_loss = -torch.minimum(ratio * gain, clipped * gain).mean(0).sum()
+                critic_loss = nn.functional.mse_loss(self.critic(states[rows]), targets[rows])
+                self.optimiser.zero_grad()
+                (actor_loss + 0.5 * critic_loss).backward()
+                nn.utils.clip_grad_norm_(self.networks.parameters(), 0.5)
+                self.optimiser.step()
+
+
+# 5. Train all learners of the scenario, and save them.
+
+
+def train(settings: Settings, folder: Path) -> None:
+    """Train for at least `steps` decisions, and write the team into `folder`."""
+    torch.set_num_threads(1)
+    torch.manual_seed(settings.seed)
+    copies = Copies(settings)
+    team = Team(copies, settings)
+    decisions = settings.copies * settings.rollout * len(team.actors)  # between two updates
+    updates = -(-settings.steps // decisions)
+    for k in range(updates):
+        rollout, harms = copies.collect(team.actors, settings.rollout)
+        team.optimiser.param_groups[0]["lr"] = settings.learning_rate * (1.0 - k / updates)
+        team.update(rollout, settings)
+        if harms:
+            print(f"{(k + 1) * decisions:,} decisions: mean harm of an episode {np.mean(harms):.2f}", flush=True)
+    save_team(folder, team.actors, copies.envs[0], seed=settings.seed, steps=updates * decisions)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for field in fields(Settings):
+        parser.add_argument(f"--{field.name.replace('_', '-')}", type=type(field.default), default=field.default)
+    settings = Settings(**vars(parser.parse_args()))
+    try:
+        check_whole_number("steps", settings.steps, 1)
+        with new_folder(settings.output) as folder:
+            train(settings, folder)
+    except (EthBrakeError, OSError) as error:
+        parser.exit(2, f"{parser.prog}: error: {error}\n")
+    print(f"ethbrake evaluate --scenario {settings.scenario} --agents full_brake,e_v2x_bm,team@{settings.output}")
