@@ -44,18 +44,19 @@ class Settings:
     gamma: float = 1.0  # later harm counts in full
     gae_lambda: float = 0.95
     clip: float = 0.2
-    log_std: float = -0.5  # of the actions, at the start
+    mean: float = -0.7  # of the actions, at the start: where nothing is at stake, a vehicle goes on braking
+    log_std: float = -0.5  # likewise
 
 
 # 2. Networks. An actor gives the mean of a Gaussian. The environment takes actions in [-1, 1]: collect() clips them.
 
 
-def perceptron(inputs: int, hidden: int, last_gain: float) -> nn.Sequential:
+def perceptron(inputs: int, hidden: int, last_gain: float, last_bias: float = 0.0) -> nn.Sequential:
     """Two hidden layers and one output, with the initial weights that are usual for PPO."""
     layers = [nn.Linear(inputs, hidden), nn.Linear(hidden, hidden), nn.Linear(hidden, 1)]
-    for layer, gain in zip(layers, (2**0.5, 2**0.5, last_gain), strict=True):
+    for layer, gain, bias in zip(layers, (2**0.5, 2**0.5, last_gain), (0.0, 0.0, last_bias), strict=True):
         nn.init.orthogonal_(layer.weight, gain)
-        nn.init.zeros_(layer.bias)
+        nn.init.constant_(layer.bias, bias)
     return nn.Sequential(layers[0], nn.ReLU(), layers[1], nn.ReLU(), layers[2])
 
 
@@ -64,7 +65,7 @@ class Learner(nn.Module):
 
     def __init__(self, features: int, settings: Settings) -> None:
         super().__init__()
-        self.mean = perceptron(features, settings.hidden, last_gain=0.01)
+        self.mean = perceptron(features, settings.hidden, last_gain=0.01, last_bias=settings.mean)
         self.log_std = nn.Parameter(torch.full((1,), settings.log_std))
         self.critic = perceptron(features, settings.hidden, last_gain=1.0)
         self.optimiser = torch.optim.Adam(self.parameters(), settings.learning_rate, eps=1e-5)
