@@ -75,9 +75,11 @@ def better_plan(
     world: Members, states: Floats, ended: Bools, step: int, constants: Floats, value: float, most: float,
     plan: Floats, trial: Floats,
 ) -> tuple[float, float]:  # fmt: skip
-    """Replace the plan from ``step`` on by the best constant, if that harms less than ``value`` and at most ``most``.
+    """Replace the rest of a plan by the best constant action, if this reduces its harm.
 
-    Returns the harm that is certified now, and the least harm found, certified or not.
+    ``value`` is the plan's harm. The replacement happens from decision ``step`` on, in place, and only if its harm is
+    less than ``value`` and at most ``most``. Returns the harm of the plan afterwards, and the least harm found,
+    certified or not.
     """
     so_far = worst_so_far(world, states)
     if value <= so_far or so_far > most:  # nothing can be better
