@@ -21,9 +21,7 @@ class Running(NamedTuple):
     """
 
     problem: ProfileProblem  # parameters, commands of the other vehicles and times of the decisions, in n * M rows
-    states: (
-        Floats  # [n * M, S] in the layout of ``physics.episode.save``: speeds, gaps, hit flags, harms so far, forces
-    )
+    states: Floats  # [n * M, S] in the layout of ``physics.episode.save``: speeds, gaps, hit flags, harms, forces
     steps: Ints  # [n] number of the decision
     ended: Bools  # [n * M] whether the member's episode is over
     caps: Floats = np.zeros((0, 0))  # [n * M, N] largest harm that each vehicle may bear (m2/s2); [0, 0]: no caps
