@@ -136,7 +136,7 @@ def evaluate_held(
     ray: str | None = None,
     on_done: OnDone | None = None,
 ) -> Evaluation:
-    """``evaluate`` all worlds of a sample; ``jobs`` and ``ray`` as in ``run_each``."""
+    """Evaluate all worlds of a sample that is held in memory; ``jobs`` and ``ray`` as in ``run_each``."""
     calls: Iterator[Call] = ((_drive, lineup, part, seed, first) for first, part in chunks_of(sample))
     parts: list[Evaluation] = []
     for part in run_each(calls, jobs, ray):
@@ -151,7 +151,7 @@ def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evalua
 
 
 def _only(outcome: Outcome, names: Sequence[str]) -> Outcome:
-    """The outcome with these registered measures alone."""
+    """Return the outcome with only these registered measures."""
     kept = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
     return replace(outcome, metrics=kept)
 
@@ -166,9 +166,10 @@ def tally_list(
     ray: str | None = None,
     on_done: OnDone | None = None,
 ) -> Tally:
-    """The statistics of the worlds 0 to ``episodes - 1`` of a list of any length; no world is kept.
+    """Return the statistics of worlds 0 to ``episodes - 1`` of a list of any length, without holding its worlds in
+    memory.
 
-    Sets of measures that take longer than driving are not in them. ``jobs`` and ``ray`` as in ``run_each``.
+    Sets of measures that take longer than driving are omitted. ``jobs`` and ``ray`` as in ``run_each``.
     """
     check_whole_number("episodes", episodes, 1, MOST_EPISODES)
     check_whole_number("seed", seed, 0)
@@ -193,7 +194,7 @@ def _tell(on_done: OnDone | None, chunks: int, worlds: int) -> None:
 
 
 def summarise_tally(lineup: Lineup, tally: Tally, seed: int) -> SummaryTable:
-    """One row per agent, as ``summarise``. Raises ``PhysicsError`` if no world is left."""
+    """Return one row per agent, as ``summarise`` does. Raise ``PhysicsError`` if every world was left out."""
     if not tally.worlds:
         raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in tally.left_out})
     scenario = lineup.scenario

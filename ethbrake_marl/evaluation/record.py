@@ -95,10 +95,11 @@ def record_episode(
 
 
 def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float) -> Iterator[tuple[Floats, ...]]:
-    """Rows of (time, gaps, speeds, positions, command from then on), segment by segment, the last with its end.
+    """Yield arrays of samples (time, gaps, speeds, positions, command), segment by segment; only the last includes its
+    end.
 
-    Worlds know gaps and speeds only. An obstacle ahead of Vehicle 1, the world's own or one that is out of reach, makes
-    its position one more gap.
+    Worlds hold gaps and speeds, not positions. So Vehicle 1's position is measured as its gap to an obstacle ahead,
+    which is the world's own or one out of reach.
     """
     front = 0.0  # position of Vehicle 1 at the start of the segment
     for number, (before, command, until_s) in enumerate(segments):
