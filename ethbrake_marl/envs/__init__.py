@@ -1,1 +1,3 @@
-"""The interfaces: PettingZoo (parallel, AEC), Gymnasium, Gymnasium vector, SB3 ``VecEnv``; ``render()``."""
+"""Environments for each interface: PettingZoo (parallel, AEC), Gymnasium, Gymnasium vector, SB3 ``VecEnv``;
+``render()``.
+"""
