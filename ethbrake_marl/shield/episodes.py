@@ -33,14 +33,14 @@ class Shielded(NamedTuple):
     def of(episodes: Episodes, task: Task) -> Shielded:
         """Collect the results of ended ``episodes`` that a driver behind a step shield drove."""
         shield: StepShield = episodes.guarded.shield
-        assert shield.running is not None
+        assert shield.memory.running is not None
         return Shielded(
             episodes.ledger.world_harm(task.harm_count),
             episodes.ledger.vehicle_harm(task.harm_count),
             shield.predicted_harm,
-            shield.baseline_shares,
-            shield.replaced.reshape(len(shield.replaced), -1),
-            shield.running.steps.copy(),
+            shield.memory.baseline_shares,
+            shield.memory.replaced.reshape(len(shield.memory.replaced), -1),
+            shield.memory.running.steps.copy(),
             ~episodes.at_rest,
         )
 

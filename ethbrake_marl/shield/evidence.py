@@ -56,29 +56,31 @@ def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
     Raises ``InvalidInput`` without a log, or where the number of worlds differs.
 
     """
-    if shield.log is None or shield.running is None:
+    if shield.log is None or shield.memory.running is None:
         raise InvalidInput("review: nothing was logged; make the shield with logging=True, and drive behind it")
-    if worlds.n != shield.running.n:
-        raise InvalidInput(f"review: {count_of(worlds.n, 'world')}, but {shield.running.n} were driven last")
-    log = [entry for entry in shield.log if entry.world < worlds.n and entry.episode == shield.episode[entry.world]]
+    if worlds.n != shield.memory.running.n:
+        raise InvalidInput(f"review: {count_of(worlds.n, 'world')}, but {shield.memory.running.n} were driven last")
+    log = [
+        entry for entry in shield.log if entry.world < worlds.n and entry.episode == shield.memory.episode[entry.world]
+    ]
     world = np.array([entry.world for entry in log], np.int64)
     step = np.array([entry.step for entry in log], np.int64)
     realised, without = np.zeros(0), np.zeros(0)
     if world.size:
-        never = np.full(worlds.n, shield.backup.plan.shape[1])
+        never = np.full(worlds.n, shield.memory.backup.plan.shape[1])
         realised = _released_harm(shield, policy, worlds, np.arange(worlds.n), never)[world]
         without = _released_harm(shield, policy, worlds, world, step)
     verdict = np.where(without > realised + SAME_HARM, "needed", "harmless")
     verdict = np.where(without < realised - SAME_HARM, "costly", verdict)
     whose = np.array([entry.vehicle for entry in log], np.int64)
-    return Review(world, whose, step, realised, without, verdict, ~shield.distrusted[world])
+    return Review(world, whose, step, realised, without, verdict, ~shield.memory.distrusted[world])
 
 
 def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: Ints, step: Ints) -> Floats:
     """Return the harm in worlds ``world`` [m] if the applied actions are repeated before decision ``step`` [m], and the
     policy drives from that decision on.
     """
-    scenario, plan = shield.scenario, shield.backup.plan[world]
+    scenario, plan = shield.scenario, shield.memory.backup.plan[world]
     actions = plan.reshape(*plan.shape[:2], len(shield.vehicles))
     again = {
         i: _Released(agent, actions[:, :, c], step, shield.vehicles, scenario.time_step_s)

@@ -62,7 +62,7 @@ class StepGuard(ShieldGuard):
         if self._told is not None and not (rows < self._told.n).all():
             raise InvalidInput(f"shield: told of {count_of(self._told.n, 'world')}, but row {rows.max()} begins")
         shield.begin(alert if self._told is None else self._told.take(rows), rows, self._policies or None)
-        moving = int((~shield.settles[rows]).sum())
+        moving = int((~shield.memory.settles[rows]).sum())
         if moving and self._to_warn:
             self._to_warn = False
             warnings.warn(
@@ -77,7 +77,7 @@ class StepGuard(ShieldGuard):
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
         """Let the shield certify or replace the proposals in all worlds whose episodes still run."""
         shield: StepShield = memory.shield
-        goes_on, finished = ~running.ended, shield.running.finished  # type: ignore[union-attr]  # it has begun
+        goes_on, finished = ~running.ended, shield.memory.running.finished  # type: ignore[union-attr]  # it has begun
         worlds = running.worlds if self._policies or self._told is not None else None  # computed at each access
         proposed, memories = self._asked(worlds, memory.policies, proposed)
         seen = seen_columns(running.packed)
@@ -100,8 +100,9 @@ class StepGuard(ShieldGuard):
         """
         memory: Guarded = ruling.memory
         shield: StepShield = memory.shield
-        running, wanted = shield.running, ruling.asked & ~shield.distrusted
+        running, distrusted = shield.memory.running, shield.memory.distrusted
         assert running is not None
+        wanted = ruling.asked & ~distrusted
         wanted[list(after.roster.failed)] = False
         if (wrong := np.flatnonzero(wanted & (after.steps != running.steps))).size:
             k = int(wrong[0])
@@ -118,7 +119,7 @@ class StepGuard(ShieldGuard):
                 f"shield: after this step {difference(running.nominal().states[k], seen[k])} (world {k})"
             )
         shield = copy.copy(shield)
-        shield.distrusted = shield.distrusted | surprising
+        shield.memory = shield.memory._replace(distrusted=distrusted | surprising)
         return memory._replace(shield=shield)
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
@@ -126,9 +127,8 @@ class StepGuard(ShieldGuard):
         vehicle.
         """
         shield: StepShield = memory.shield
-        assert shield.running is not None
         infos = self._of_step(ruling) | why(ruling)
-        infos |= {"bound_harm": shield.bound, "trusted": ~shield.distrusted, "settles": shield.settles}
+        infos |= {"bound_harm": shield.bound, "trusted": ~shield.memory.distrusted, "settles": shield.memory.settles}
         if self._shares:
-            infos |= {"own_harm": shield.shares(), "baseline_own_harm": shield.baseline_shares}
+            infos |= {"own_harm": shield.shares(), "baseline_own_harm": shield.memory.baseline_shares}
         return infos

@@ -40,7 +40,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Self, cast, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ethbrake_marl.agents.driving import script_agents
 from ethbrake_marl.agents.protocol import Agent, fixed_commands
@@ -58,7 +57,8 @@ from ethbrake_marl.shield.first_plan import best_constants, joint_constants
 from ethbrake_marl.shield.log import Intervention, interventions
 from ethbrake_marl.shield.reasons import ShieldReason
 from ethbrake_marl.shield.rollouts import Proposer, certify_by_policy, rolled_out
-from ethbrake_marl.shield.running import Running, begin_running, put
+from ethbrake_marl.shield.running import Running, begin_running
+from ethbrake_marl.shield.step_memory import StepMemory
 
 Cap = Literal["baseline"]  # plan under which a vehicle's harm is its cap, the largest harm that it may bear
 
@@ -125,17 +125,8 @@ class StepShield:
         self.vehicle = self.vehicles if several else self.vehicles[0]
         self.scenario, self.harm_count, self.allowance, self.cap = scenario, harm_count, allowance, cap
         self.logging = logging
-        self._entries: list[Intervention] = []  # shared with copies; the first ``_logged`` belong to this shield
-        self._logged = 0
-        self.running: Running | None = None
-        self.backup = Backup(np.zeros((0, 0)), np.zeros(0))
-        self.first_bound: Floats = np.zeros(0)  # [n] harm of the backup at the first decision
-        self.alone_harm: Floats = np.zeros(0)  # [n] harm of the policy's rollout; infinity without a policy
-        self.settles: Bools = np.zeros(0, np.bool_)  # [n] whether all vehicles rest at the horizon under the first plan
-        self.replaced: Ints = np.zeros(0, np.int64)  # [n] or [n, K] number of actions replaced so far in the episode
-        self.episode: Ints = np.zeros(0, np.int64)  # [n] number of each row's running episode
-        self.distrusted: Bools = np.zeros(0, np.bool_)  # [n] whether the world contradicted the prediction
-        self.baseline_shares: Floats = np.zeros((0, 0))  # [n, N] harm of each vehicle under the best constant actions
+        self._entries: list[Intervention] = []  # shared with copies; the first ``memory.logged`` belong to this shield
+        self.memory = StepMemory()
         scripts = script_agents(scenario, except_for=self.vehicles) if others is None else others
         self._others = {i: script for i, script in scripts.items() if i not in self.vehicles}
         self._width = int(Decisions(np.zeros(1), scenario.time_step_s).before(scenario.horizon_s)[0]) + 1
@@ -143,15 +134,18 @@ class StepShield:
     @property
     def bound(self) -> Floats:
         """Largest possible harm of each running episode, [n] m2/s2; certificates may use all of it."""
-        if self.running is None or self.allowance == 0.0:
-            return self.backup.harm
-        granted = np.where(self.running.finished, 0.0, self.first_bound + self.allowance)
-        return np.maximum(self.backup.harm, granted)
+        return self._bound_of(self.memory)
+
+    def _bound_of(self, memory: StepMemory) -> Floats:
+        running, harm = memory.running, memory.backup.harm
+        if running is None or self.allowance == 0.0:
+            return harm
+        return np.maximum(harm, np.where(running.finished, 0.0, memory.first_bound + self.allowance))
 
     @property
     def predicted_harm(self) -> Floats:
         """Bound at the alert, allowance included, [n] m2/s2."""
-        return self.first_bound + self.allowance
+        return self.memory.first_bound + self.allowance
 
     @property
     def chosen_policy(self) -> Bools:
@@ -161,30 +155,28 @@ class StepShield:
     @property
     def log(self) -> list[Intervention] | None:
         """All interventions so far; None without ``logging``."""
-        return self._entries[: self._logged] if self.logging else None
+        return self._entries[: self.memory.logged] if self.logging else None
 
     def clear_log(self) -> None:
         """Delete all log entries. The log grows until this is called."""
-        self._entries, self._logged = [], 0
+        self._entries, self.memory = [], self.memory._replace(logged=0)
 
     @property
     def interventions(self) -> Ints:
         """Number of actions replaced so far in each running episode, summed over the vehicles, [n]."""
-        return np.asarray(self.replaced.reshape(len(self.replaced), -1).sum(axis=1), np.int64)
+        return np.asarray(self.memory.replaced.reshape(len(self.memory.replaced), -1).sum(axis=1), np.int64)
 
     def shares(self) -> Floats:
         """Return the harm that each vehicle bears if the current plan is executed, [n, N] m2/s2."""
-        if self.running is None:
+        running, backup = self.memory.running, self.memory.backup
+        if running is None:
             raise InvalidInput("shield: shares, but no episode has begun; call begin first")
-        return ends_under(self.running.nominal(), self.backup.plan)[1][:, -self.scenario.vehicles :]
+        return ends_under(running.nominal(), backup.plan)[1][:, -self.scenario.vehicles :]
 
     def take(self, rows: Ints) -> Self:
         """Return an independent shield for some of the rows."""
-        part, held = copy.copy(self), self.backup
-        part.running = None if self.running is None else self.running.take(rows)
-        part.backup = held._replace(plan=held.plan[rows], harm=held.harm[rows])
-        for name in ("first_bound", "alone_harm", "settles", "replaced", "distrusted", "baseline_shares", "episode"):
-            setattr(part, name, getattr(self, name)[rows])
+        part = copy.copy(self)
+        part.memory = self.memory.take(rows)
         return part
 
     def begin(
@@ -208,22 +200,23 @@ class StepShield:
             possible: the members of each world [n * M], the world itself first; None: ``members_of(worlds)``.
 
         """
-        running_rows = len(self.first_bound)
+        running_rows = len(self.memory.first_bound)
         if not (rows < running_rows).all() and sorted(rows.tolist()) != list(range(len(rows))):
             raise InvalidInput(
                 f"shield: begin in row {rows.max()} of a batch of {running_rows}: a larger batch begins with all of its"
                 " rows at once"
             )
-        new = copy.copy(self)
-        new._begin(worlds, rows, policy, self.members_of(worlds) if possible is None else possible)
-        self.__dict__.update(new.__dict__)
+        possible = self.members_of(worlds) if possible is None else possible
+        self.memory = self.memory.put(rows, self._begun(worlds, rows, policy, possible))
 
     def members_of(self, worlds: Worlds) -> Worlds:
         """Return the members of worlds at the alert, [n * M]. Here each world is its only member."""
         return worlds
 
-    def _begin(self, worlds: Worlds, rows: Ints, policy: Agent | Mapping[int, Agent] | None, possible: Worlds) -> None:
-        """Compute the first plan and its bound in each of these worlds, and store both in their rows."""
+    def _begun(
+        self, worlds: Worlds, rows: Ints, policy: Agent | Mapping[int, Agent] | None, possible: Worlds
+    ) -> StepMemory:
+        """Return the memory of these episodes as they begin, with the first plan and its bound in each world."""
         members, vehicles = possible.n // worlds.n, self.vehicles
         problem = self._problem(possible, members)
         running = begin_running(problem, members)
@@ -245,14 +238,14 @@ class StepShield:
             plan[better] = actions[better]
             harm = np.where(better, alone, harm)
         settles = ends_under(running, plan)[0]
-        harm = self._bound_at_alert(possible, problem, rows, plan, harm)
-        new: dict[str, NDArray[Any]] = {
-            "first_bound": harm, "alone_harm": alone, "settles": settles,
-            "replaced": np.zeros((worlds.n, *plan.shape[2:]), np.int64), "distrusted": np.zeros(worlds.n, np.bool_),
-            "baseline_shares": borne[::members, borne.shape[1] - worlds.N :],
-        }  # fmt: skip
+        harm, enclosure = self._bound_at_alert(possible, problem, rows, plan, harm)
         constants = joint_constants(len(vehicles)) if len(vehicles) > 1 else np.array(CONSTANTS)
-        self._keep(rows, running, Backup(plan, harm, constants), new)
+        return StepMemory(
+            running, Backup(plan, harm, constants), first_bound=harm, alone_harm=alone, settles=settles,
+            replaced=np.zeros((worlds.n, *plan.shape[2:]), np.int64), distrusted=np.zeros(worlds.n, np.bool_),
+            baseline_shares=borne[::members, borne.shape[1] - worlds.N :], episode=np.zeros(worlds.n, np.int64),
+            enclosure=enclosure,
+        )  # fmt: skip
 
     def _problem(self, possible: Worlds, members: int) -> ProfileProblem:
         """Return all possible worlds with the commands of the unshielded vehicles.
@@ -281,30 +274,12 @@ class StepShield:
 
     def _bound_at_alert(
         self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
-    ) -> Floats:
-        """Return the bound [n] of the first plans. Here it is ``harm``, their harm in the worst member."""
-        return harm
+    ) -> tuple[Floats, Any]:
+        """Return the bound [n] of the first plans, and the enclosure to remember.
 
-    def _keep(self, rows: Ints, running: Running, backup: Backup, new: dict[str, NDArray[Any]]) -> None:
-        """Store newly begun episodes in their rows, or replace the whole batch by a larger one."""
-        old, order = self.running, np.argsort(rows)
-        if old is None or running.n >= old.n:
-            self.running = running.take(order)
-            self.backup = backup._replace(plan=backup.plan[order], harm=backup.harm[order])
-            new = {name: values[order] for name, values in new.items()}
-            new["episode"] = np.full(running.n, self.episode.max(initial=-1) + 1)
-        else:
-            at = old.rows_of(rows)
-            self.running = Running(
-                old.problem.put(at, running.problem), put(old.states, at, running.states),
-                put(old.steps, rows, running.steps), put(old.ended, at, running.ended),
-                put(old.caps, at, running.caps) if old.caps.size else old.caps,
-            )  # fmt: skip
-            plan, harm = put(self.backup.plan, rows, backup.plan), put(self.backup.harm, rows, backup.harm)
-            self.backup = backup._replace(plan=plan, harm=harm)
-            new["episode"] = self.episode[rows] + 1
-            new = {name: put(getattr(self, name), rows, values) for name, values in new.items()}
-        self.__dict__.update(new)
+        Here the bound is ``harm``, their harm in the worst member, and there is no enclosure.
+        """
+        return harm, None
 
     def decide(
         self,
@@ -319,48 +294,51 @@ class StepShield:
         ``seen`` [n, columns] holds the observed worlds in the first columns of ``Running.states``; None skips the
         comparison with the prediction. A ``proposer`` is rolled out where nothing else certifies a proposal.
         """
-        if self.running is None:
+        memory = self.memory
+        if memory.running is None:
             raise InvalidInput("shield: decide, but no episode has begun; call begin first")
-        if np.shape(proposed) != (shape := (*self.distrusted.shape, *self.backup.plan.shape[2:])):
+        if np.shape(proposed) != (shape := (*memory.distrusted.shape, *memory.backup.plan.shape[2:])):
             raise InvalidInput(f"shield: proposed {np.shape(proposed)}; {shape} is needed")
-        after = copy.copy(self)
-        decision = after._decided(proposed, seen, ~self.running.finished if only is None else only, proposer)
-        self.__dict__.update(after.__dict__)  # atomic: not even an interrupt leaves a partial update
+        asked = ~memory.running.finished if only is None else only
+        if seen is not None:
+            memory = self._compared(memory, seen, asked)
+        decision, self.memory = self._decided(memory, proposed, asked, proposer)
         return decision
 
-    def _decided(self, proposed: Floats, seen: Floats | None, asked: Bools, proposer: Proposer | None) -> Decision:
-        """Decide, and update this shield to its state after the decision."""
-        assert self.running is not None
-        if seen is not None:
-            self._compare(seen, asked)
-        before = self.running
+    def _decided(
+        self, memory: StepMemory, proposed: Floats, asked: Bools, proposer: Proposer | None
+    ) -> tuple[Decision, StepMemory]:
+        """Return the decision in the worlds that are ``asked`` [n], and the memory after it."""
+        before, held, budget = memory.running, memory.backup, self._bound_of(memory)
+        assert before is not None
         goes_on, asked = asked & before.finished, asked & ~before.finished
         each = np.repeat(asked, before.members)
         now = before._replace(ended=before.ended | ~each)
         given = np.array(proposed, np.float64)
-        given[self.distrusted] = np.nan
-        held, budget = self.backup, self.bound
+        given[memory.distrusted] = np.nan
         decision = certify(now, given, held, budget)
         if proposer is not None:
             decision = certify_by_policy(decision, now, given, budget, held.plan, proposer)
-        decision = self._also_certified(now, held, budget, decision, asked & ~self.distrusted)
-        decision.reason[asked & self.distrusted] = ShieldReason.ASSUMPTION_BROKEN
+        decision = self._also_certified(now, memory, budget, decision, asked & ~memory.distrusted)
+        decision.reason[asked & memory.distrusted] = ShieldReason.ASSUMPTION_BROKEN
         decision.applied[goes_on] = -1.0  # full braking where the episode should have ended
-        self.replaced = self.replaced + (decision.intervened.T & asked).T
-        self.running = decision.after._replace(ended=np.where(each, decision.after.ended, before.ended))
-        self.backup = decision.backup
-        decision = decision._replace(bound=self.bound)
+        after = memory._replace(
+            replaced=memory.replaced + (decision.intervened.T & asked).T,
+            running=decision.after._replace(ended=np.where(each, decision.after.ended, before.ended)),
+            backup=decision.backup,
+        )
+        decision = decision._replace(bound=self._bound_of(after))
         if self.logging:
-            if len(self._entries) > self._logged:  # entries of a step that was rolled back, or of a copy
-                self._entries = self._entries[: self._logged]
-            self._entries.extend(interventions(now, self.episode, self.vehicles, proposed, decision, held))
-            self._logged = len(self._entries)
-        return decision
+            if len(self._entries) > memory.logged:  # entries of a step that was rolled back, or of a copy
+                self._entries = self._entries[: memory.logged]
+            self._entries.extend(interventions(now, memory.episode, self.vehicles, proposed, decision, held))
+            after = after._replace(logged=len(self._entries))
+        return decision, after
 
-    def _also_certified(self, now: Running, held: Backup, budget: Floats, decision: Decision, asked: Bools) -> Decision:
-        """Restrict a decision that all members allow; this class leaves it unchanged. ``held`` is the backup
-        before it.
-        """
+    def _also_certified(
+        self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
+    ) -> Decision:
+        """Restrict a decision that all members allow; this class leaves it unchanged. ``memory`` is the one before."""
         return decision
 
     def as_seen(self, seen: Floats) -> Floats:
@@ -368,12 +346,13 @@ class StepShield:
 
         Worlds without an obstacle get the predicted gap to the obstacle where the prediction has a column for it.
         """
-        assert self.running is not None
-        N = self.running.problem.mass.shape[1]
+        running = self.memory.running
+        assert running is not None
+        N = running.problem.mass.shape[1]
         if self.scenario.vehicles == N:
             return seen
         seen = seen.copy()
-        seen[:, N] = np.where(np.isposinf(seen[:, N]), self.running.states[:: self.running.members, N], seen[:, N])
+        seen[:, N] = np.where(np.isposinf(seen[:, N]), running.states[:: running.members, N], seen[:, N])
         return seen
 
     def expects(self, seen: Floats) -> Bools:
@@ -382,7 +361,7 @@ class StepShield:
         With one member, both must be equal to the bit. With several members, each column must lie within the range of
         their predictions, or, after an impact in one of them, be a finite number.
         """
-        running = self.running
+        running = self.memory.running
         assert running is not None
         seen = self.as_seen(seen)
         columns = seen.shape[1]
@@ -399,29 +378,30 @@ class StepShield:
         predicted = running.states.reshape(running.n, running.members, -1)
         return np.asarray((predicted[:, :, 2 * N - 1 : 3 * N - 2] == 1.0).any(axis=(1, 2)), np.bool_)
 
-    def _compare(self, seen: Floats, asked: Bools) -> None:
-        """Mark the worlds that contradict the prediction as distrusted, and choose a new fallback plan from the
-        observed state.
+    def _compared(self, memory: StepMemory, seen: Floats, asked: Bools) -> StepMemory:
+        """Return the memory after a comparison of the observed worlds with the prediction.
+
+        Worlds that contradict it are distrusted, and get a new fallback plan from the observed state.
         """
-        assert self.running is not None
-        running, seen = self.running, self.as_seen(seen)
+        running, backup, seen = memory.running, memory.backup, self.as_seen(seen)
+        assert running is not None
         columns, surprising = seen.shape[1], asked & ~self.expects(seen)
         if not surprising.any():
-            return
-        self.distrusted = self.distrusted | surprising
+            return memory
         known = np.isfinite(seen).all(axis=1) & ~running.finished  # other worlds keep their prediction, or brake fully
         rows = np.flatnonzero(surprising & known)
         states, ended, at = running.states.copy(), running.ended.copy(), running.rows_of(rows)
         states[at, :columns] = np.repeat(seen[rows], running.members, axis=0)
         ended[at] = np.repeat(running.steps[rows], running.members) >= running.problem.last_step[at]
-        self.running = running._replace(states=states, ended=ended)
-        plan, harm, held = self.backup.plan.copy(), self.backup.harm.copy(), self.backup.plan
+        running = running._replace(states=states, ended=ended)
+        plan, harm = backup.plan.copy(), backup.harm.copy()
         harm[rows] = np.inf
-        for constant in (None, *self.backup.constants):
-            trial = held if constant is None else from_now(held, constant, running.steps)
+        for constant in (None, *backup.constants):
+            trial = backup.plan if constant is None else from_now(backup.plan, constant, running.steps)
             with renumbered(rows):
-                found = plan_harm(self.running.take(rows), trial[rows])
+                found = plan_harm(running.take(rows), trial[rows])
             better = rows[found < harm[rows]]
             harm[rows] = np.minimum(found, harm[rows])
             plan[better] = trial[better]
-        self.backup = self.backup._replace(plan=plan, harm=harm)
+        distrusted, backup = memory.distrusted | surprising, backup._replace(plan=plan, harm=harm)
+        return memory._replace(running=running, backup=backup, distrusted=distrusted)

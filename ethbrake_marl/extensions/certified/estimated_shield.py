@@ -42,21 +42,20 @@ SURPRISE = 1e-6  # by more than this (m, m/s) what is measured is not what was f
 
 def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
     """Where it began anew, count the members' harm so far, and hold the old plan's rest if that harms no more."""
-    running, old = shield.running, before.running
+    (running, backup), (old, held) = shield.memory[:2], before.memory[:2]
     assert running is not None and old is not None
-    at, plan, width = running.rows_of(rows), shield.backup.plan[rows].copy(), before.backup.plan.shape[1]
+    at, plan, width = running.rows_of(rows), backup.plan[rows].copy(), held.plan.shape[1]
     N, states = running.problem.mass.shape[1], running.states.copy()
     states[at, 3 * N - 2 : 5 * N - 4] = old.states[at, 3 * N - 2 : 5 * N - 4]  # harm
-    shield.running = running._replace(states=states)
+    running = running._replace(states=states)
     column = np.arange(width) + old.steps[rows, np.newaxis]
-    rest = np.take_along_axis(before.backup.plan[rows], np.minimum(column, width - 1), axis=1)
+    rest = np.take_along_axis(held.plan[rows], np.minimum(column, width - 1), axis=1)
     rest = np.where(column < width, rest, -1.0)  # full braking after the plan
-    part = shield.running.take(rows)
+    part = running.take(rows)
     harm, still = plan_harm(part, plan), plan_harm(part, rest)
     plan[still <= harm] = rest[still <= harm]
-    shield.backup = shield.backup._replace(
-        plan=put(shield.backup.plan, rows, plan), harm=put(shield.backup.harm, rows, np.minimum(still, harm))
-    )
+    backup = backup._replace(plan=put(backup.plan, rows, plan), harm=put(backup.harm, rows, np.minimum(still, harm)))
+    shield.memory = shield.memory._replace(running=running, backup=backup)
 
 
 class BelievedShield:
@@ -125,7 +124,7 @@ class BelievedShield:
     def take(self, rows: Ints) -> BelievedShield:
         """The shield of some rows, which goes on apart."""
         apart = copy.copy(self)
-        if self.shield.running is not None:
+        if self.shield.memory.running is not None:
             apart.shield = self.shield.take(rows)
         apart._odometer = take_memory(self._odometer, rows)
         for name in (*PER_WORLD, *(("_totals",) if len(self._totals) else ())):
@@ -183,7 +182,7 @@ class BelievedShield:
         shield, vehicle = self.shield, self.vehicle
         told = Told.to(worlds, vehicle)
         heard = np.concatenate([told.known, told.reacts], axis=1).astype(np.float64)
-        fresh, begun = np.isnan(self._heard[:, 0]), shield.running is not None
+        fresh, begun = np.isnan(self._heard[:, 0]), shield.memory.running is not None
         keeps, anew = np.zeros_like(told.known), fresh
         if self.robust != INTERIOR:  # its plans are certified from the first decision on, whatever is heard later
             if begun:
@@ -204,7 +203,7 @@ class BelievedShield:
         first, self._heard[rows] = rows[fresh[rows]], heard[rows]
         felt = worlds.pair_hit[first, max(vehicle - 1, 0) : vehicle + 1].any(axis=1)
         felt |= worlds.obstacle_hit[first] & (vehicle == 0)
-        self.predicted_harm[first] = np.where(felt, np.inf, shield.backup.harm[first])
+        self.predicted_harm[first] = np.where(felt, np.inf, shield.memory.backup.harm[first])
 
     def _begin_shield(
         self, worlds: Worlds, believed: Worlds, way_m: Floats, rows: Ints, keeps: Bools, before: StepShield | None
@@ -214,8 +213,9 @@ class BelievedShield:
         for m, share in enumerate([None, *self._corners()]):
             foretold = None
             if before is not None:
-                assert before.running is not None
-                expected = worlds_at(believed, before.running.states[rows * before.running.members + m])
+                running = before.memory.running
+                assert running is not None
+                expected = worlds_at(believed, running.states[rows * running.members + m])
                 known = keeps.any(axis=1, keepdims=True)
                 foretold = (replace(expected, pair_hit=expected.pair_hit & known), keeps)
             parts.append(self._believe(worlds, way_m, share, foretold))
@@ -223,7 +223,7 @@ class BelievedShield:
 
     def _keeps(self, told: Told, time_s: Floats) -> Bools:
         """Whose foretold state tells more than what was told, [n, N]: nobody told anything, or not since an impact."""
-        running = self.shield.running
+        running = self.shield.memory.running
         if running is None:
             return np.zeros(told.known.shape, np.bool_)
         n, N = told.known.shape
@@ -239,7 +239,7 @@ class BelievedShield:
 
     def _note_impacts(self, worlds: Worlds) -> None:
         """Write down which vehicles met in some member since the last decision."""
-        running = self.shield.running
+        running = self.shield.memory.running
         assert running is not None
         pairs = running.problem.mass.shape[1] - 1
         totals = running.states[:, 4 * pairs + 1 : 5 * pairs + 1].reshape(worlds.n, running.members, pairs)
@@ -252,10 +252,11 @@ class BelievedShield:
 
     def _is_surprised(self, believed: Worlds, heard: Bools) -> Bools:
         """Where somebody of whom was ``heard`` [n, N] is not within what the shield foretold, [n]."""
-        assert self.shield.running is not None
+        running = self.shield.memory.running
+        assert running is not None
         seen, wrong = seen_columns(Packed.of(believed)), np.zeros(believed.n, np.bool_)
         first = (seen.shape[1] + 4) // 5 - believed.N  # 1: an obstacle ahead is vehicle 0 of the columns
-        foretold = self.shield.running.states[:, : seen.shape[1]].reshape(believed.n, self.shield.running.members, -1)
+        foretold = running.states[:, : seen.shape[1]].reshape(believed.n, running.members, -1)
         outside: Bools = (seen < foretold.min(axis=1) - SURPRISE) | (seen > foretold.max(axis=1) + SURPRISE)
         for i in range(believed.N):
             wrong |= heard[:, i] & outside[:, first + i]

@@ -26,7 +26,7 @@ class RobustGuard(StepGuard):
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
         """What the infos say of a certified step, and in how many worlds for each one it is certified."""
-        return super().tell(memory, ruling) | {"members": memory.shield.running.members}
+        return super().tell(memory, ruling) | {"members": memory.shield.memory.running.members}
 
 
 class BelievedGuard(ShieldGuard):
@@ -61,7 +61,7 @@ class BelievedGuard(ShieldGuard):
         infos |= {"bound_harm": np.inf, "settles": False, "believed": True, "trusted": robust}
         if ruling is not None:
             infos["bound_harm"] = np.where(np.isfinite(estimated.predicted_harm), shield.bound, np.inf)
-            infos["settles"] = shield.settles
+            infos["settles"] = shield.memory.settles
         if robust:
             infos["members"] = estimated.members
         return infos

@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from ethbrake_marl.shield.certify import Backup, Decision, certify
 from ethbrake_marl.shield.reasons import NO_CERTIFICATE
 from ethbrake_marl.shield.running import Running
 from ethbrake_marl.shield.step import StepShield
+from ethbrake_marl.shield.step_memory import StepMemory
 
 
 class RobustShield(StepShield):
@@ -56,7 +57,6 @@ class RobustShield(StepShield):
             what = "several vehicles" if self.cap is None else "a cap"
             raise InvalidInput(f"shield: uncertainty: {what} with it: not covered; mode robust shields one vehicle")
         self.uncertainty, self.robust = uncertainty, checked_robust(robust, "shield")
-        self.boxes: Boxes | None = None  # of ``interior``, once episodes have begun
         Boxes.check_possible(self.robust, scenario, harm_count, self._others)
 
     @property
@@ -68,25 +68,27 @@ class RobustShield(StepShield):
         """The members of worlds at the alert, [n * M]: each world, then its corners."""
         return worlds if self.uncertainty is None else self.uncertainty.members(worlds)
 
-    def take(self, rows: Ints) -> Self:
-        """The shield of some rows, which goes on apart."""
-        part = super().take(rows)
-        part.boxes = None if self.boxes is None else self.boxes.take(rows)
-        return part
+    @property
+    def boxes(self) -> Boxes | None:
+        """The boxes of ``interior``, once episodes have begun; else None."""
+        boxes: Boxes | None = self.memory.enclosure
+        return boxes
 
     def _bound_at_alert(
         self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
-    ) -> Floats:
+    ) -> tuple[Floats, Boxes | None]:
         """In interior mode the bound over all worlds of each box."""
         if possible.n == len(rows) or self.robust != INTERIOR:
-            return harm
+            return harm, self.boxes
         boxes = Boxes.of(possible, problem, len(rows), self.scenario, self._others)
-        self.boxes = boxes.placed(self.boxes, rows)
-        return boxes.at_alert(plan, harm)
+        return boxes.at_alert(plan, harm), boxes.placed(self.boxes, rows)
 
-    def _also_certified(self, now: Running, held: Backup, budget: Floats, decision: Decision, asked: Bools) -> Decision:
+    def _also_certified(
+        self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
+    ) -> Decision:
         """In interior mode what is certified for all worlds of each box."""
-        return decision if self.boxes is None else certify_inside(self.boxes, now, held, budget, decision, asked)
+        boxes = memory.enclosure
+        return decision if boxes is None else certify_inside(boxes, now, memory.backup, budget, decision, asked)
 
     def _leaves_range(self, running: Running) -> Bools:
         """Worlds [n] that may leave the range of their members.
