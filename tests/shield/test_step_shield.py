@@ -637,11 +637,13 @@ def test_joint_constants__hold_all_alike_and_ladders_each_once() -> None:
 def test_bound_at_the_alert__is_at_most_full_braking_and_any_single_constant() -> None:
     worlds = PAIR.sample(40, 8).worlds
     joint = begun(PAIR, worlds)
-    braked = plan_harm(joint.running, np.full((40, STEPS, 2), -1.0))
-    assert (joint.first_bound <= braked).all()
-    assert joint.first_bound.mean() < 0.8 * braked.mean()
+    braked = plan_harm(joint.memory.running, np.full((40, STEPS, 2), -1.0))
+    assert (joint.memory.first_bound <= braked).all()
+    assert joint.memory.first_bound.mean() < 0.8 * braked.mean()
     for vehicle in (1, 2):
-        assert (joint.first_bound <= begun(PAIR.with_learners([vehicle]), worlds).first_bound + 1e-6).all()
+        assert (
+            joint.memory.first_bound <= begun(PAIR.with_learners([vehicle]), worlds).memory.first_bound + 1e-6
+        ).all()
 
 
 def test_settles__says_what_the_plan_comes_to_in_the_engine() -> None:

@@ -143,7 +143,7 @@ def test_bound_at_the_alert__is_that_of_the_best_constant_in_the_worst_corner() 
     )  # fmt: skip
     worlds, uncertainty = scenario.sample(1, 0).worlds, parse_uncertainty("gaps_m=3")
     shield = begun(scenario, worlds, RobustShield, uncertainty=uncertainty)
-    alone = [begun(scenario, uncertainty.members(worlds).take([m])).first_bound[0] for m in range(5)]
+    alone = [begun(scenario, uncertainty.members(worlds).take([m])).memory.first_bound[0] for m in range(5)]
     tried = [plan_harm(shield.memory.running, np.full((1, 81), -a))[0] for a in np.linspace(0.0, 1.0, 41)]
     assert shield.memory.running.members == 5
     assert len(set(alone)) > 2
