@@ -553,7 +553,8 @@ def _checked_dt(host: Host, scenario: Scenario) -> float:
     """Return the host's step length.
 
     Raises ``InvalidInput`` for an object that is not a host, and for a step that does not divide the scenario's time
-    step."""
+    step.
+    """
     missing = [what for what in ("dt", "state", "apply") if not hasattr(host, what)]
     if missing:
         raise InvalidInput(f"host {type(host).__name__}: has no {' and no '.join(missing)}; docs/hosts.md shows one")
