@@ -133,7 +133,7 @@ class Harms:
 
 
 class Goal(NamedTuple):
-    """Quantity that the trainings of a level minimise, as a mean over seeds, worlds and learners; also for full braking."""
+    """What the trainings of a level minimise, as a mean over seeds, worlds and learners, also for full braking."""
 
     name: str
     reached: float

@@ -78,7 +78,7 @@ class CounterfactualModel(BaseAlgorithm):
         self._train(actor, self._try_out(seen, moments, actor))
 
     def _visit(self, told: BaseCallback, act: Act) -> tuple[Float32s, State]:
-        """Drive for ``n_steps``. Return the observations [n_steps, rows, F] and the states of the worlds in step order."""
+        """Drive for ``n_steps``. Return the observations [n_steps, rows, F] and the states of the worlds."""
         seen, moments, numbers = [], [], []
         for _ in range(self.recipe.n_steps):
             observations: Any = self._last_obs

@@ -174,7 +174,7 @@ def scenario_from_data(
 
 
 def _fits(rows: Floats, draw: DataDraw) -> dict[str, Any]:
-    """Return independent fits to the time gaps, the mean speed of a row, and each vehicle's deviation from that mean."""
+    """Return independent fits to the time gaps, to the mean speed of a row, and to deviations from that mean."""
     gaps, speeds = np.split(rows, [rows.shape[1] // 2], axis=1)
     times = gaps / np.maximum(speeds[:, 1:], SLOWEST_MPS)
     used = (speeds >= SLOWEST_MPS).all(axis=1) & ((times > 0.0) & (times <= LONGEST_S)).all(axis=1)
