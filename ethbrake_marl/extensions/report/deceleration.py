@@ -108,9 +108,7 @@ def regimes_of(worlds: Worlds, pair: int, deceleration_mps2: Floats) -> NDArray[
         driving_capacity_mps2=0.0, latency_s=v.latency_s[:, own], mass_t=1.0, restitution=0.0,
         speed_limit_mps=v.speed_limit_mps[:, own],
     )  # fmt: skip
-    with np.errstate(
-        divide="ignore", invalid="ignore"
-    ):  # time at which each vehicle would stand; infinite without braking
+    with np.errstate(divide="ignore", invalid="ignore"):  # standstill time; infinite without braking
         speed = worlds.speeds_mps[:, own]
         stop_s = np.where(speed > 0.0, v.latency_s[:, own] + speed / deceleration_mps2[:, own], 0.0)
     rows = advance(alone, -deceleration_mps2[:, own], until_s=_LONG_S, record=True)[1].rows

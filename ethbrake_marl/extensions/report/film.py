@@ -60,7 +60,7 @@ def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float 
 
 
 def film(world: Worlds, agents: Mapping[str, Driver], ending: str, *, scenario: Scenario) -> bytes:
-    """Return ``film_bytes`` of several agents, by title, in one world. Impossible requests are refused before any work."""
+    """Return ``film_bytes`` of several agents, by title, in one world. Raises before any work if it is impossible."""
     check_film(ending, len(agents))
     films = {title: film_scenes(world, agent, scenario=scenario) for title, agent in agents.items()}
     return film_bytes(films, ending)

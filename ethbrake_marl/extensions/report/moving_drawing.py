@@ -125,11 +125,7 @@ class _Strip:
                     f'<rect x="{x:.1f}" y="{top}" width="5" height="{2 * _HALF_BODY}" fill="var(--{name})"'
                     f' opacity="0">{self._switched(lit)}</rect>'
                 )
-        for (
-            start,
-            until,
-            struck,
-        ) in self._events():  # a star at the front for each impact with the vehicle or obstacle ahead
+        for start, until, struck in self._events():  # a star at the front for each impact ahead
             if struck.pair + 1 == i:
                 points = " ".join(f"{x:.1f},{y:.1f}" for x, y in star(0.0, _FILM_LANE, 17, 8))
                 lit = [start <= k < until for k in range(len(self._film))]

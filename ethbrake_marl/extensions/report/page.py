@@ -42,7 +42,10 @@ class Part:
 
     @classmethod
     def paragraph(cls, text: str, kind: str = "") -> Part:
-        """Return text as a paragraph. ``kind``: ``quiet`` (conditions), ``note`` (important remark), ``alarm``, or plain."""
+        """Return text as a paragraph.
+
+        ``kind``: ``quiet`` (conditions), ``note`` (important remark), ``alarm``, or empty.
+        """
         return cls(Markup('<p class="{}">{}</p>\n').format(kind, shown(text)))
 
     @classmethod

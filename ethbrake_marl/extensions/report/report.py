@@ -37,7 +37,10 @@ SHIELD_WORLDS = 200  # number of worlds in which a shield's replacements are sim
 
 
 def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) -> Section:
-    """Return the section on the ten worlds in which an agent did worst. ``watched`` worlds get a button for the player."""
+    """Return the section on the ten worlds in which an agent did worst.
+
+    ``watched`` worlds get a button that starts the player.
+    """
     regrets, outcome = regrets_of(evaluation), evaluation.outcome(focus)
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
     columns: dict[str, NDArray[Any] | None] = {
@@ -108,7 +111,7 @@ _SPLIT: tuple[Column | str, ...] = (
 
 
 def shield_section(rows: ShieldModes, conditions: str) -> Section:
-    """Return the section that compares the shield's modes on the same worlds and rates each intervention of step mode."""
+    """Return the section that compares the shield's modes and rates each intervention of step mode."""
     if not rows:
         return Section("Shield", ())
     told = (
@@ -176,7 +179,10 @@ class Report:
 
     @property
     def about(self) -> str:
-        """The agent that the page is about: the focus, else the last agent with a trained policy, else the last agent."""
+        """The agent that the page is about.
+
+        It is the focus, else the last agent with a trained policy, else the last agent.
+        """
         learned = [row.agent for row in self.rows if row.policy_sha256]
         return self.focus or (learned or [row.agent for row in self.rows] or [""])[-1]
 
@@ -218,7 +224,7 @@ class Report:
 
     @property
     def first_sentence(self) -> str:
-        """A sentence that compares the agent's harm with full braking and the best known, and says where the agent fails.
+        """A sentence that compares the agent's harm with full braking and the best known, and names its failures.
 
         It fails in another test where it does no less harm than full braking; if it fails in none, single worlds are
         named.

@@ -54,7 +54,7 @@ def learning_curve(
 
 
 def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | None = None, bins: int = 12) -> Figure:
-    """Draw the mean of both harms against the sum of the gaps at the alert: one line per agent, bands for 95 % intervals.
+    """Draw the mean of both harms against the sum of the gaps at the alert, one line per agent, with 95 % bands.
 
     Worlds are grouped into ``bins`` equal parts of the range. Raises ``InvalidInput`` for an unknown agent or
     ``bins < 1``.

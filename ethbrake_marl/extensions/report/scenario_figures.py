@@ -78,7 +78,10 @@ def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
 
 
 def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
-    """Return label -> values [n] of the quantities to draw in pairs: one of each quantity that varies, then further ones."""
+    """Return label -> values [n] of the quantities to draw in pairs.
+
+    One entry of each quantity that varies comes first, then further entries.
+    """
     found: list[tuple[int, str, Floats]] = []
     for rule in QUANTITY.of(worlds).values():
         values, own = rule.of(worlds), {"vehicle": focus, "pair": max(focus - 1, 0), "world": 0}[rule.per]

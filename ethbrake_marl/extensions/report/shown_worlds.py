@@ -34,7 +34,10 @@ WORDS = {
 
 
 def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS) -> dict[int, Played]:
-    """Choose up to ``most`` worlds, by row: where ``focus`` did worst, best against full braking, typically, and at random."""
+    """Choose up to ``most`` worlds to show, by row.
+
+    They are worlds where ``focus`` did worst, best against full braking, and typically, and worlds at random.
+    """
     outcome = evaluation.outcome(focus)
     found: dict[int, Played] = {}
     total, first = outcome.total_harm, outcome.first_impact_harm

@@ -67,7 +67,7 @@ def series_style(number: int) -> dict[str, Any]:
 
 
 def label_text(text: str, most: int = 40) -> str:
-    """Return text that is safe in a figure: no formula, no character that the font lacks, at most ``most`` characters."""
+    """Return text that is safe in a figure: no formula, no character that the font lacks, and not too long."""
     signs = font_signs()
     told = "".join(c if ord(c) in signs else c.encode("unicode_escape").decode() for c in plain_text(text))
     return (told if len(told) <= most else f"{told[: most - 16]}…{told[-15:]}").replace("$", r"\$")

@@ -126,10 +126,7 @@ def _is_ours(svg: bytes) -> bool:
             _restyle(element, recolour=False)
             if element.tag not in _TAGS:
                 return False
-            for (
-                name,
-                value,
-            ) in element.attrib.items():  # an attribute may only draw, and refer to nothing outside its figure
+            for name, value in element.attrib.items():  # may only draw, and refer to nothing outside
                 inside = name == "transform" or "(" not in value or _CLIP.fullmatch(value) is not None
                 if not (_ID.fullmatch(value) if name == _HREF else name in _ATTRIBUTES and inside):
                     return False

@@ -30,7 +30,7 @@ def is_as_shipped(scenario: Scenario) -> bool:
 
 
 def other_tests(scenario: Scenario) -> tuple[Scenario, ...]:
-    """Return the two tests to show with results on ``scenario``; none unless it is one of the three tests as shipped."""
+    """Return the two tests to show with results on ``scenario``; none unless it is one of the three, as shipped."""
     if scenario.name not in TESTS or not is_as_shipped(scenario):
         return ()
     return tuple(load_scenario(name) for name in TESTS if name != scenario.name)

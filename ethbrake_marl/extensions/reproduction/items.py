@@ -109,9 +109,9 @@ ITEMS = (  # in the order of the paper
 
 
 def read_results(folder: Path) -> list[Result]:
-    """The results that are there, in the order of the paper.
+    """Return the results that exist, in the order of the paper.
 
-    Raises ``InvalidInput`` for one that is damaged, or another item's.
+    Raises ``InvalidInput`` for a damaged result, or a result of another item.
     """
     files = {item.name: folder / item.name / RESULT for item in ITEMS}
     return [checked_result(read_object(file), file, name) for name, file in files.items() if file.is_file()]
