@@ -55,7 +55,7 @@ _BUT_CHANNEL = {"name", "title", "description", "source", "v2x"}
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """One scenario of an ablation."""
+    """One level of an ablation: a scenario, and the level that it varies."""
 
     scenario: Scenario
     clear: str | None = None  # name of the level that differs only in ``v2x``; None: this level is on the ladder

@@ -136,7 +136,7 @@ def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, sta
 
 
 def other_count(count: HarmCount) -> HarmCount:
-    """The harm count that is not ``count``."""
+    """Return the harm count that is not ``count``."""
     return "total" if count == "first" else "first"
 
 

@@ -296,11 +296,11 @@ def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -
     gaps (plus ``way_m`` [n]), ``A`` the largest closing acceleration and ``a`` the weakest brakes. Then ``w^2`` is at
     most ``V^2``, and no gap grows beyond ``G + V^2 / 2a`` (plus ``V a / r`` if brakes build up at rate r), so all terms
     of D stay below ``S = V^2 (1 + A / a) + 2 A G``.
-    A segment of motion rounds each speed twice and each gap five times; a round of impacts rounds each speed by
-    ``CLUSTER_EPS``. Either changes D by at most 8 eps S. These errors add up and do not multiply, because the proofs
-    compare a motion with itself. ``BOUND_EPS`` covers 500 of them: an episode of 8 s has 80 steps, and the bound's own
-    arithmetic is a few hundred roundings. For several vehicles (a team) the largest speed is a speed limit if any of
-    them may drive, and the largest closing acceleration uses the strongest drive.
+    A segment of motion rounds each speed twice and each gap five times; a round of impacts rounds each speed by up to
+    8 eps of the largest speed. Either changes D by at most 8 eps S. These errors add up and do not multiply, because
+    the proofs compare a motion with itself. ``BOUND_EPS`` covers 500 of them: an episode of 8 s has 80 steps, and the
+    bound's own arithmetic is a few hundred roundings. For several vehicles (a team) the largest speed is a speed limit
+    if any of them may drive, and the largest closing acceleration uses the strongest drive.
     """
     v, chosen = worlds.vehicles, np.atleast_1d(vehicle)
     driving = v.driving_capacity_mps2[:, chosen]

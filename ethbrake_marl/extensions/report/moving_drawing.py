@@ -65,7 +65,7 @@ def animate_films(films: Mapping[str, Sequence[Scene]], *, fps: int) -> str:
 
 
 class _Strip:
-    """One film on its road."""
+    """One agent's film, drawn on its own road."""
 
     def __init__(self, film: Sequence[Scene], title: str, left_m: float, right_m: float, fps: int) -> None:
         self.title = title

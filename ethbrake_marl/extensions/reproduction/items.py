@@ -1,4 +1,4 @@
-"""The items of a reproduction, in the order of the paper."""
+"""List of the items of a reproduction (the paper's figures and tables), in the order of the paper."""
 
 from __future__ import annotations
 

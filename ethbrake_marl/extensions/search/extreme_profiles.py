@@ -57,7 +57,7 @@ def extreme_profiles(problem: ProfileProblem, states: Floats, has_front: Bools, 
 def _fill_extremes(
     problem: ProfileProblem, states: Floats, has_front: Bools, has_rear: Bools, ends: Ints, commands: Floats
 ) -> None:
-    """Fill ``ends`` [n, KEPT, K] and ``commands`` [n, KEPT, K, 1]."""
+    """Fill ``ends`` [n, KEPT, K] and ``commands`` [n, KEPT, K, 1] with the best extreme profiles of each world."""
     no_random = np.zeros(states.shape[0], np.uint64)
     for k in range(states.shape[0]):
         world = make_search_world(problem, k, no_random)

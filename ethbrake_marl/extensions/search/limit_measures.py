@@ -119,7 +119,10 @@ class LimitMeasures(MeasureSet):
         return regrets
 
     def row(self, tally: AgentTally, worlds: int, context: Regrets | Silent) -> dict[str, Any]:
-        """Return the share of worlds with a best known harm, the worlds where the agent is below it, and those between proofs."""
+        """Return the share of worlds with a best known harm, and the number of worlds where the agent is below it.
+
+        Also returns the summary of worlds with proven contact but no proven impact (``Between``).
+        """
         between = None if isinstance(context, Silent) else context.between
         return {
             "known_best_share": tally.share(KNOWN, worlds),

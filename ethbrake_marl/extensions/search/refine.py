@@ -88,7 +88,7 @@ def _refine_worlds(
     problem: ProfileProblem, random: UInt64s, budget: int, commands: Floats, first: Floats, total: Floats,
     failed: Bools,
 ) -> None:  # fmt: skip
-    """Improve ``commands`` in place, and fill the other outputs [n]."""
+    """Improve ``commands`` [n, T] in place, and fill ``first`` and ``total`` harm [n] and ``failed`` worlds [n]."""
     start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
     mine, other = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))
     room = Plan(np.zeros(T), np.zeros((T + 1, S)))

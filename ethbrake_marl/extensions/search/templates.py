@@ -36,7 +36,7 @@ def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed:
 def _best_templates(
     problem: ProfileProblem, random: UInt64s, bound: Floats, number: int, commands: Floats, steps: Ints
 ) -> None:
-    """Fill ``commands`` and ``steps``."""
+    """Fill ``commands`` [n, T] and ``steps`` [n] with the best template of each world."""
     start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
     best, room = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))
     for k in range(start.shape[0]):

@@ -37,7 +37,7 @@ class NamedWorld(FileModel):
 
 
 class NamedWorlds(FileModel):
-    """A file of named worlds."""
+    """Content of a file of named worlds."""
 
     format: Literal["ethbrake-worlds"]
     version: Annotated[int, Field(ge=1, le=1)]  # not a Literal, which would accept true and 1.0

@@ -83,7 +83,7 @@ def _place(path: YamlPath) -> str:
 
 
 class SeedRange(FileModel):
-    """``count`` seeds from ``first`` on."""
+    """Range of ``count`` seeds, starting with ``first``."""
 
     first: Seed = Field(default=0, description="the smallest seed")
     count: int = Field(ge=1, le=MOST_JOBS, description="how many seeds")
@@ -97,7 +97,7 @@ _Seeds = Annotated[
 
 
 class Grid(FileModel):
-    """All combinations of what is listed."""
+    """Jobs for all combinations of the listed values."""
 
     settings: Annotated[dict[str, _Values], AfterValidator(_check_keys)] = Field(
         default={}, alias="set", description="a list of values for each dotted key"
@@ -120,7 +120,7 @@ class Grid(FileModel):
 
 
 class ListedJob(FileModel):
-    """One job."""
+    """One single job."""
 
     settings: _Settings = Field(default={}, alias="set", description="settings by dotted key, as train --set")
     scenario: str = Field(description="a name or a path, as train --scenario")
@@ -129,7 +129,7 @@ class ListedJob(FileModel):
 
 
 class SweepFile(StudyFile):
-    """The whole file; ``settings`` hold for every job."""
+    """Content of a sweep's file; ``settings`` apply to every job."""
 
     settings: _Settings = Field(default={}, alias="set", description="settings of every job, as train --set")
     grid: Grid | None = Field(default=None, description="every combination of what it lists")

@@ -70,7 +70,10 @@ _Number = Annotated[int | float, PlainValidator(_check_number), WithJsonSchema({
 
 
 class Range(FileModel):
-    """From ``low`` to ``high``, both included; whole numbers where both are written without a point."""
+    """Range of a setting from ``low`` to ``high``, both included.
+
+    If both ends are written without a point, only whole numbers are tried.
+    """
 
     low: _Number = Field(description="the least value, included")
     high: _Number = Field(description="the largest value, included; with low: whole numbers where neither has a point")
@@ -123,7 +126,7 @@ class Range(FileModel):
 
 
 class Choices(FileModel):
-    """One of a list of values, of any kind."""
+    """List of values of a setting, of any kind."""
 
     choices: tuple[Any, ...] = Field(strict=False, min_length=2, description="values of any kind that the recipe takes")
 
@@ -178,7 +181,7 @@ def _check_recipe_keys(value: dict[str, Any]) -> dict[str, Any]:
 
 
 class Measuring(FileModel):
-    """The list by which trials are judged and pruned, and how often in a training."""
+    """List of worlds on which trials are judged and pruned, and the number of evaluations in a training."""
 
     worlds: int = Field(default=1000, ge=1, le=1_000_000, description="of the list")
     seed: Seed = Field(default=4007, description="of the list")
@@ -186,7 +189,10 @@ class Measuring(FileModel):
 
 
 class Pruning(FileModel):
-    """A trial stops whose least harm so far is above the median of the others' means until then (Ray's median rule)."""
+    """Rule that stops weak trials early (Ray's median stopping rule).
+
+    A trial stops if its least harm so far is above the median of the other trials' mean harm up to the same time.
+    """
 
     after_trials: _Count = Field(default=5, description="so many others must have come as far before one is stopped")
     after_times: _Count = Field(default=3, description="nobody is stopped before it was measured so often")
@@ -206,7 +212,7 @@ class Pruning(FileModel):
 
 
 class Sampling(FileModel):
-    """Who proposes: Optuna's TPE, or chance."""
+    """Source of the proposals: Optuna's TPE, or random values."""
 
     name: Literal["tpe", "random"] = Field(default="tpe", description="Optuna's TPE, or chance")
     seed: Seed = Field(default=0, description="of what is proposed")
@@ -223,7 +229,7 @@ class Sampling(FileModel):
 
 
 class TuningFile(StudyFile):
-    """The whole file."""
+    """Content of a tuning's file."""
 
     scenario: str = Field(description="a name or a path, as train --scenario")
     recipe: str = Field(description="a name or a path, as train --recipe")
