@@ -27,7 +27,7 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 @compiled(apart=True)
 def radius(x: Floats) -> float:
-    """Return the largest distance of a form's values from its centre."""
+    """Return the largest distance of an affine form's values from its centre."""
     whole: float = x[-1]
     for k in range(1, x.shape[0] - 1):
         whole += abs(x[k])
@@ -36,13 +36,13 @@ def radius(x: Floats) -> float:
 
 @compiled(apart=True)
 def low(x: Floats) -> float:
-    """Return the least value of a form."""
+    """Return the least value of an affine form."""
     return float(x[0] - radius(x))
 
 
 @compiled(apart=True)
 def high(x: Floats) -> float:
-    """Return the largest value of a form."""
+    """Return the largest value of an affine form."""
     return float(x[0] + radius(x))
 
 
@@ -70,7 +70,7 @@ def negative(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def between(least: float, most: float, width: int) -> Floats:
-    """Return the form [width] of an arbitrary number in an interval."""
+    """Return the affine form [width] of an arbitrary number in an interval."""
     out = np.zeros(width)
     out[0], out[-1] = 0.5 * (least + most), 0.5 * (most - least)
     return out
@@ -154,7 +154,7 @@ def positive_part(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def cut(x: Floats, least: float, most: float) -> Floats:
-    """Return a form of the same number, which is known to lie in an interval.
+    """Return an affine form of the same number, which is known to lie in an interval.
 
     The result is the interval where it is tighter than the form, else the form itself.
     """
@@ -224,7 +224,7 @@ class Path(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Motion of each vehicle alone through one piece, filled in by ``move_alone``."""
+    """Motion of each vehicle alone through one piece of time, filled in by ``move_alone``."""
 
     pull: Floats  # [N, W] acceleration by the command
     onward: Floats  # [N, W] speed at the end under the command alone, as if the vehicle never stopped
@@ -246,7 +246,7 @@ def new_motion(N: int, width: int) -> Motion:
 
 @compiled(apart=True)
 def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
-    """Move every vehicle through one piece under its command, as if it were alone on the road."""
+    """Move every vehicle through one piece of time under its command, as if it were alone on the road."""
     for i in range(cell.speed.shape[0]):
         command(cell, i, piece, motion)
     for i in range(cell.speed.shape[0]):
@@ -293,7 +293,7 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
-    """Account for brakes that hold a vehicle at rest while they are released in this piece.
+    """Account for brakes that hold a vehicle at rest while they are released in this piece of time.
 
     The vehicle may stand until its force is above 0. It is then faster, and further on, by at most the negative speed
     that it would have reached.
@@ -307,7 +307,7 @@ def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
 
 @compiled(apart=True)
 def between_shifted(x: Floats, shift: float) -> Floats:
-    """Return the form of any number between ``x`` and ``x + shift``."""
+    """Return the affine form of any number between ``x`` and ``x + shift``."""
     out = x.copy()
     add(out, 1.0, between(min(shift, 0.0), max(shift, 0.0), x.shape[0]))
     return out
@@ -336,7 +336,7 @@ def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
-    """Set ``onward`` and ``reach`` of a vehicle whose command may take effect within this piece or after it."""
+    """Set ``onward`` and ``reach`` of a vehicle whose command may take effect within this piece of time or after it."""
     pull = motion.pull[i]
     if pull[0] == 0.0 and radius(pull) == 0.0:
         return
@@ -362,7 +362,7 @@ def since(cell: Cell, i: int, time: float) -> Floats:
 
 @compiled(apart=True)
 def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> None:
-    """Set speed and distance of a braking vehicle that stops, or may stop, in this piece and then stands."""
+    """Set speed and distance of a braking vehicle that stops, or may stop, in this piece of time and then stands."""
     pull, vague, width = motion.pull[i], motion.vague[i], speed.shape[0]
     beyond = negative(motion.onward[i])
     least, most = max(low(beyond), 0.0), max(high(beyond), 0.0)
@@ -379,7 +379,7 @@ def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> 
 
 @compiled(apart=True)
 def deceleration(pull: Floats, vague: float) -> Floats:
-    """Return the mean deceleration over any part of the piece.
+    """Return the mean deceleration over any part of the piece of time.
 
     The acceleration differs from ``pull`` by at most ``vague``.
     """

@@ -42,7 +42,7 @@ SLOWEST = 0.05  # below this mean closing speed (m/s) an impact is assumed possi
 
 
 class Approach(NamedTuple):
-    """How a pair may meet within a piece."""
+    """How a pair may meet within a piece of time."""
 
     closing: Floats  # [W] closing speed at the start of the piece
     squared: Floats  # [W] squared closing speed at contact
@@ -52,7 +52,10 @@ class Approach(NamedTuple):
 
 @compiled(apart=True)
 def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
-    """Return how much a neighbouring pair in contact may change a pair's relative speed (or its gap) in the piece."""
+    """Return how much a neighbouring pair in contact may change the relative speed, or the gap, of a pair.
+
+    The change is within the present piece of time.
+    """
     P, most = cell.gap.shape[0], 0.0
     if p > 0 and path.marks[P + p - 1] != FREE:
         most += high(cell.share[p - 1, 1]) * path.touch[p - 1, REACH] if of_gap else blur(cell, path, p - 1, 1)
@@ -63,7 +66,10 @@ def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
 
 @compiled(apart=True)
 def pressing(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the least and the largest closing acceleration of a pair in the piece. Either vehicle may stop in it."""
+    """Return the least and the largest closing acceleration of a pair in the piece of time.
+
+    Either vehicle may stop in it.
+    """
     front_low, front_high = low(motion.pull[p]) - motion.vague[p], high(motion.pull[p]) + motion.vague[p]
     rear_low, rear_high = low(motion.pull[p + 1]) - motion.vague[p + 1], high(motion.pull[p + 1]) + motion.vague[p + 1]
     if motion.rest[p] != MOVES:
@@ -75,7 +81,7 @@ def pressing(motion: Motion, p: int) -> tuple[float, float]:
 
 @compiled(apart=True)
 def may_meet(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> bool:
-    """Return whether the pair may come into contact in this piece while it closes."""
+    """Return whether the pair may come into contact in this piece of time while it closes."""
     N = cell.speed.shape[0]
     gap = path.forms[N + p]
     softest, hardest = pressing(motion, p)
@@ -97,7 +103,7 @@ def may_meet(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> b
 def approach(
     cell: Cell, path: Path, motion: Motion, p: int, length: float, front_stands: bool
 ) -> tuple[Approach, bool]:
-    """Return how a pair meets, and whether it can meet in this piece at all.
+    """Return how a pair meets, and whether it can meet in this piece of time at all.
 
     ``front_stands`` selects the worlds in which the front vehicle stands at contact, or those in which it moves. For
     closing speed w, closing acceleration b and gap g, the squared closing speed at contact is ``w^2 + 2 b g``, and the
@@ -152,7 +158,7 @@ def approach(
 
 @compiled(apart=True)
 def _stopping_way(moving: bool, speed: Floats, pull: Floats, vague: float, length: float) -> Floats:
-    """Return the stopping distance of a braking vehicle that stops within the piece."""
+    """Return the stopping distance of a braking vehicle that stops within the piece of time."""
     if not high(pull) + vague < 0.0 or (vague > 0.0 and not moving):
         fastest = max(high(speed), 0.0) + max(high(pull) + vague, 0.0) * length
         return between(0.0, fastest * length, speed.shape[0])

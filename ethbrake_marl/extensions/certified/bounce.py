@@ -28,7 +28,8 @@ def spring_apart(
 ) -> None:
     """Set speeds and distances of a pair that separates after its impact.
 
-    ``jump`` is the change of relative speed by the impact, ``left`` the time from the impact to the end of the piece.
+    ``jump`` is the change of relative speed by the impact, ``left`` the time from the impact to the end of the piece of
+    time.
     """
     front, rear = product(cell.share[p, 0], jump), product(cell.share[p, 1], jump)
     after.forms[p + 1] = difference(motion.onward[p + 1], rear)

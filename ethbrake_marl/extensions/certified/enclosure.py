@@ -78,7 +78,7 @@ def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
 
 @compiled(apart=True)
 def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats) -> tuple[Cell, Floats]:
-    """Return the cell of a box, and the time from the alert to its first piece (s) as a form.
+    """Return the cell of a box, and the time from the alert to its first piece of time (s) as an affine form.
 
     Time is counted from the first decision, because the first decision falls at a different time in each world where
     the latency of the shielded vehicle is uncertain. The first piece starts before it by the shortest time that any
@@ -139,7 +139,7 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
 
 @compiled(apart=True)
 def build_up(cell: Cell, i: int, late: Floats, rates: Floats) -> None:
-    """Fill in the forces of vehicle ``i`` before the first piece (``late``) and in every piece.
+    """Fill in the forces of vehicle ``i`` before the first piece of time (``late``) and in every piece.
 
     The force is 0 at the alert. ``rates`` [2, W] are the rates of building up and of releasing the brakes.
     """
@@ -221,7 +221,7 @@ def ramp(
 
 @compiled(apart=True)
 def wait(cell: Cell, late: Floats) -> bool:
-    """Move the worlds of a cell from the alert to the first piece, which takes ``late`` (s) in each world.
+    """Move the worlds of a cell from the alert to the first piece of time, which takes ``late`` (s) in each world.
 
     Returns False if the motion until then may be more than undisturbed motion: a contact, a stop, the speed limit, or a
     command that takes effect on the way.
@@ -276,7 +276,7 @@ def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
 
 @compiled(apart=True)
 def pieces(known: Known, onset: Floats, earliest: float, plan: Floats) -> tuple[Floats, Floats]:
-    """Return the limits of the pieces (s after the first decision), and the shielded vehicle's action in each piece."""
+    """Return the limits of the pieces of time (s after the first decision), and the action in each of them."""
     N = onset.shape[0]
     before = earliest - known.begin_s
     first = math.ceil(before / LONGEST_PIECE_S) if before > 0.0 else 0
@@ -311,8 +311,8 @@ def bound_of(
 ) -> float:  # fmt: skip
     """Return an upper bound on the harm of a plan over one box.
 
-    If the result is above ``most`` it is no bound, only larger than ``most``. ``out`` receives the form that reaches
-    it.
+    If the result is above ``most`` it is no bound, only larger than ``most``. ``out`` receives the affine form that
+    reaches it.
     """
     cell, late = cell_of(low_, high_, free, known, plan)
     # rough bound for all worlds, whose first piece begins ``late`` after the alert

@@ -102,7 +102,7 @@ def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
 def branch(
     cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, how: Approach, worst: float, out: Floats
 ) -> float:
-    """Handle the worlds in which pair ``p`` has an impact in this piece; return the new ``worst``.
+    """Handle the worlds in which pair ``p`` has an impact in this piece of time; return the new ``worst``.
 
     If their harm is final it is recorded, else they become a path of their own. Where that path cannot be followed, the
     rough bound is recorded instead.
@@ -146,7 +146,7 @@ def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
 
 @compiled(apart=True)
 def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats, time: Floats, length: float) -> Floats:
-    """Return the closing speed of the other pair if it may meet in the same piece, after pair ``p``; else 0."""
+    """Return the closing speed of the other pair if it may meet in the same piece of time, after pair ``p``; else 0."""
     N, other = cell.speed.shape[0], 1 - p
     push = product(cell.share[p, other], speed)  # change of the middle vehicle's speed, towards the other pair
     push *= 1.0 + cell.restitution
@@ -169,7 +169,7 @@ def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats,
 def strike(
     cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, how: Approach, speed: Floats, harm: Floats
 ) -> bool:
-    """Put the worlds in which pair ``p`` has its impact in this piece on the stack as a new path.
+    """Put the worlds in which pair ``p`` has its impact in this piece of time on the stack as a new path.
 
     Returns False if this path cannot be followed.
     """
@@ -270,7 +270,7 @@ def may_turn(cell: Cell, motion: Motion, p: int, piece: int) -> bool:
 
 @compiled(apart=True)
 def may_move(cell: Cell, motion: Motion, i: int, piece: int, which: int) -> bool:
-    """Return whether an acceleration may fall (``which`` 0) or rise (1) within the piece by brake build-up."""
+    """Return whether an acceleration may fall (``which`` 0) or rise (1) within the piece of time by brake build-up."""
     if not cell.forces.build[i] or motion.vague[i] > cell.forces.swing[i, piece + 1].max():
         return cell.moving and motion.vague[i] > 0.0
     return bool(cell.forces.swing[i, piece + 1, which] > 0.0)
@@ -280,8 +280,8 @@ def may_move(cell: Cell, motion: Motion, i: int, piece: int, which: int) -> bool
 def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, length: float) -> bool:
     """Push a second path: the worlds in which pair ``p`` met and stayed in contact without an impact.
 
-    With brake build-up the pair may open and have its first impact within the piece; the path below on the stack covers
-    these worlds.
+    With brake build-up the pair may open and have its first impact within the piece of time; the path below on the
+    stack covers these worlds.
     """
     size = stack.size[0]
     if size >= STACK:
@@ -323,8 +323,8 @@ MOST_PATHS = 4000  # most paths to follow in one cell
 def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float) -> float:
     """Return an upper bound on the harm of every world of the cell (m2/s2).
 
-    A result above ``most`` is no bound: the search then stopped early. ``out`` [W] receives the form that reaches the
-    bound.
+    A result above ``most`` is no bound: the search then stopped early. ``out`` [W] receives the affine form that
+    reaches the bound.
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     worst, paths = -math.inf, 0
@@ -375,7 +375,10 @@ def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, o
 
 @compiled(apart=True)
 def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
-    """Return whether a pair in contact that had no impact yet may open and then have its first impact in this piece."""
+    """Return whether a pair in contact without an impact so far may have its first impact in this piece of time.
+
+    For this the pair must open first.
+    """
     P = cell.gap.shape[0]
     for p in range(P):
         if path.marks[P + p] == TOUCHES and path.marks[p] == 0:
@@ -387,7 +390,10 @@ def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
 
 @compiled(apart=True)
 def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
-    """Treat the pairs in contact, and those that may come into contact, in one piece. Return the new ``worst``."""
+    """Treat the pairs in contact, and those that may come into contact, in one piece of time.
+
+    Return the new ``worst``.
+    """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     length = cell.times[path.marks[2 * P] + 1] - cell.times[path.marks[2 * P]]
     for p in range(P):
@@ -432,7 +438,7 @@ def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out
 
 @compiled(apart=True)
 def go_on(cell: Cell, path: Path, motion: Motion) -> bool:
-    """Advance the path to the end of the piece without an impact. Return False if no world can do so."""
+    """Advance the path to the end of the piece of time without an impact. Return False if no world can do so."""
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     for p in range(P):
         if path.marks[P + p] == TOUCHES:

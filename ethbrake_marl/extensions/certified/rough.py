@@ -37,7 +37,7 @@ def driven(cell: Cell, i: int, speed: float, since: float) -> float:
 
 @compiled(apart=True)
 def rough_harm(cell: Cell, path: Path, hit: int) -> float:
-    """Return an upper bound on the harm of all worlds of a path, from the present piece on.
+    """Return an upper bound on the harm of all worlds of a path, from the present piece of time on.
 
     ``hit`` is a pair that counts as hit already; -1: only the pairs marked in the path.
     """

@@ -82,7 +82,7 @@ def backwards(cell: Cell, p: int) -> float:
 
 @compiled(apart=True)
 def stray(cell: Cell, touch: Floats, p: int) -> float:
-    """Return the largest difference between the speed of a pair's centre of mass and its form.
+    """Return the largest difference between the speed of a pair's centre of mass and its affine form.
 
     In a world that creeps, the form's speed lies between 0 and ``CREEP``, the rear vehicle's between minus
     ``backwards`` and 1 times ``CREEP``, and the front vehicle's between 0 and ``faster`` times ``CREEP``: no impact
@@ -93,13 +93,13 @@ def stray(cell: Cell, touch: Floats, p: int) -> float:
 
 @compiled(apart=True)
 def blur(cell: Cell, path: Path, p: int, side: int) -> float:
-    """Return the largest deviation of a vehicle's speed from the form of its pair in the present piece."""
+    """Return the largest deviation of a vehicle's speed from the affine form of its pair in contact."""
     return float(high(cell.share[p, side]) * path.touch[p, SPREAD] + stray(cell, path.touch[p], p))
 
 
 @compiled(apart=True)
 def begin_touch(touch: Floats) -> None:
-    """Reset the state of a contact, except the columns of the present piece."""
+    """Reset the state of a contact, except the columns of the present piece of time."""
     spread, reach = touch[SPREAD], touch[REACH]  # columns of the present piece
     touch[:] = 0.0
     touch[SPREAD], touch[REACH], touch[SOFTEST] = spread, reach, math.inf
@@ -107,7 +107,7 @@ def begin_touch(touch: Floats) -> None:
 
 @compiled(apart=True)
 def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
-    """Move a pair in contact through one piece.
+    """Move a pair in contact through one piece of time.
 
     ``motion`` holds both vehicles as if alone on entry, and as one on return.
     """
@@ -143,7 +143,10 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
 
 @compiled(apart=True)
 def dip_of(cell: Cell, vague: float, length: float) -> float:
-    """Return by how much a speed may fall below its values at both ends of a piece in which its force changes sign."""
+    """Return by how much a speed may fall below its values at both ends of a piece of time.
+
+    This can happen if the vehicle's force changes sign in it.
+    """
     return 0.5 * vague * length if cell.moving else 0.0
 
 
@@ -156,7 +159,10 @@ def own_pulls(motion: Motion, p: int) -> tuple[float, float]:
 
 @compiled(apart=True)
 def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, hardest: float, length: float) -> None:
-    """Update the bounds for worlds that may creep. ``slowest`` is the least speed of the centre of mass."""
+    """Update the bounds for worlds that may creep. ``slowest`` is the least speed of the centre of mass.
+
+    A world creeps once one vehicle of a pair in contact stands or moves backwards.
+    """
     largest = max(
         high(cell.share[p, 0]), high(cell.share[p, 1])
     )  # share of one vehicle, relative to the centre of mass
@@ -176,7 +182,7 @@ def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, har
 
 @compiled(apart=True)
 def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
-    """Update a pair whose form stands: each of its worlds stands, or creeps and is braked.
+    """Update a pair whose affine form stands: each of its worlds stands, or creeps and is braked.
 
     The brakes b reduce the rear vehicle's speed. The front vehicle's speed is at most ``faster`` times the rear one's.
     """
@@ -194,7 +200,7 @@ def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) 
 
 @compiled(apart=True)
 def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
-    """Separate a pair that was in contact and opens in this piece: both vehicles move alone from now on."""
+    """Separate a pair that was in contact and opens in this piece of time: both vehicles move alone from now on."""
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     touch, width = path.touch[p], cell.speed.shape[1]
     opening, wide, astray = max(touch[OPENING], 0.0), touch[WIDE], stray(cell, touch, p)
@@ -217,7 +223,7 @@ def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
 
 @compiled(apart=True)
 def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length: float, vague: float) -> None:
-    """Update the relative speed and the gap of a pair in contact over one piece.
+    """Update the relative speed and the gap of a pair in contact over one piece of time.
 
     The closing acceleration is between ``least`` and ``most``. An impact never increases the relative speed, so it
     grows at most by what the commands add. While the pair is pressed together by b between b- and b+, it does not grow:
@@ -269,7 +275,7 @@ def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: fl
 
 @compiled(apart=True)
 def settle(touch: Floats, e: float, length: float) -> None:
-    """Reset the contact if the pair certainly moves as one by the end of the piece.
+    """Reset the contact if the pair certainly moves as one by the end of the piece of time.
 
     A flight that begins with separating speed s takes at most 2 s / b- and closes with at most s sqrt(b+ / b-). So
     after 2 s / (b- (1 - e sqrt(b+ / b-))) the two move as one, unless one of them creeps.

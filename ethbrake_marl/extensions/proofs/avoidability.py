@@ -82,7 +82,7 @@ def drive_before_braking(
 def largest_behind(
     gap: float, v_l: float, a_l: float, v_f: float, a_f: float, u: float, limit: float
 ) -> tuple[float, float, bool]:
-    """Return the values of ``drive_before_braking`` for a drive that ends at the speed limit."""
+    """Return the values of ``drive_before_braking`` for a vehicle that stops driving at its speed limit."""
     cap = time_to_limit(v_f, u, limit)
     if cap > 0.0:
         found = drive_before_braking(gap, v_l, a_l, v_f, a_f, u)
@@ -151,7 +151,10 @@ def plan_behind(
     gap: Floats, speed: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, keep: float,
     plan: Floats, out: Floats,
 ) -> None:  # fmt: skip
-    """Write the largest trajectory that stays ``keep`` metres behind the leader, if any, to ``plan`` and ``out``."""
+    """Write the largest trajectory that stays ``keep`` metres behind the leader, if any, to ``plan`` and ``out``.
+
+    It is the trajectory that is farthest ahead at all times.
+    """
     a_f, u = braking[i], driving[i]
     if i > 0:
         a_l = braking[i - 1]

@@ -31,7 +31,7 @@ _TRIED = 8  # number of meetings evaluated before the search, for a first best v
 
 @compiled(apart=True)
 def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
-    """Return the least closing speed of meetings between two times.
+    """Return the least closing speed of first contacts between two times.
 
     It falls with time, except if the leader brakes harder than the controlled vehicle: it may then rise by the
     difference.
@@ -61,10 +61,11 @@ def decision_around(at: Floats, early: float, late: float) -> tuple[float, float
 
 @compiled(apart=True)
 def lacking(kind: int, at: Floats, early: float, late: float, softest: float, hard: float, begin: float) -> float:
-    """Return how far the command in force at a cell's meetings is from the best extreme command after them, at least.
+    """Return how far the command in force at the first contacts of a cell is from the best command after them.
 
-    Before a gentle meeting the vehicle brakes (drives); to soften what follows it drives (brakes) after it. The command
-    is the same in the whole decision step. Covers meetings with closing speeds from ``softest`` to ``hard``.
+    The result is a lower bound. Before a gentle contact the vehicle brakes (drives); to soften what follows it drives
+    (brakes) after it. The command is the same in the whole decision step, so it cannot do both. Covers contacts with
+    closing speeds from ``softest`` to ``hard``.
     """
     whole = at[LINE.U_F] + at[LINE.A_F]
     turn = gentlest(kind, at, early)[1]
@@ -88,7 +89,7 @@ def harm_of(
     kind: int, at: Floats, early: float, late: float, soft: float, hard: float, floor: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Return a lower bound on the harm of the meetings of a cell."""
+    """Return a lower bound on the harm of the first contacts of a cell (a range of times and closing speeds)."""
     begin, end = decision_around(at, early, late)
     lack = 0.0
     if end > late:
@@ -102,7 +103,7 @@ def harm_of(
 
 @compiled
 def room_for(heap: Floats, count: int, harm: float) -> int:
-    """Make room on the heap for a cell with this bound; return its index.
+    """Make room on the heap for a cell (a range of times and closing speeds) with this bound; return its index.
 
     Index 0 holds the cell with the least bound.
     """
@@ -117,7 +118,7 @@ def room_for(heap: Floats, count: int, harm: float) -> int:
 
 @compiled(apart=True)
 def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: float, hard: float) -> int:
-    """Add a cell to the heap; return the new number of cells."""
+    """Add a cell (a range of times and closing speeds) to the heap; return the new number of cells."""
     at = room_for(heap, count, harm)
     heap[at, EARLY], heap[at, LATE], heap[at, SOFT], heap[at, HARD] = early, late, soft, hard
     return count + 1
@@ -125,7 +126,7 @@ def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: 
 
 @compiled(apart=True)
 def drop_first(heap: Floats, count: int) -> int:
-    """Remove the first cell from the heap; return the new number of cells."""
+    """Remove the first cell from the heap, which has the least bound; return the new number of cells."""
     count -= 1
     at, below = 0, 1
     while below < count:
@@ -145,9 +146,9 @@ def drop_first(heap: Floats, count: int) -> int:
 def divide(
     kind: int, at: Floats, floor: float, count: int, plan: Floats, other: Floats, heap: Floats
 ) -> tuple[int, float]:
-    """Replace the first cell of the heap by its halves.
+    """Replace the first cell of the heap, a range of times and closing speeds, by its halves.
 
-    Returns the new number of cells, and the harm of a meeting inside.
+    Returns the new number of cells, and the harm of a first contact inside.
     """
     harm, early, late, soft, hard = (heap[0, HARM], heap[0, EARLY], heap[0, LATE], heap[0, SOFT], heap[0, HARD])
     count = drop_first(heap, count)
@@ -177,7 +178,7 @@ def least_harm(
     kind: int, at: Floats, first: float, last: float, floor: float, best: float, enough: float, plan: Floats,
     other: Floats, heap: Floats,
 ) -> float:  # fmt: skip
-    """Return a lower bound on the harm of all meetings between two times, or ``best`` if no meeting does less.
+    """Return a lower bound on the harm of all first contacts between two times, or ``best`` if no meeting does less.
 
     Harm of ``enough`` is proven without it: as soon as some meeting does no more than that, 0 is returned.
     """

@@ -1,4 +1,4 @@
-"""How much faster than the common speed of two vehicles in contact one of them can be, and what that costs.
+"""Bounds on how much faster than their common speed one of two vehicles in contact can be, and what that costs.
 
 A *flight* is a time in which the two are apart. ``share`` is the partner's share of both masses. ``press`` is the
 acceleration with which they close under the best command (m/s2); ``reach`` is how much of it a command can hold back.
@@ -16,9 +16,9 @@ from ethbrake_marl.physics.jit import compiled
 def flight_lead(share: float, press: float, reach: float, opening: float, flight: float) -> float:
     """Return the speed lead that a flight of this length gives the controlled vehicle, less its cost. [m/s]
 
-    The lead over the common speed is ``share (press L - o) - G`` for length L and opening o. G is the least loss of
-    command, at most ``reach`` per second, that keeps the two apart for L: ``G L - G^2 / 2 reach >= press L^2 / 2 - o
-    L``. Returns -inf if nothing keeps them apart.
+    A flight is a time in which the two vehicles are apart. The lead over the common speed is ``share (press L - o) -
+    G`` for length L and opening speed o. G is the least loss of command, at most ``reach`` per second, that keeps the
+    two apart for L: ``G L - G^2 / 2 reach >= press L^2 / 2 - o L``. Returns -inf if nothing keeps them apart.
     """
     relative = share * (press * flight - opening)
     if press * flight <= 2.0 * opening:

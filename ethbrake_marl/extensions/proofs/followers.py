@@ -72,8 +72,8 @@ def pushed_by_leader(
 ) -> float:
     """Return the least closing speed at the rear pair, from the centre of mass of leader and controlled vehicle.
 
-    Returns 0 if nothing is proven. A standing leader stays in place, so a later meeting with it differs only in time;
-    the window with the loss is then not used.
+    Returns 0 if nothing is proven. A standing leader stays in place, so a later first contact with it differs only in
+    time; the window with the loss is then not used.
     """
     share, rest, press = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.U_F] + at[LINE.A_L]
     v_l, way_l = leader(at, early)
@@ -148,10 +148,10 @@ def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: 
 def after_front(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least squared closing speed at the rear pair after a meeting with the leader of at most ``closing``.
+    """Return the least squared closing speed at the rear pair after a first contact with the leader.
 
-    The arguments from the centre of mass do not hold if an obstacle may throw both vehicles back; they are then left
-    out.
+    The contact closes with at most ``closing``. The arguments from the centre of mass do not hold if an obstacle may
+    throw both vehicles back; they are then left out.
     """
     share, rest = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE]
     v_l, way_l = leader(at, early)

@@ -66,7 +66,10 @@ def behind_full_braking(at: Floats, early: float, late: float) -> float:
 
 @compiled
 def soft_behind(at: Floats, early: float, late: float, near: float, far: float, since: float, power: float) -> float:
-    """Return the least closing speed of the meetings with the rear vehicle in a cell."""
+    """Return the least closing speed of the first contacts with the rear vehicle in a cell.
+
+    A cell is a range of times and of distances by which the rear vehicle has come further than by full braking.
+    """
     faster = gained(near, late, since, power)
     # the fastest way of the controlled vehicle to that place is to brake, then to drive
     brake = braking_to_rear(at, late, far + faster * (late - early))
@@ -79,11 +82,12 @@ def after_behind(
     at: Floats, early: float, late: float, near: float, far: float, hard: float, faster: float, moved: Floats,
     plan: Floats, other: Floats,
 ) -> float:  # fmt: skip
-    """Return the least squared closing speed at the front pair after the meetings with the rear vehicle in a cell.
+    """Return the least squared closing speed at the front pair after the rear vehicle was met first.
 
-    The closing speeds are at most ``hard``. The bound starts from a state at ``early`` that is at every later time of
-    the cell no further and no faster than after any meeting of the cell. In the meetings the rear vehicle is ``near``
-    to ``far`` further, and faster by ``faster``, than by full braking.
+    The first contacts are those of a cell: at times from ``early`` to ``late``, with the rear vehicle ``near`` to
+    ``far`` further, and faster by ``faster``, than by full braking, and with closing speeds of at most ``hard``. The
+    bound starts from a state at ``early`` that is at every later time no further and no faster than after any of these
+    contacts.
     """
     further = near - faster * (late - early)
     v_l, way_l = leader(at, early)
@@ -112,7 +116,10 @@ def put_behind(
     at: Floats, early: float, late: float, near: float, far: float, soft: float, hard: float, search: Floats,
     count: int, moved: Floats, plan: Floats, other: Floats, heap: Floats,
 ) -> int:  # fmt: skip
-    """Add a cell of meetings with the rear vehicle to the heap if it may beat the best; return the number of cells."""
+    """Add a cell of first contacts with the rear vehicle to the heap if it may beat the best.
+
+    Returns the number of cells.
+    """
     since, power, floor = search[SINCE], search[POWER], search[FLOOR]
     room = at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, late)[1] - follower(at, early)[1]
     span = max(late - since, 0.0)
@@ -135,7 +142,10 @@ def put_behind(
 def try_behind(
     at: Floats, time: float, near: float, far: float, search: Floats, moved: Floats, plan: Floats, other: Floats
 ) -> None:
-    """Lower the best to the harm of the gentlest meeting with the rear vehicle, about ``near`` further, at ``time``."""
+    """Lower the best to the harm of the gentlest first contact with the rear vehicle at ``time``.
+
+    The rear vehicle is then about ``near`` further than by full braking.
+    """
     near = max(near, behind_full_braking(at, time, time))
     if near > far or near > at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, time)[1] - follower(at, time)[1]:
         return
@@ -149,7 +159,10 @@ def try_behind(
 def divide_behind(
     at: Floats, search: Floats, count: int, moved: Floats, plan: Floats, other: Floats, heap: Floats
 ) -> int:
-    """Replace the first cell of the heap by its halves; return the new number of cells."""
+    """Replace the first cell of the heap by its halves; return the new number of cells.
+
+    A cell is a range of times, distances and closing speeds of first contacts with the rear vehicle.
+    """
     early, late, near, far = heap[0, EARLY], heap[0, LATE], heap[0, NEAR], heap[0, FAR]
     soft, hard = heap[0, SOFT], min(heap[0, HARD], math.sqrt(search[BEST]))
     count = drop_first(heap, count)
@@ -177,7 +190,10 @@ def divide_behind(
 def meetings_behind(
     at: Floats, last: float, search: Floats, moved: Floats, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Return a lower bound on the harm of first meetings with the rear vehicle until ``last``, at most the best."""
+    """Return a lower bound on the harm of all first contacts with the rear vehicle until ``last``.
+
+    The result is at most the least harm found before (``search[BEST]``).
+    """
     since, hard, count = min(search[SINCE], last), math.sqrt(search[BEST]), 0
     if since > 0.0:
         count = put_behind(at, 0.0, since, 0.0, 0.0, 0.0, hard, search, count, moved, plan, other, heap)

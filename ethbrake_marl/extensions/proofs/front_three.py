@@ -37,7 +37,7 @@ from ethbrake_marl.physics.state import Floats
 def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Floats, other: Floats) -> float:
     """Return the least harm if leader and rear vehicle meet with the controlled one between them; else infinity.
 
-    The closing speed of the front pair is at least the least of its meetings; the rear pair has the rest.
+    The closing speed of the front pair is at least the least of its first contacts; the rear pair has the rest.
     """
     pair[PAIR_GAP], pair[LEADER_ONSET], pair[LEADER_FREE] = at[LINE.GAP_L] + at[LINE.GAP_R], 0.0, 0.0
     pair[LEADER_V], pair[LEADER_A] = at[LINE.V_L], at[LINE.A_L]
@@ -54,7 +54,7 @@ def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Float
 
 @compiled(apart=True)
 def late_meetings(at: Floats, first: float, stand: float, plan: Floats, other: Floats) -> int:
-    """Return whether the first meeting with the rear vehicle may come after it would stand by full braking.
+    """Return whether the first contact with the rear vehicle may come after it would stand by full braking.
 
     0: it cannot. 1: it may, and the harm is then no less than if the leader is met first. 2: it may, and nothing is
     proven.

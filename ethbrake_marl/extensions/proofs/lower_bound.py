@@ -75,7 +75,7 @@ def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
 
 @compiled(apart=True)
 def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
-    """Return whether the other neighbour has not arrived before the gentlest meeting at ``time``."""
+    """Return whether the other neighbour has not arrived before the gentlest first contact at ``time``."""
     if kind == FRONT_FIRST:
         return stays_ahead(at, gentlest_front(at, time)[1], time, plan, other)
     return stays_behind(at, braking_to_rear(at, time, 0.0), time, plan, other)
@@ -83,7 +83,7 @@ def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) ->
 
 @compiled(apart=True)
 def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, other: Floats) -> float:
-    """Return the latest time, at most ``last``, of a meeting with one neighbour before the other one has arrived.
+    """Return the latest time, at most ``last``, of a first contact with one neighbour before the other one has arrived.
 
     At ``first`` there is room. The later the meeting, the shorter the drive (the braking) before it, and the less room
     behind (ahead).
@@ -101,7 +101,7 @@ def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, o
 
 @compiled(apart=True)
 def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple[float, float, bool]:
-    """Return the latest meeting with the leader, and the latest one at which the leader is met first.
+    """Return the latest first contact with the leader, and the latest one at which the leader is met first.
 
     Also returns whether the leader may be met first arbitrarily late and softly. ``first`` is the earliest meeting.
     """
@@ -156,7 +156,7 @@ def front_first(
 def soft_harm(
     kind: int, at: Floats, early: float, late: float, floor: float, best: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least harm, if below ``best``, of meetings from ``early`` to ``late`` with any closing speed."""
+    """Return the least harm, if below ``best``, of first contacts from ``early`` to ``late`` with any closing speed."""
     soft = 0.0
     while soft * soft < best:
         hard = soft + 0.02 * (1.0 + soft)
@@ -202,7 +202,7 @@ def rear_first(
 
 @compiled(apart=True)
 def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
-    """Return a time after which no first meeting with the rear vehicle is possible; everything stands at ``rest``.
+    """Return a time after which no first contact with the rear vehicle is possible; everything stands at ``rest``.
 
     By then the rear vehicle has passed neither the leader nor the controlled vehicle. If it brakes harder than the
     controlled vehicle by b, it was faster by ``b t`` at time t before the meeting, from its onset on.

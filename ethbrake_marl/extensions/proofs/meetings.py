@@ -26,7 +26,7 @@ _GUARD = 2.0**-46  # relative allowance for rounding of positions, so that no me
 
 @compiled(apart=True)
 def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
-    """Return the least closing speed of a meeting with the leader at ``time``, and how long to drive before it.
+    """Return the least closing speed of a first contact with the leader at ``time``, and how long to drive first.
 
     The slowest way to be there at that time is to drive, then to brake.
     """
@@ -83,7 +83,7 @@ def braking_to_rear(at: Floats, time: float, further: float) -> float:
 
 @compiled(apart=True)
 def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
-    """Return the least closing speed of a meeting with the rear vehicle at ``time``, and how long to brake before it.
+    """Return the least closing speed of a first contact with the rear vehicle at ``time``, and how long to brake first.
 
     The fastest way to be there at that time is to brake, then to drive. The braking is infinite if the vehicle is then
     at its speed limit.

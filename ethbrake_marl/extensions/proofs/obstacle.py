@@ -78,9 +78,9 @@ def least_beyond(
 
 @compiled(apart=True)
 def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float, float, float]:
-    """Return the least position and speed at ``late`` of a braking vehicle that left a meeting, and its brakes.
+    """Return the least position and speed at ``late`` of a braking vehicle after its first contact, and its brakes.
 
-    It left the meeting ``faster`` than the leader. The brakes are the hardest of all three vehicles, so that no vehicle
+    It left the contact ``faster`` than the leader. The brakes are the hardest of all three vehicles, so that no vehicle
     falls further behind.
     """
     v_l, way = leader(at, late)
@@ -140,10 +140,10 @@ def behind_leader(
     at: Floats, early: float, late: float, soft: float, hard: float, beyond: float, place: float, speed: float,
     plan: Floats, other: Floats,
 ) -> float:  # fmt: skip
-    """Return the least squared closing speed at the rear pair after a meeting with the leader, if nobody passes it.
+    """Return the least squared closing speed at the rear pair after a first contact with the leader.
 
-    The leader hits the obstacle with at most ``sqrt(beyond)``. The centre of mass of all three is at ``late`` at least
-    at ``place``, with ``speed``. Returns LARGE if such a course is impossible.
+    Nobody passes the leader, which hits the obstacle with at most ``sqrt(beyond)``. The centre of mass of all three is
+    at ``late`` at least at ``place``, with ``speed``. Returns LARGE if such a course is impossible.
     """
     wall, drive, onset = at[LINE.GAP_L] + at[LINE.WALL], at[LINE.U_F], at[LINE.ONSET_R]
     kept = 1.0 - at[LINE.FRONT_SHARE] * (1.0 + at[LINE.RESTITUTION])
@@ -212,7 +212,7 @@ def behind_leader(
 def after_at_obstacle(
     at: Floats, early: float, late: float, soft: float, hard: float, follows: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least harm at rear pair and obstacle after a meeting with the leader.
+    """Return the least harm at rear pair and obstacle after a first contact with the leader.
 
     The harm at the rear pair is at least ``follows``.
     """
@@ -245,7 +245,7 @@ def after_at_obstacle(
 def beyond_rear(
     at: Floats, early: float, late: float, closing: float, least: float, plan: Floats, other: Floats
 ) -> float:
-    """Return ``least_beyond`` after a meeting with the rear vehicle with at most ``closing``."""
+    """Return ``least_beyond`` after a first contact with the rear vehicle with at most ``closing``."""
     v_l, way_l = leader(at, late)
     v_r, way_r = follower(at, late)
     front, rear = all_three(at)[:2]
@@ -260,7 +260,10 @@ def beyond_rear(
 def after_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least harm at front pair and obstacle after a meeting with the rear vehicle of at most ``closing``."""
+    """Return the least harm at front pair and obstacle after a first contact with the rear vehicle.
+
+    The contact closes with at most ``closing``.
+    """
     share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
     v_l, way_l = leader(at, early)
     v_r, way_r = follower(at, early)

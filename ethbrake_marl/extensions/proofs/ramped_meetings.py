@@ -92,7 +92,7 @@ def met_at(kind: int, at: Floats, time: float, plan: Floats) -> tuple[float, flo
 
 @compiled(apart=True)
 def gentlest_ramped(kind: int, at: Floats, time: float) -> float:
-    """Return the least closing speed of a meeting at ``time``."""
+    """Return the least closing speed of a first contact at ``time``."""
     plan = empty_legs()
     sign, v, place = met_at(kind, at, time, plan)
     return max(sign * (switch_for(at, sign, time, place, -math.inf, HALVINGS, plan)[2] - v), 0.0)
@@ -102,7 +102,10 @@ def gentlest_ramped(kind: int, at: Floats, time: float) -> float:
 def slack_of(
     kind: int, at: Floats, early: float, late: float, v: float, hard: float, plan: Floats
 ) -> tuple[float, float]:
-    """Return how far from its place, and by which speed, a vehicle that meets in a cell may be at ``early`` at most."""
+    """Return how far from its place, and by which speed, the controlled vehicle may be at ``early`` at most.
+
+    It meets its neighbour between ``early`` and ``late`` with a closing speed of at most ``hard``.
+    """
     span = late - early
     if kind == RAMPED_FRONT:
         return (hard + at[LINE.A_F] * span) * span, at[LINE.A_F] * span
@@ -112,7 +115,7 @@ def slack_of(
 
 @compiled(apart=True)
 def gentlest_ramped_between(kind: int, at: Floats, early: float, late: float) -> float:
-    """Return the least closing speed of the meetings between two times."""
+    """Return the least closing speed of the first contacts between two times."""
     plan = empty_legs()
     hard = gentlest_ramped(kind, at, early)
     sign, v, place = met_at(kind, at, early, plan)
@@ -127,7 +130,10 @@ def gentlest_ramped_between(kind: int, at: Floats, early: float, late: float) ->
 
 @compiled(apart=True)
 def force_of_meeting(kind: int, at: Floats, early: float, late: float, hard: float) -> float:
-    """Return the largest force, times the sign, with which a meeting of a cell can be as soft as ``hard``."""
+    """Return the largest force, times the sign, with which a first contact can be as soft as ``hard``.
+
+    The contact lies between ``early`` and ``late``.
+    """
     plan = empty_legs()
     sign, v, place = met_at(kind, at, early, plan)
     far, faster = slack_of(kind, at, early, late, v, hard, plan)
@@ -149,9 +155,10 @@ def force_of_meeting(kind: int, at: Floats, early: float, late: float, hard: flo
 def after_ramped(
     kind: int, at: Floats, early: float, late: float, hard: float, plan: Floats, other: Floats
 ) -> float:  # fmt: skip
-    """Return the least squared closing speed at the other neighbour after a meeting of a cell.
+    """Return the least squared closing speed at the other neighbour after a first contact.
 
-    The bound uses the motion of the controlled vehicle alone.
+    The contact lies between ``early`` and ``late`` and closes with at most ``hard``. The bound uses the motion of the
+    controlled vehicle alone.
     """
     sign = 1.0 if kind == RAMPED_FRONT else -1.0
     share = at[LINE.FRONT_SHARE] if kind == RAMPED_FRONT else at[LINE.REAR_SHARE]
@@ -193,7 +200,7 @@ def after_ramped(
 
 @compiled(apart=True)
 def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
-    """Return whether the other neighbour never arrives before a meeting at ``time`` or later."""
+    """Return whether the other neighbour never arrives before a first contact at ``time`` or later."""
     sign, _, place = met_at(kind, at, time, plan)
     switch = switch_for(at, sign, time, place, -math.inf, HALVINGS, plan)[1]
     fill_controlled(at, sign, switch, time, -math.inf, plan)
