@@ -315,7 +315,7 @@ def between_shifted(x: Floats, shift: float) -> Floats:
 
 @compiled(apart=True)
 def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
-    """Set ``pull`` of vehicle ``i``; it is 0 before the latency has elapsed."""
+    """Set the acceleration ``pull`` of vehicle ``i`` by its command; it is 0 before the latency has elapsed."""
     pull = motion.pull[i]
     pull[:] = 0.0
     motion.rest[i], motion.vague[i] = MOVES, 0.0
@@ -379,7 +379,7 @@ def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> 
 
 @compiled(apart=True)
 def deceleration(pull: Floats, vague: float) -> Floats:
-    """Return the mean deceleration over any part of the piece of time.
+    """Return the mean deceleration over any part of the piece of time, as an affine form.
 
     The acceleration differs from ``pull`` by at most ``vague``.
     """

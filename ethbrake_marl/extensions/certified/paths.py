@@ -63,7 +63,7 @@ STACK = 256  # largest number of waiting paths
 
 
 class Stack(NamedTuple):
-    """Paths that wait to be followed."""
+    """Stack of paths (sets of worlds with the same impacts) that wait to be followed."""
 
     forms: Floats  # [STACK, N + P + 1, W]
     touch: Floats  # [STACK, P, TOUCH_WIDTH]
@@ -73,7 +73,7 @@ class Stack(NamedTuple):
 
 @compiled(apart=True)
 def new_stack(N: int, width: int) -> Stack:
-    """Return an empty stack."""
+    """Return an empty stack of paths."""
     P = N - 1
     return Stack(
         np.zeros((STACK, N + P + 1, width)),
@@ -94,7 +94,7 @@ def keep_worst(harm: Floats, worst: float, out: Floats) -> float:
 
 @compiled(apart=True)
 def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
-    """Apply ``keep_worst`` to the rough bound of a path that is not followed any further."""
+    """Record the rough bound on the harm of a path that is not followed any further; return the new ``worst``."""
     return keep_with(np.zeros(cell.speed.shape[1]), rough_harm(cell, path, -1), worst, out)
 
 
@@ -138,7 +138,7 @@ def branch(
 
 @compiled(apart=True)
 def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
-    """Apply ``keep_worst`` to a harm to which at most ``rest`` will be added."""
+    """Record a harm to which at most ``rest`` will be added; return the new ``worst``."""
     whole = harm.copy()
     whole[0] += rest
     return keep_worst(whole, worst, out)

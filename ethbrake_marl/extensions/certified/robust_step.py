@@ -62,7 +62,7 @@ class RobustShield(StepShield):
 
     @property
     def possible_are(self) -> str:  # type: ignore[override]  # a constant there
-        """Description of the members for messages."""
+        """Description of a world's members (possible worlds) for error messages."""
         return f"uncertainty: {self.uncertainty}"
 
     def members_of(self, worlds: Worlds) -> Worlds:

@@ -76,7 +76,10 @@ def faster(cell: Cell, p: int) -> float:
 
 @compiled(apart=True)
 def backwards(cell: Cell, p: int) -> float:
-    """Return the largest backward speed of the rear vehicle after an impact, as a multiple of its speed before."""
+    """Return the largest backward speed of the rear vehicle after an impact, as a multiple of its speed before.
+
+    It is at least 0.
+    """
     return float(max(0.0, (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0))
 
 
@@ -99,7 +102,7 @@ def blur(cell: Cell, path: Path, p: int, side: int) -> float:
 
 @compiled(apart=True)
 def begin_touch(touch: Floats) -> None:
-    """Reset the state of a contact, except the columns of the present piece of time."""
+    """Reset the state of a pair in contact, except the columns of the present piece of time."""
     spread, reach = touch[SPREAD], touch[REACH]  # columns of the present piece
     touch[:] = 0.0
     touch[SPREAD], touch[REACH], touch[SOFTEST] = spread, reach, math.inf

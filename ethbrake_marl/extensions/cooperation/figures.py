@@ -160,7 +160,7 @@ def _place(level: Json, ladder: Sequence[str]) -> float:
 def _reached(
     axes: Axes, levels: Sequence[Json], ladder: Sequence[str], harm_count: HarmCount, algorithm: str, number: int
 ) -> None:
-    """Draw one algorithm: its ladder, and its worse channels beside the clear channel. Each seed is a dot."""
+    """Draw the harm of one algorithm on the ladder, and on worse channels beside it. Each seed is a dot."""
     own = [level for level in levels if level["algorithm"] in (None, algorithm)]
     style = series_style(number + 1 if number == 0 else number + 3)
     hollow = {**style, "linestyle": "none", "markerfacecolor": "white"}

@@ -161,7 +161,7 @@ class Goal(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Results of one level with one algorithm."""
+    """Results of one level with one training algorithm: harm, best known harm, shielded results and goal."""
 
     level: Level
     algorithm: str | None  # None: the level has no learner

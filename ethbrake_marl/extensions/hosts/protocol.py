@@ -209,7 +209,7 @@ class _Grid:
 
 
 class _Run:
-    """Running episodes in a host."""
+    """Running episodes in a host: decisions, latencies, impacts and harm, around the host's steps."""
 
     def __init__(self, host: Host, worlds: Worlds, team: Team, scenario: Scenario) -> None:
         self.host, self.team, self.scenario = host, team, scenario
@@ -520,9 +520,9 @@ class _Motion:
         )  # fmt: skip
 
     def _wrong_speed(self, step: _Step, met: Bools, change: Floats) -> tuple[int, str] | None:
-        """Return the first speed that rule 3 refuses.
+        """Return the first reported speed that the commands since the alert rule out, and what is wrong with it.
 
-        ``change`` [n, N] m/s is what the command alone adds to the speed.
+        ``change`` [n, N] m/s is what the command alone adds to the speed in this step.
         """
         began = self.led_mps + step.begin_mps - self.speeds_mps
         led = held_speeds(began, change, self.vehicles.speed_limit_mps, 1.0)

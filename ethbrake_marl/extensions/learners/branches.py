@@ -28,7 +28,7 @@ Decide = Callable[[Observations, Ints, int], Floats]  # (observations [m, L, F],
 
 
 class Offsets(NamedTuple):
-    """Offsets that are added to one learner's actions in each row."""
+    """For each row, the learner whose actions are moved, by how much, and for how many steps."""
 
     learner: Ints  # [n] index of the learner among the learners
     size: Floats  # [n] offset of its action; the sum is clipped to [-1, 1]

@@ -16,8 +16,8 @@ from ethbrake_marl.physics.jit import compiled
 def flight_lead(share: float, press: float, reach: float, opening: float, flight: float) -> float:
     """Return the speed lead that a flight of this length gives the controlled vehicle, less its cost. [m/s]
 
-    A flight is a time in which the two vehicles are apart. The lead over the common speed is ``share (press L - o) -
-    G`` for length L and opening speed o. G is the least loss of command, at most ``reach`` per second, that keeps the
+    A flight is a time in which the two vehicles are apart. For length L and opening speed o the lead over the common
+    speed is ``share (press L - o) - G``. G is the least loss of command, at most ``reach`` per second, that keeps the
     two apart for L: ``G L - G^2 / 2 reach >= press L^2 / 2 - o L``. Returns -inf if nothing keeps them apart.
     """
     relative = share * (press * flight - opening)

@@ -106,9 +106,9 @@ def pushed_by_leader(
 
 @compiled(apart=True)
 def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: Floats, other: Floats) -> float:
-    """Return the least closing speed at the rear pair if the leader brakes harder, so the vehicle stays near it.
+    """Return the least closing speed at the rear pair behind a leader that brakes harder.
 
-    Returns 0 if nothing is proven.
+    The controlled vehicle then stays near the leader. Returns 0 if nothing is proven.
     """
     share, rest, bounce = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.RESTITUTION]
     v_l, way_l = leader(at, early)
@@ -215,9 +215,9 @@ def pushed_by_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, gap: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Return the least closing speed at the front pair, from the centre of mass of the two other vehicles.
+    """Return the least closing speed at the front pair after the controlled vehicle met the rear one.
 
-    Needs ``a_f >= a_r``.
+    The bound follows from the centre of mass of these two vehicles. Needs ``a_f >= a_r``.
     """
     share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
     v_l = leader(at, early)[0]
@@ -241,9 +241,9 @@ def pushed_by_rear(
 
 @compiled(apart=True)
 def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: Floats, other: Floats) -> float:
-    """Return the least closing speed at the front pair of a vehicle that stays ahead of the common centre of mass.
+    """Return the least closing speed at the front pair after the controlled vehicle met the rear one.
 
-    Needs ``a_f >= a_r``. Returns 0 if the closing speed may rise.
+    The controlled vehicle stays ahead of the rear one. Needs ``a_f >= a_r``. Returns 0 if the closing speed may rise.
     """
     share, v_l = at[LINE.REAR_SHARE], leader(at, early)[0]
     pooled = (1.0 - share) * at[LINE.A_F] + share * at[LINE.A_R]

@@ -48,7 +48,7 @@ def all_three(at: Floats) -> tuple[float, float, float, float]:
 
 @compiled
 def leader_pushed(at: Floats, early: float, beyond: float) -> tuple[float, float]:
-    """Return the speed of a leader, pushed at ``early``, that hits the obstacle with ``sqrt(beyond)``, and when."""
+    """Return the speed of a leader that, pushed at ``early``, hits the obstacle with ``sqrt(beyond)``, and when."""
     v = math.sqrt(max(beyond + 2.0 * at[LINE.A_L] * (at[LINE.WALL] - leader(at, early)[1]), 0.0))
     return v, early + (v - math.sqrt(beyond)) / at[LINE.A_L]
 
@@ -57,10 +57,10 @@ def leader_pushed(at: Floats, early: float, beyond: float) -> tuple[float, float
 def least_beyond(
     at: Floats, early: float, late: float, place: float, speed: float, least: float, plan: Floats, other: Floats
 ) -> float:
-    """Return ``least``, or more: the centre of mass must not reach the obstacle before the leader.
+    """Return the least squared speed with which the leader, pushed at ``early``, hits the obstacle; at least ``least``.
 
-    ``least`` and the result are values of ``beyond``. The leader is pushed at ``early``. The centre of mass of all
-    three is at ``late`` at least at ``place``, with ``speed``.
+    It follows from the centre of mass of all three vehicles, which must not reach the obstacle before the leader. At
+    ``late`` that centre is at least at ``place``, with ``speed``.
     """
     if not speed > 0.0:
         return least
@@ -245,7 +245,10 @@ def after_at_obstacle(
 def beyond_rear(
     at: Floats, early: float, late: float, closing: float, least: float, plan: Floats, other: Floats
 ) -> float:
-    """Return ``least_beyond`` after a first contact with the rear vehicle with at most ``closing``."""
+    """Return the least ``beyond`` (see ``least_beyond``) after a first contact with the rear vehicle.
+
+    The contact closes with at most ``closing``.
+    """
     v_l, way_l = leader(at, late)
     v_r, way_r = follower(at, late)
     front, rear = all_three(at)[:2]

@@ -32,7 +32,7 @@ def empty_legs() -> Floats:
 
 @compiled
 def put_leg(plan: Floats, k: int, end: float, force: float, jerk: float) -> None:
-    """Set leg ``k`` of a plan."""
+    """Set leg ``k`` of a plan: its end, its initial force and its jerk."""
     plan[ENDS, k], plan[FORCES, k], plan[JERKS, k] = end, force, jerk
 
 

@@ -60,7 +60,7 @@ READINGS = (Reading("as stated"), Reading("Vehicle 2 acts at 0.2 s", 0.2))
 
 
 def lineup(scenario: Scenario, *specs: str) -> dict[str, Agent]:
-    """Return agents by their names in ``NAMES``, else by their spec."""
+    """Return the agents of these specs, by their names in ``NAMES`` or else by spec."""
     return {NAMES.get(spec, spec): agent for spec, agent in make_agents(specs, scenario).items()}
 
 

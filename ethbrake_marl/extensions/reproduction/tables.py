@@ -60,7 +60,7 @@ class Beside:
         return found
 
     def candidates(self, row: str, quantity: str) -> Iterator[tuple[str, Estimate]]:
-        """Yield our numbers that a number of a row may mean, the compared one first."""
+        """Yield our numbers to which a number in a row of the paper may correspond, the compared one first."""
         for name in self.ours[row]:
             if quantity in self.numbers[name]:
                 yield f"{name} ({self.title})", self.numbers[name][quantity]

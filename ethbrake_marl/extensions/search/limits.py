@@ -27,7 +27,7 @@ class IncompleteTable(UserWarning):
 
 @dataclass(frozen=True, slots=True)
 class Unproven:
-    """Result if nothing is proven for a task in these worlds."""
+    """Result instead of a proof if nothing is proven for a task in these worlds, with the reason."""
 
     because: str  # reason, as a clause
 

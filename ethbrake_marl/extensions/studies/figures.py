@@ -81,7 +81,7 @@ def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
 
 
 def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, Any]:
-    """Return ``HARM`` and the ``FIGURES`` after these evaluations, without the hash."""
+    """Return the quantity ``HARM`` and the figures of a table after these evaluations, without the policy's hash."""
     harm = RunDirectory.chosen_by(evaluations, job.training.recipe.reward.harm_count)
     kept, last = min(evaluations, key=lambda each: each[harm]), evaluations[-1]
     return {
@@ -94,7 +94,10 @@ def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, An
 
 
 def final_figures(job: TrainingJob) -> dict[str, Any]:
-    """Return ``HARM`` and all ``FIGURES`` of a finished training. Raises ``InvalidInput`` for a damaged file."""
+    """Return the quantity ``HARM`` and all figures of a finished training.
+
+    Raises ``InvalidInput`` for a damaged file.
+    """
     run, evaluations = RunDirectory(job.folder), evaluations_of(job)
     if not evaluations:
         raise InvalidInput(f"{run.progress}: holds no evaluation; delete its folder to train anew")

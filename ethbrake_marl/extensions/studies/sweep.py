@@ -209,7 +209,7 @@ class Row:
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """All jobs, in the order of the table. Common parts are loaded once."""
+    """All jobs of a sweep, in the order of its table. Common parts are loaded once."""
 
     rows: Sequence[Row]
 
@@ -271,7 +271,7 @@ class SweepPlan:
         finish(self.job(row, path))
 
     def results(self, path: Path) -> dict[str, dict[str, Any]]:
-        """Return ``HARM`` and ``FIGURES`` of each finished job, by its name."""
+        """Return the figures (``HARM`` and ``FIGURES``) of each finished job, by its name."""
         jobs = ((row.name, self.job(row, path)) for row in self.rows)
         return {name: final_figures(job) for name, job in jobs if is_done(job)}
 

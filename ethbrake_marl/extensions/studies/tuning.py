@@ -198,7 +198,7 @@ class Pruning(FileModel):
     after_times: _Count = Field(default=3, description="nobody is stopped before it was measured so often")
 
     def rule(self) -> TrialScheduler:
-        """Return the rule for Ray Tune."""
+        """Return Ray Tune's scheduler that applies this rule."""
         from ray.tune.schedulers import MedianStoppingRule
 
         return MedianStoppingRule(
