@@ -1,4 +1,4 @@
-"""PettingZoo's module: ``from ethbrake_marl import ethbrake_v0``, then ``ethbrake_v0.parallel_env()`` or ``.env()``."""
+"""PettingZoo-style environment module; use as ``ethbrake_v0.parallel_env()`` or, for the AEC API, ``ethbrake_v0.env()``."""
 
 from __future__ import annotations
 
