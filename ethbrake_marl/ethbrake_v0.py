@@ -1,4 +1,4 @@
-"""PettingZoo-style environment module; use as ``ethbrake_v0.parallel_env()`` or, for the AEC API, ``ethbrake_v0.env()``."""
+"""Environment module in PettingZoo's style, with ``ethbrake_v0.parallel_env()`` and, for the AEC API, ``.env()``."""
 
 from __future__ import annotations
 

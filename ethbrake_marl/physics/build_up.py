@@ -29,7 +29,7 @@ _PARTS_LATE_MPS2 = 1e-12  # smallest difference of accelerations at a separation
 
 @compiled(bare=True)
 def built_up(table: Floats) -> bool:
-    """Return whether every force equals the command in effect: until the next onset the motion is then that of ``move``."""
+    """Return whether every force equals the command in effect, so that ``move`` is exact until the next onset."""
     there = True
     for i in range(table.shape[1]):
         there = there and table[ROW.FORCE, i] == table[ROW.COMMAND, i] * table[ROW.ACTIVE, i]

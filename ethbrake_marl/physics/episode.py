@@ -28,8 +28,6 @@ from ethbrake_marl.physics.segment import advance_table
 from ethbrake_marl.physics.state import Floats, Ints
 
 # state of an episode after a step; a value below 0 is a failure: minus the status of the kernel
-
-
 GOES_ON, AT_REST, AT_HORIZON = 0, 1, 2
 
 

@@ -26,7 +26,7 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(bare=True)
 def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) -> int:
-    """Mass-weighted isotonic regression of vehicles ``first..last`` (inclusive) into row ``out``; return the block count.
+    """Pool vehicles ``first..last`` by mass-weighted isotonic regression into row ``out``; return the number of blocks.
 
     Rows ``low`` and ``high`` bound the value of each vehicle; they are equal for an ordinary value. All members of a
     pooled block get the same bits. Rows BLOCK_* describe the blocks. A vehicle of infinite mass (the obstacle) stands

@@ -1,4 +1,4 @@
-"""Observations of a scenario: what its vehicles observe, and the rows of learners, full state or place behind it."""
+"""Observations in a scenario: features of each vehicle, the full state, and the rows that learners receive."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 def observation_for(scenario: Scenario, vehicle: str | None = None) -> ObservationSpec:
-    """What a vehicle, or any learner, observes in this scenario unless somebody says otherwise: what it declares.
+    """Return the observation of a vehicle, or of all learners, that the scenario declares.
 
-    Where it declares nothing: one neighbour on each side; where Vehicle 1 has an obstacle ahead, also the own place in
-    the line and the obstacle. Raises ``InvalidInput`` naming two learners that observe different features.
+    By default a vehicle observes one neighbour on each side; with an obstacle ahead also its own place in the line and
+    the obstacle. Raises ``InvalidInput`` naming two learners with different observations, if ``vehicle`` is None.
     """
     observations = observations_of(scenario)
     if vehicle is None:
@@ -30,10 +30,10 @@ def observation_for(scenario: Scenario, vehicle: str | None = None) -> Observati
 
 
 def observations_of(scenario: Scenario, given: Observation | None = None) -> tuple[ObservationSpec, ...]:
-    """What each vehicle observes, front to rear, [N]: what is given, or else what the scenario declares.
+    """Return the observation of each vehicle, front to rear, [N]: from ``given``, otherwise from the scenario.
 
-    Both say it of all vehicles, or by name of some: ``{"vehicle_2": ["own", "front_1"]}``. Raises ``UnknownName`` for a
-    vehicle that is not there, and what ``choose_observation`` raises.
+    Both give one observation for all vehicles, or one by name for some: ``{"vehicle_2": ["own", "front_1"]}``. Raises
+    ``UnknownName`` for an unknown vehicle, and what ``choose_observation`` raises.
     """
     names, step_s, said = scenario.vehicle_names, scenario.time_step_s, scenario.observation
     usual = ObservationSpec(role=scenario.has_obstacle, obstacle=scenario.has_obstacle)
@@ -53,9 +53,9 @@ def observations_of(scenario: Scenario, given: Observation | None = None) -> tup
 
 
 def common_observation(observations: tuple[ObservationSpec, ...], scenario: Scenario) -> ObservationSpec:
-    """What all learners observe, of what each vehicle does; of all vehicles where nobody learns.
+    """Return the observation that all learners share, of one per vehicle; without learners, that all vehicles share.
 
-    Raises ``InvalidInput`` naming two that observe different features.
+    Raises ``InvalidInput`` naming two of them with different observations.
     """
     first, *others = scenario.learners or range(scenario.vehicles)
     for other in others:
@@ -70,10 +70,10 @@ def common_observation(observations: tuple[ObservationSpec, ...], scenario: Scen
 
 # The full state of a line as one vector, for centralised critics: all vehicles, all pairs, the time.
 #
-# It reuses the features of ``observations`` and hides nothing: no latency keeps a value from a critic. Rows of learners
-# may end with it, or with the learner's place among the learners (``appended``).
+# It uses the features of ``game.features`` and hides nothing: a critic sees values that latency hides from vehicles.
+# The row of a learner may end with the full state, or with the learner's place among the learners (``appended``).
 
-Appended = Literal["number", "state"]  # what a row holds behind the vehicle's own observation
+Appended = Literal["number", "state"]  # what a row holds after the vehicle's own observation
 
 _OWN_ONLY = ObservationSpec(front=0, rear=0)
 
@@ -90,9 +90,9 @@ _PAIR_FEATURES = tuple(replace(f, meaning=_PAIR_MEANING[f.name]) for f in GROUPS
 
 
 def state_features(scenario: Scenario) -> tuple[Feature, ...]:
-    """Every number of the state in order: each vehicle's own features, each pair's gap and hit flag, the time.
+    """Return the features of the full state in order: each vehicle's own features, each pair's gap and hit flag, time.
 
-    Where there is an obstacle ahead of Vehicle 1, its gap and hit flag follow.
+    With an obstacle ahead of Vehicle 1, its gap and hit flag follow.
     """
     vehicles = [replace(f, name=f"{name}.{f.name}") for name in scenario.vehicle_names for f in GROUPS.own]
     pairs = [replace(f, name=f"pair_{p}.{f.name}") for p in range(1, scenario.vehicles) for f in _PAIR_FEATURES]
@@ -102,8 +102,8 @@ def state_features(scenario: Scenario) -> tuple[Feature, ...]:
 
 
 def full_state(worlds: Worlds, scenario: Scenario) -> Observations:
-    """State of every world, [n, S] float32 in its own memory; S = 7 N + 2 P + 1, and 2 more with an obstacle ahead."""
-    latency = worlds.vehicles.latency_s  # whole, with what a channel has drawn
+    """Return the full state of every world, [n, S] float32; S = 7 N + 2 P + 1, plus 2 with an obstacle ahead."""
+    latency = worlds.vehicles.latency_s  # the whole latency, including the channel's part
     whole_latency = replace(worlds.vehicles, own_latency_s=latency, known_from_s=Vehicles.known_at_once(latency))
     vehicles = [observe(replace(worlds, vehicles=whole_latency), i, _OWN_ONLY) for i in range(worlds.N)]
     pair_values = {"gap": worlds.gaps_m, "hit": worlds.pair_hit.astype(np.float64)}
@@ -117,7 +117,7 @@ def full_state(worlds: Worlds, scenario: Scenario) -> Observations:
 
 
 def row_features(own: tuple[Feature, ...], appended: Appended | None, scenario: Scenario) -> tuple[Feature, ...]:
-    """Every number of a learner's row in order; raises ``InvalidInput`` for another word than ``Appended`` has."""
+    """Return the features of a learner's row in order; raise ``InvalidInput`` for an invalid ``appended``."""
     if appended not in (None, *get_args(Appended)):
         raise InvalidInput(f"appended = {appended!r}: must be {' or '.join(get_args(Appended))}, or None")
     if appended is None:
