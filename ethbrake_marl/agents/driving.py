@@ -63,10 +63,10 @@ def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | Non
 def episode_engine(worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None) -> Engine:
     """Return an engine over ``worlds`` in which ``agent`` drives ``vehicle``, or a team drives its vehicles.
 
-    The other vehicles follow their scripts. The agents decide when their first vehicle's latency has elapsed and every time step after that, like learners;
-    their commands are applied without rounding. Behind a shield they propose commands, and the engine treats their
-    vehicles as learners. An agent that looks ahead knows the scripts, and assumes that other controlled vehicles brake
-    fully. Raises ``InvalidInput`` for a learner without an agent.
+    The other vehicles follow their scripts. The agents decide when their first vehicle's latency has elapsed and every
+    time step after that, like learners; their commands are applied without rounding. Behind a shield they propose
+    commands, and the engine treats their vehicles as learners. An agent that looks ahead knows the scripts, and assumes
+    that other controlled vehicles brake fully. Raises ``InvalidInput`` for a learner without an agent.
     """
     team = agent if isinstance(agent, Team) else Team.of(agent, () if vehicle is None else (vehicle,))
     drivers = team.drivers

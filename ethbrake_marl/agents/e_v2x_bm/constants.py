@@ -174,8 +174,8 @@ def will_stay_apart(table: Floats) -> bool:
     * r stands, or both are one body;
     * ``w <= 0`` and ``d_r >= d_f``: w stays so until r stands, also with the kernel's rounding;
     * r would stop behind f, ``g + v_f^2 / 2 d_f > v_r^2 / 2 d_r``, the pair is apart (or separating), and, if r brakes
-      harder while it closes, the smallest gap is positive too: ``w^2 < 2 (d_r - d_f) g``. (If r brakes less hard, the gap
-      is concave until f stands, and decreases from then on.) All of this with margins.
+      harder while it closes, the smallest gap is positive too: ``w^2 < 2 (d_r - d_f) g``. (If r brakes less hard, the
+      gap is concave until f stands, and decreases from then on.) All of this with margins.
     """
     vehicles, hardest = table.shape[1], 0.0
     if pieces_to_come(table):

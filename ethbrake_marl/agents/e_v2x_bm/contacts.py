@@ -48,7 +48,7 @@ def stopping_distance(speed: float, deceleration: float) -> float:
 
 @compiled
 def contact_while_coasting(gap: float, v_l: float, a_l: float, v_f: float, tau: float) -> float:
-    """Return the squared closing speed if the pair meets while the follower still coasts (regimes A and A'), else -1."""
+    """Return the squared closing speed if the pair meets while the follower coasts (regimes A and A'), else -1."""
     w = v_f - v_l
     stop_l = stopping_time(v_l, a_l)
     squared = w * w + 2.0 * a_l * gap

@@ -180,7 +180,7 @@ class EV2XBM:
             return {"deceleration_mps2": closed.deceleration_mps2, "predicted_harm": closed.harm}
 
         def is_fixed(script: Script) -> bool:
-            """Return whether the script's command is fixed before ``vehicle``, which may be scripted or free, chooses."""
+            """Return whether the script's command is fixed before that of ``vehicle``, scripted or free, is chosen."""
             chooses_first = isinstance(script, EV2XBM) and (script._mode == "pairwise" or vehicle not in scripts)
             return is_state_free(script) or chooses_first
 

@@ -83,7 +83,7 @@ def make_room() -> Room:
 
 @compiled(apart=True, bare=True)
 def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, out: Floats) -> int:
-    """Write the best deceleration of a line, its harm and the other count's to ``out`` [3]; return DONE or a failed check.
+    """Write a line's best deceleration, its harm and the other count's to ``out`` [3]; return DONE or a failed check.
 
     ``breakpoints`` [CANDIDATES] are simulated in addition to the grid.
     """
@@ -188,7 +188,7 @@ def locate_borders(line: Line, room: Room) -> int:
 
 @compiled(bare=True)
 def _cut(line: Line, few: Samples) -> int:
-    """Bring samples 0 and 5, on the two sides of a border, together, reducing their distance to a fifth in each round."""
+    """Bring samples 0 and 5, on the two sides of a border, together: each round divides their distance by five."""
     while few.at[5] - few.at[0] > NARROWEST_MPS2:
         low, width = few.at[0], few.at[5] - few.at[0]
         for k in range(4):
