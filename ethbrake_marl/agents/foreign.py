@@ -330,7 +330,7 @@ class PolicyAgent:
             return self._answer(seen, state, np.arange(worlds.n))
         except Exception as error:
             k = self._find_failing(seen, state)
-            first, last = (steps.min(initial=10**9) + 1, steps.max(initial=0) + 1)  # over all running episodes
+            first, last = steps.min(initial=10**9) + 1, steps.max(initial=0) + 1  # over all running episodes
             where = f"step {first}" if first >= last else f"steps {first} to {last}"
             where = where if k is None else _moment_text(k, worlds, steps)
             reason = f"{where}: observations of shape {seen.shape}: {describe_error(error)}"

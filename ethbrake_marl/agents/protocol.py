@@ -193,7 +193,7 @@ class AgentAround(ByPolicy):
         return getattr(self.policy, "time_step_s", None)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Begin as the policy does."""
+        """Return the policy's initial memory."""
         return begin_script(self.policy, alert, vehicle, scripts)
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:

@@ -157,13 +157,13 @@ class Sheet:
                 yield (*cells, *[Shown("")] * (len(columns) - len(cells)))
 
     def only(self, columns: Iterable[int]) -> Sheet:
-        """Return the table with only these columns, by number."""
+        """Return the table with only these columns, by index from 0."""
         kept = list(columns)
         rows = [row if isinstance(row, str) else [row[k] for k in kept if k < len(row)] for row in self.rows]
         return replace(self, columns=[self.columns[k] for k in kept], rows=rows)
 
     def filled(self) -> list[int]:
-        """Return the numbers of the columns in which some row has a value; without rows, of all columns."""
+        """Return the indices of the columns in which some row has a value; without rows, of all columns."""
         rows = [row for row in self.rows if not isinstance(row, str)]
         return [
             k for k in range(len(self.columns)) if not rows or any(k < len(row) and row[k] is not None for row in rows)

@@ -16,7 +16,7 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput
 
 LARGEST_OBJECT_BYTES = 16 << 20
 
-_HIDDEN, _UNFINISHED = (".ethbrake-", ".partial")  # not the target's name: file names have a maximum length
+_HIDDEN, _UNFINISHED = ".ethbrake-", ".partial"  # not the target's name: file names have a maximum length
 
 
 def write_file(path: Path, data: bytes) -> None:

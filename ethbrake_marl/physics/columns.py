@@ -73,7 +73,7 @@ def columns(state: Floats) -> Columns:
 
 
 class Packed(NamedTuple):
-    """Worlds as rows of two arrays."""
+    """n worlds packed into two arrays, one row per world."""
 
     state: Floats  # [n, S]
     params: Floats  # [n, 1 + 7 N], [n, 1 + 8 N + N * N] or, with M columns of messages, [n, 1 + 8 N + N * N + M]

@@ -157,7 +157,7 @@ class Messages(NamedTuple):
 
     @property
     def periodic(self) -> Bools:
-        """Worlds with periodic messages, so that knowledge of others grows old between two messages, [n]."""
+        """Worlds in which messages are sent periodically, so that knowledge of others ages between them, [n]."""
         return np.asarray((self.columns[:, CHANNEL.PERIOD : CHANNEL.PERIOD + 1] > 0.0).any(axis=1))
 
     def newest_told(self, vehicle: int) -> Told:

@@ -42,7 +42,7 @@ FOLDERS: dict[str, Path] = {}  # path as text -> registered folder
 
 @dataclass(frozen=True, slots=True)
 class CatalogueEntry:
-    """A shipped or registered scenario."""
+    """Name, title and file of a shipped or registered scenario."""
 
     name: str
     title: str

@@ -274,7 +274,7 @@ class ScenarioFields(FileModel):
 
     @property
     def members(self) -> tuple[ScenarioFields, ...]:
-        """Scenarios of a mixture; empty for any other scenario."""
+        """The scenarios that a mixture consists of; empty for any other scenario."""
         return self._members
 
     @property
@@ -299,19 +299,19 @@ class ScenarioFields(FileModel):
 
     @property
     def has_obstacle(self) -> bool:
-        """Whether there is an obstacle ahead of Vehicle 1, in some member at least if this is a mixture."""
+        """Whether there is an obstacle ahead of Vehicle 1; for a mixture, in at least one member."""
         if self.members:
             return any(member.has_obstacle for member in self.members)
         return self.declares("obstacle_gap_m") or self.obstacle_margin_m is not None
 
     @property
     def has_friction(self) -> bool:
-        """Whether the friction of the road is declared, in some member at least if this is a mixture."""
+        """Whether the friction of the road is declared; for a mixture, in at least one member."""
         return any(member.has_friction for member in self.members) or self.declares("friction")
 
     @property
     def builds_up(self) -> bool:
-        """Whether brakes may build up, in some member at least if this is a mixture."""
+        """Whether brakes may build up; for a mixture, in at least one member."""
         own = self.declares("brake_rate_mps3") or self.declares("release_rate_mps3")
         return own or any(member.builds_up for member in self.members)
 
@@ -331,7 +331,7 @@ class ScenarioFields(FileModel):
 
     @property
     def by_link(self) -> bool:
-        """Whether the channel differs from the paper's rule (``V2X.by_link``), in some member at least of a mixture."""
+        """Whether the channel differs from the paper's rule (``V2X.by_link``); for a mixture, in at least one member."""
         return any(member.by_link for member in self.members) or self.v2x.by_link
 
     @property
