@@ -36,7 +36,10 @@ _KINDS = (
 
 
 def adapt_policy(policy: Any, name: str, features: int, initial_state: Begin | None) -> tuple[Infer, Begin | None]:
-    """Return the policy as such a function, and the function that makes its initial memory; raise ``InvalidInput``."""
+    """Return a policy as a function ``(observation, state) -> (action, state)``, and what makes its initial state.
+
+    The second result is None for a policy without a state. Raises ``InvalidInput`` if it is not a policy.
+    """
     if isinstance(policy, str | os.PathLike):
         policy = _open_onnx(Path(policy), name)
     if not (hasattr(policy, "run") and hasattr(policy, "get_inputs")) and not hasattr(policy, "predict"):

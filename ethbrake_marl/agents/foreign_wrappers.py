@@ -40,7 +40,7 @@ _INSIDE = ("venv", "envs", "vec_envs", "par_env", "aec_env", "env")  # attribute
 def changes(layer: type[Any]) -> bool:
     """Return whether a wrapper or environment may change observations or actions.
 
-    The class that defines its methods decides: it must be in ``HARMLESS`` or belong to this package.
+    It does not if each of its methods is defined by a class in ``HARMLESS`` or by a class of this package.
     """
     for method in _METHODS:
         definer = next((each for each in layer.__mro__ if method in vars(each)), object)

@@ -168,7 +168,7 @@ def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations
 
 
 class Scaling(NamedTuple):
-    """The groups of a specification, except contacts, as arguments of the kernel."""
+    """Arguments of the kernel that computes all groups except the contact features."""
 
     offsets: Ints  # offsets of the neighbours in the line
     role: bool

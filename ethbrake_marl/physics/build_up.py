@@ -60,9 +60,10 @@ def first_return(value: float, rate: float, jerk: float) -> float:
 
 @compiled
 def gap_after(gap: float, closing: float, pressing: float, jerk: float, time: float) -> float:
-    """Return the gap after ``time`` at constant closing jerk: ``g - (w + (b + j t / 3) t / 2) t``, in m.
+    """Return the gap after ``time`` t at constant closing jerk: ``g - (w + (b + j t / 3) t / 2) t``, in m.
 
-    g is ``gap`` (m), w ``closing`` (m/s), b ``pressing`` (m/s2), j ``jerk`` (m/s3).
+    g is ``gap`` (m), w ``closing`` (closing speed, m/s), b ``pressing`` (closing acceleration, m/s2), j ``jerk``
+    (m/s3).
     """
     return gap - (closing + 0.5 * (pressing + jerk * time / 3.0) * time) * time
 
@@ -257,7 +258,10 @@ def crossing_s(below: float, rate: float) -> float:
 
 @compiled(apart=True, bare=True)
 def accelerate_moving(table: Floats) -> float:
-    """``accelerate`` with brake build-up: set accelerations and jerks; return the time until touching vehicles part."""
+    """Version of ``accelerate`` for brake build-up: set accelerations and jerks; return the time until vehicles part.
+
+    The time (s) is that until the first touching vehicles separate.
+    """
     vehicles = table.shape[1]
     for i in range(vehicles):
         plan_force(table, i, table[ROW.COMMAND, i] * table[ROW.ACTIVE, i])
@@ -287,7 +291,7 @@ def accelerate_moving(table: Floats) -> float:
 
 @compiled(apart=True, bare=True)
 def next_moving_event(table: Floats, now: float, end: float, parting: float) -> float:
-    """``next_event`` with brake build-up; ``parting`` is the time until touching vehicles separate (s)."""
+    """Version of ``next_event`` for brake build-up; ``parting`` is the time until touching vehicles separate (s)."""
     vehicles = table.shape[1]
     soonest = min(end - now, parting)
     for i in range(vehicles):
@@ -331,7 +335,7 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
 
 @compiled(apart=True, bare=True)
 def move_on_cubics(table: Floats, duration: float) -> bool:
-    """``move`` with brake build-up: move gaps, speeds and forces to the next event; False if a contact was missed."""
+    """Version of ``move`` for brake build-up: move gaps, speeds and forces; return False if a contact was missed."""
     vehicles, sound = table.shape[1], True
     for p in range(vehicles - 1):
         if table[ROW.CONTACT_TIME, p] <= duration:
@@ -373,7 +377,7 @@ def move_on_cubics(table: Floats, duration: float) -> bool:
 
 @compiled(apart=True, bare=True)
 def move_apart_on_cubics(table: Floats, duration: float) -> bool:
-    """``move_apart`` with brake build-up: move each vehicle alone if no two can come into contact, else return False.
+    """Version of ``move_apart`` for brake build-up: move each vehicle alone if no two can meet, else return False.
 
     Whether two can meet is bounded by the speeds that each of them reaches on its way.
     """
@@ -444,7 +448,7 @@ def move_alone(table: Floats, i: int, wanted: float, duration: float) -> tuple[f
 
 @compiled(apart=True, bare=True)
 def move_alone_by_events(table: Floats, i: int, wanted: float, duration: float) -> tuple[float, float]:
-    """``move_alone`` event by event, for a vehicle that may come to rest or reach its speed limit."""
+    """Version of ``move_alone`` for a vehicle that may come to rest or reach its speed limit: event by event."""
     speed, limit, now = table[ROW.SPEED_VALUE, i], table[ROW.LIMIT, i], 0.0
     slowest, fastest = speed, speed
     while now < duration:

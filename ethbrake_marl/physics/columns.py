@@ -102,7 +102,7 @@ class Packed(NamedTuple):
 
     @property
     def column(self) -> Columns:
-        """First column of each group."""
+        """Index of the first column of each group."""
         return _known_columns((self.state.shape[1] + 4) // 8)
 
     @property

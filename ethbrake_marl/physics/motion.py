@@ -65,7 +65,10 @@ def contact(gap: float, closing: float, pressing: float) -> tuple[float, float]:
 
 @compiled
 def drift(gap: float, closing: float, pressing: float, duration: float) -> float:
-    """Return the gap after ``duration`` at constant closing acceleration: ``g - (w + b t / 2) t``. [m]"""
+    """Return the gap after ``duration`` t at constant closing acceleration: ``g - (w + b t / 2) t``. [m]
+
+    g is ``gap`` (m), w ``closing`` (closing speed, m/s), b ``pressing`` (closing acceleration, m/s2).
+    """
     return gap - (closing + 0.5 * pressing * duration) * duration
 
 

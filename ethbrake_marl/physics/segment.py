@@ -38,7 +38,7 @@ def advance_table(
 def advance_on_cubics(
     table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int
 ) -> tuple[int, int]:
-    """``advance_table`` with brake build-up."""
+    """Version of ``advance_table`` for brake build-up."""
     for i in range(table.shape[1]):
         if not command_acts(table[ROW.ONSET, i], duration):
             table[ROW.ONSET, i] = max(table[ROW.ONSET, i], duration)

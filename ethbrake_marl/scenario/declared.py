@@ -299,19 +299,19 @@ class ScenarioFields(FileModel):
 
     @property
     def has_obstacle(self) -> bool:
-        """Whether there is an obstacle ahead of Vehicle 1; for a mixture, in at least one member."""
+        """Whether there is an obstacle ahead of Vehicle 1; for a mixture: in some member."""
         if self.members:
             return any(member.has_obstacle for member in self.members)
         return self.declares("obstacle_gap_m") or self.obstacle_margin_m is not None
 
     @property
     def has_friction(self) -> bool:
-        """Whether the friction of the road is declared; for a mixture, in at least one member."""
+        """Whether the friction of the road is declared; for a mixture: in some member."""
         return any(member.has_friction for member in self.members) or self.declares("friction")
 
     @property
     def builds_up(self) -> bool:
-        """Whether brakes may build up; for a mixture, in at least one member."""
+        """Whether brakes may build up; for a mixture: in some member."""
         own = self.declares("brake_rate_mps3") or self.declares("release_rate_mps3")
         return own or any(member.builds_up for member in self.members)
 
@@ -331,7 +331,7 @@ class ScenarioFields(FileModel):
 
     @property
     def by_link(self) -> bool:
-        """Whether the channel differs from the paper's rule (``V2X.by_link``); for a mixture, in at least one member."""
+        """Whether the channel differs from the paper's rule (``V2X.by_link``); for a mixture: in some member."""
         return any(member.by_link for member in self.members) or self.v2x.by_link
 
     @property

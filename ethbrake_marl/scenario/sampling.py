@@ -237,7 +237,7 @@ def _unusable(scenario: ScenarioFields, world: int) -> InvalidInput:
 
 
 def _draw(scenario: ScenarioFields, seed: int, channel: Channel, attempt: int, index: Ints) -> Sample:
-    """Return the worlds with these numbers (ascending) in this attempt."""
+    """Draw the worlds with these numbers (ascending) once, with the random numbers of this attempt."""
     first, last = int(index[0]), int(index[-1])
 
     def numbers(width: int, of: tuple[int, ...] = ()) -> Floats:

@@ -140,7 +140,7 @@ def closing_speed_squared(
 
 @compiled
 def least_behind_braking(gap: float, v_l: float, a_l: float, v_f: float, tau: float) -> float:
-    """``least_to_spare_front`` for a leader that brakes from 0 and a follower that brakes from ``tau >= 0``."""
+    """Case of ``least_to_spare_front`` in which the leader brakes from 0 and the follower from ``tau >= 0``."""
     coasting = contact_while_coasting(gap, v_l, a_l, v_f, tau)
     if coasting > TOUCH_SQUARED:
         return math.inf
@@ -159,7 +159,7 @@ def least_behind_braking(gap: float, v_l: float, a_l: float, v_f: float, tau: fl
 
 @compiled
 def least_behind_coasting(gap: float, v_l: float, a_l: float, v_f: float, lead: float) -> float:
-    """``least_to_spare_front`` for a follower that brakes from 0 and a leader that brakes from ``lead > 0``."""
+    """Case of ``least_to_spare_front`` in which the follower brakes from 0 and the leader from ``lead > 0``."""
     if v_f == 0.0:
         return 0.0
     w = v_f - v_l
@@ -194,7 +194,7 @@ def least_to_spare_front(gap: float, v_l: float, a_l: float, onset_l: float, v_f
 
 @compiled
 def most_ahead_of_coasting(gap: float, v_l: float, v_f: float, a_f: float, tau: float) -> float:
-    """``most_to_spare_rear`` for a leader that brakes from 0 and a follower that brakes from ``tau >= 0``."""
+    """Case of ``most_to_spare_rear`` in which the leader brakes from 0 and the follower from ``tau >= 0``."""
     reach = v_f * tau + stopping_distance(v_f, a_f)
     touching = gap == 0.0 and v_f == v_l  # pressed together from the start: no impact
     if reach <= gap or touching:

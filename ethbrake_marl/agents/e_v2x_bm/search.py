@@ -83,9 +83,9 @@ def make_room() -> Room:
 
 @compiled(apart=True, bare=True)
 def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, out: Floats) -> int:
-    """Write a line's best deceleration, its harm and the other count's to ``out`` [3]; return DONE or a failed check.
+    """Find a line's best deceleration; write it, its harm and its harm under the other count to ``out`` [3].
 
-    ``breakpoints`` [CANDIDATES] are simulated in addition to the grid.
+    ``breakpoints`` [CANDIDATES] are simulated in addition to the grid. Returns DONE or the failed check.
     """
     status = share_start(line)
     if status == FLAG.DONE:
