@@ -1,4 +1,4 @@
-"""Where a vehicle estimates the others to be, from periodic messages whose content may be old."""
+"""A vehicle's estimate of the others' states, from the newest periodic messages, which may be old."""
 
 from __future__ import annotations
 
