@@ -1,0 +1,128 @@
+"""Observations in a scenario: features of each vehicle, the full state, and the rows that learners receive."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Literal, get_args
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.game.features import GROUPS, Feature
+from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec, choose_observation, observe
+from ethbrake_marl.physics.state import Vehicles, Worlds
+from ethbrake_marl.scenario.schema import Scenario
+
+
+def observation_for(scenario: Scenario, vehicle: str | None = None) -> ObservationSpec:
+    """Return the observation of a vehicle, or of all learners, that the scenario declares.
+
+    By default a vehicle observes one neighbour on each side; with an obstacle ahead also its own place in the line and
+    the obstacle. Raises ``InvalidInput`` naming two learners with different observations, if ``vehicle`` is None.
+    """
+    observations = observations_of(scenario)
+    if vehicle is None:
+        return common_observation(observations, scenario)
+    if vehicle not in scenario.vehicle_names:
+        raise unknown_name("vehicle", vehicle, scenario.vehicle_names)
+    return observations[scenario.vehicle_names.index(vehicle)]
+
+
+def observations_of(scenario: Scenario, given: Observation | None = None) -> tuple[ObservationSpec, ...]:
+    """Return the observation of each vehicle, front to rear, [N]: from ``given``, otherwise from the scenario.
+
+    Both give one observation for all vehicles, or one by name for some: ``{"vehicle_2": ["own", "front_1"]}``. Raises
+    ``UnknownName`` for an unknown vehicle, and what ``choose_observation`` raises.
+    """
+    names, step_s, said = scenario.vehicle_names, scenario.time_step_s, scenario.observation
+    usual = ObservationSpec(role=scenario.has_obstacle, obstacle=scenario.has_obstacle)
+    each = dict.fromkeys(names, usual)
+    for told in (said, given):
+        if isinstance(told, Mapping) and any(str(name).startswith("vehicle_") for name in told):
+            for name, listed in told.items():
+                if name not in each:
+                    raise unknown_name("vehicle", name, names)
+                try:
+                    each[name] = choose_observation(listed, step_s)
+                except InvalidInput as error:
+                    raise type(error)(f"{name}: {error}") from None
+        elif told is not None:
+            each = dict.fromkeys(names, choose_observation(told, step_s))
+    return tuple(each.values())
+
+
+def common_observation(observations: tuple[ObservationSpec, ...], scenario: Scenario) -> ObservationSpec:
+    """Return the observation that all learners share, of one per vehicle; without learners, that all vehicles share.
+
+    Raises ``InvalidInput`` naming two of them with different observations.
+    """
+    first, *others = scenario.learners or range(scenario.vehicles)
+    for other in others:
+        if observations[other] != observations[first]:
+            one, two = (scenario.vehicle_names[i] for i in (first, other))
+            raise InvalidInput(
+                f"observation: {one} and {two} of {scenario.name!r} observe different features, here learners must"
+                " observe the same: give one list for all, let one learn, or use parallel_env or scheme independent"
+            )
+    return observations[first]
+
+
+# The full state of a line as one vector, for centralised critics: all vehicles, all pairs, the time.
+#
+# It uses the features of ``game.features`` and hides nothing: a critic sees values that latency hides from vehicles.
+# The row of a learner may end with the full state, or with the learner's place among the learners (``appended``).
+
+Appended = Literal["number", "state"]  # what a row holds after the vehicle's own observation
+
+_OWN_ONLY = ObservationSpec(front=0, rear=0)
+
+_PAIR_MEANING = {"gap": "free distance between the two", "hit": "1 if the pair has had an impact"}
+
+_OBSTACLE_FEATURES = tuple(
+    replace(f, name=f"obstacle.{f.name}", meaning=meaning)
+    for f in GROUPS.obstacle
+    for name, meaning in (("gap", "distance from Vehicle 1 to the obstacle"), ("hit", f.meaning))
+    if f.name == name
+)
+
+_PAIR_FEATURES = tuple(replace(f, meaning=_PAIR_MEANING[f.name]) for f in GROUPS.neighbour if f.name in _PAIR_MEANING)
+
+
+def state_features(scenario: Scenario) -> tuple[Feature, ...]:
+    """Return the features of the full state in order: each vehicle's own features, each pair's gap and hit flag, time.
+
+    With an obstacle ahead of Vehicle 1, its gap and hit flag follow.
+    """
+    vehicles = [replace(f, name=f"{name}.{f.name}") for name in scenario.vehicle_names for f in GROUPS.own]
+    pairs = [replace(f, name=f"pair_{p}.{f.name}") for p in range(1, scenario.vehicles) for f in _PAIR_FEATURES]
+    time = Feature("time", "s", scenario.horizon_s, 0.0, 1.0, "time since Vehicle 1 began to brake; scale: the horizon")
+    obstacle = _OBSTACLE_FEATURES if scenario.has_obstacle else ()
+    return (*vehicles, *pairs, time, *obstacle)
+
+
+def full_state(worlds: Worlds, scenario: Scenario) -> Observations:
+    """Return the full state of every world, [n, S] float32; S = 7 N + 2 P + 1, plus 2 with an obstacle ahead."""
+    latency = worlds.vehicles.latency_s  # the whole latency, including the channel's part
+    whole_latency = replace(worlds.vehicles, own_latency_s=latency, known_from_s=Vehicles.known_at_once(latency))
+    vehicles = [observe(replace(worlds, vehicles=whole_latency), i, _OWN_ONLY) for i in range(worlds.N)]
+    pair_values = {"gap": worlds.gaps_m, "hit": worlds.pair_hit.astype(np.float64)}
+    columns = [pair_values[f.name][:, p] for p in range(worlds.N - 1) for f in _PAIR_FEATURES]
+    columns.append(worlds.time_s)
+    if scenario.has_obstacle:
+        columns += [worlds.obstacle_gap_m, worlds.obstacle_hit.astype(np.float64)]
+    features = state_features(scenario)[-len(columns) :]
+    rest = [np.clip(c / f.scale, f.low, f.high) for c, f in zip(columns, features, strict=True)]
+    return np.concatenate([*vehicles, np.stack(rest, axis=1)], axis=1, dtype=np.float32)
+
+
+def row_features(own: tuple[Feature, ...], appended: Appended | None, scenario: Scenario) -> tuple[Feature, ...]:
+    """Return the features of a learner's row in order; raise ``InvalidInput`` for an invalid ``appended``."""
+    if appended not in (None, *get_args(Appended)):
+        raise InvalidInput(f"appended = {appended!r}: must be {' or '.join(get_args(Appended))}, or None")
+    if appended is None:
+        return own
+    if appended == "state":
+        return (*own, *state_features(scenario))
+    last = len(scenario.learners) - 1
+    return (*own, Feature("learner", "1", 1.0, 0.0, float(max(last, 1)), "the learner's place among the learners"))
