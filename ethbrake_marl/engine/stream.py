@@ -75,8 +75,8 @@ class Roster:
             del self.failed[row]
 
     def mark(self, status: Ints, from_s: Floats, until_s: Floats) -> None:
-        """Record the worlds with a non-zero ``status``, which a step from ``from_s`` to ``until_s`` [n] could not
-        advance.
+        """Record worlds with a non-zero ``status``: a step from ``from_s`` to ``until_s`` [n] could not advance
+        them.
         """
         new = FLAG.failure(np.where(status == 0, FLAG.DONE, status), from_s, until_s).worlds
         self.failed |= new
@@ -144,7 +144,7 @@ class Stream:
         self._drawn += size
 
     def prepare(self, alert: Worlds) -> Start:
-        """Return worlds at t = 0 advanced to their first decision. Raise ``InvalidInput`` if that is not before the
+        """Return worlds at t = 0 advanced to their first decision; raise ``InvalidInput`` if it is after the
         horizon.
         """
         alert = alert.play_pieces(self._pieces)

@@ -145,8 +145,9 @@ def try_action(
 
 @compiled
 def tell_action(out: Floats, action: Floats, bound: float, margin: float) -> None:
-    """Write applied action, bound and margin into ``out`` [K, 4]; vehicles without a certificate keep their own
-    margin.
+    """Write applied action, bound and margin into ``out`` [K, 4].
+
+    Vehicles whose proposal has no certificate keep the margin that is there already.
     """
     for c in range(action.shape[0]):
         out[c, APPLIED], out[c, BOUND] = action[c], bound
@@ -236,10 +237,10 @@ def certify_worlds(
 
 @compiled
 def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Floats) -> None:
-    """Fill ``value`` [n] with the worst harm, over the members, of executing the plans from now on; infinity where it
-    fails.
+    """Fill ``value`` [n] with the worst harm, over the members, of executing the plans from now on.
 
-    Where one of the ``constants`` harms less than a plan, it replaces the rest of that plan in place first.
+    The value is infinity where the physics fails. Where one of the ``constants`` harms less than a plan, it replaces
+    the rest of that plan in place first.
     """
     n, every = running.steps.shape[0], all_members(running)
     trial = np.zeros((plans.shape[1], plans.shape[2]))
@@ -323,9 +324,7 @@ class Decision(NamedTuple):
         return np.array(texts).reshape(self.reason.shape)
 
     def put(self, rows: Ints, other: Decision, taken: Ints) -> Decision:
-        """Return a copy with some worlds replaced: world ``rows[j]`` of this decision by world ``taken[j]`` of
-        ``other``.
-        """
+        """Return a copy with world ``rows[j]`` of this decision replaced by world ``taken[j]`` of ``other``."""
         columns: dict[str, Any] = {
             name: put(getattr(self, name), rows, getattr(other, name)[taken]) for name in self._fields[:5]
         }
@@ -348,9 +347,7 @@ def plan_harm(running: Running, plan: Floats) -> Floats:
 
 
 def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Floats, Floats]:
-    """Return each plan, or the best constant action where it harms less in the worst member, and the harm of the
-    result.
-    """
+    """Return each plan, or the best constant action if it harms less in the worst member, and the resulting harm."""
     value = np.empty(running.n)
     _check_plan(running, plan)
     plans = np.array(plan, np.float64, order="C")
@@ -362,16 +359,15 @@ def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Fl
 
 
 def from_now(past: Floats, later: Floats | float, steps: Ints) -> Floats:
-    """Return plans with the actions of ``past`` before decision ``steps`` [n], and of ``later`` from that decision
-    on.
-    """
+    """Return plans with the actions of ``past`` before decision ``steps`` [n], and of ``later`` afterwards."""
     made = np.arange(past.shape[1]) < steps[:, np.newaxis]
     return np.where(made if past.ndim == 2 else made[:, :, np.newaxis], past, later)
 
 
 def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) -> Decision:
-    """Decide in every world: apply the proposed action if it can be certified, else the backup plan's. Changes no
-    argument.
+    """Decide in every world: apply the proposed action if it can be certified, else the backup plan's.
+
+    No argument is changed.
 
     Args:
         running: the episodes at this decision.

@@ -33,9 +33,7 @@ def seen_columns(packed: Packed) -> Floats:
 
 
 def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
-    """Return ``worlds`` with speeds, gaps and hit flags (also the obstacle's) replaced by those of ``states`` [n,
-    S].
-    """
+    """Return ``worlds`` with the speeds, gaps and hit flags of ``states`` [n, S], also those of an obstacle."""
     added = (states.shape[1] + 4) // 6 - worlds.N  # 1 if each group starts with the column of an obstacle, else 0
     N = worlds.N + added
     gaps, hit = states[:, N : 2 * N - 1], states[:, 2 * N - 1 : 3 * N - 2] == 1.0
@@ -50,9 +48,7 @@ def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
 
 
 def difference(predicted: Floats, seen: Floats) -> str:
-    """Describe the first number in which a world's seen state [S] differs from its predicted state; "nothing" if none
-    does.
-    """
+    """Describe the first number in which a seen state [S] differs from its prediction; "nothing" if none does."""
     vehicles = (len(predicted) + 4) // 6
     for column in np.flatnonzero(~(seen == predicted[: len(seen)])).tolist():
         if column < vehicles:

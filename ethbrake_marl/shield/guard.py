@@ -122,9 +122,7 @@ class StepGuard(ShieldGuard):
         return memory._replace(shield=shield)
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a step: action and reason, bound, whether the world is trusted, and the harm of each
-        vehicle.
-        """
+        """Return the infos of a step: action, reason, bound, trust in the world, and the harm of each vehicle."""
         shield: StepShield = memory.shield
         assert shield.running is not None
         infos = self._of_step(ruling) | why(ruling)

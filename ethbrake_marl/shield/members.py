@@ -195,10 +195,9 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
 
 @compiled
 def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int, constants: Floats, c: int) -> float:
-    """Return the harm of member ``m`` if constant action ``c`` of ``constants`` [C, K] is held, simulated in one
-    segment.
+    """Return the harm of member ``m`` if constant action ``c`` of ``constants`` [C, K] is held to the horizon.
 
-    Returns infinity where the physics fails.
+    It is simulated in one segment. Returns infinity where the physics fails.
     """
     table, clock, vehicles, bounds = world.table, world.clock[m], world.vehicles, world.bounds
     enter(world, m, state)

@@ -72,9 +72,7 @@ class Running(NamedTuple):
 
 
 def begin_running(problem: ProfileProblem, members: int = 1) -> Running:
-    """Return the episodes of a problem at their first decision. Every ``members`` rows of the problem form one
-    world.
-    """
+    """Return the episodes of a problem at their first decision; every ``members`` rows of it form one world."""
     steps, ended = np.zeros(problem.n // members, np.int64), np.zeros(problem.n, np.bool_)
     return Running(problem, problem.start, steps, ended)
 

@@ -358,9 +358,7 @@ class StepShield:
         return decision
 
     def _also_certified(self, now: Running, held: Backup, budget: Floats, decision: Decision, asked: Bools) -> Decision:
-        """Restrict a decision that all members allow; this class leaves it unchanged. ``held`` is the backup
-        before it.
-        """
+        """Restrict a decision that all members allow; ``held`` is the backup before it. This class changes nothing."""
         return decision
 
     def as_seen(self, seen: Floats) -> Floats:
@@ -400,9 +398,7 @@ class StepShield:
         return np.asarray((predicted[:, :, 2 * N - 1 : 3 * N - 2] == 1.0).any(axis=(1, 2)), np.bool_)
 
     def _compare(self, seen: Floats, asked: Bools) -> None:
-        """Mark the worlds that contradict the prediction as distrusted, and choose a new fallback plan from the
-        observed state.
-        """
+        """Mark worlds that contradict the prediction as distrusted, and choose a fallback plan for them."""
         assert self.running is not None
         running, seen = self.running, self.as_seen(seen)
         columns, surprising = seen.shape[1], asked & ~self.expects(seen)

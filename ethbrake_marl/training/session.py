@@ -226,9 +226,7 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
 
 
 def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
-    """Save the best and the last good policy, and record how the run ended. Delete the checkpoints of a finished
-    run.
-    """
+    """Save the best and the last good policy, and record how the run ended. A finished run loses its checkpoints."""
     run, training, course = callback.run, callback.learner.training, callback.course
     for policy, folder in ((course.kept, run.policy), (course.policy, run.last_policy)):
         if policy is not None:
