@@ -40,7 +40,10 @@ def take_memory(memory: Memory, rows: Ints) -> Memory:
 
 
 def renew_memory(memory: Memory, rows: Ints, part: Memory) -> Memory:
-    """Return ``memory`` with ``rows`` replaced by those of ``part``; what ``part`` lacks or has as None is kept."""
+    """Return ``memory`` with ``rows`` replaced by those of ``part``; what ``part`` lacks or has as None is kept.
+
+    Raises ``InvalidInput`` if ``part`` has keys that ``memory`` lacks.
+    """
     if part is None:
         return memory
     if memory is None or (isinstance(part, Mapping) and not part.keys() <= memory.keys()):

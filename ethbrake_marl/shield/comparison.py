@@ -63,9 +63,9 @@ def difference(predicted: Floats, seen: Floats) -> str:
 def ends_under(running: Running, plan: Floats) -> tuple[Bools, Floats]:
     """Return how the episodes end if the plans are executed from now on.
 
-    Returns two arrays: whether all vehicles rest at the horizon in every member, [n]; and the harm of the whole episode
-    that each vehicle bears, [n * M, N] m2/s2. Harm is split by mass with the operations of the ledger, so both agree to
-    the bit. With an obstacle ahead, its column comes first and is 0.
+    Returns two arrays: whether all vehicles rest at the horizon in every member (possible world), [n]; and the harm of
+    the whole episode that each vehicle bears, [n * M, N] m2/s2. Harm is split by mass with the operations of the
+    ledger, so both agree to the bit. With an obstacle ahead, its column comes first and is 0.
     """
     rests, borne = np.empty(running.n, np.bool_), np.empty(running.problem.mass.shape)
     plans = np.ascontiguousarray(plan).reshape(*plan.shape[:2], len(running.problem.vehicles))

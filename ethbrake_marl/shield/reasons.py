@@ -26,7 +26,7 @@ class ShieldReason(IntEnum):
 
     @property
     def text(self) -> str:
-        """Reason in words."""
+        """The reason in words, such as "no certificate"."""
         return self.name.lower().replace("_", " ")
 
 

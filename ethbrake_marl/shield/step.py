@@ -219,7 +219,7 @@ class StepShield:
         self.__dict__.update(new.__dict__)
 
     def members_of(self, worlds: Worlds) -> Worlds:
-        """Return the members of worlds at the alert, [n * M]. Here each world is its only member."""
+        """Return the members (possible worlds) of worlds at the alert, [n * M]. Here each world is its only member."""
         return worlds
 
     def _begin(self, worlds: Worlds, rows: Ints, policy: Agent | Mapping[int, Agent] | None, possible: Worlds) -> None:
@@ -392,7 +392,9 @@ class StepShield:
         return np.asarray(within | (self._leaves_range(running) & np.isfinite(seen).all(axis=1)), np.bool_)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Return the worlds [n] that may leave the range of their members, because a member has had an impact."""
+        """Return the worlds [n] that may leave the range of their members (possible worlds): one of these had an
+        impact.
+        """
         N = running.problem.mass.shape[1]
         predicted = running.states.reshape(running.n, running.members, -1)
         return np.asarray((predicted[:, :, 2 * N - 1 : 3 * N - 2] == 1.0).any(axis=(1, 2)), np.bool_)

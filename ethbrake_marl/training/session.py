@@ -180,7 +180,7 @@ def build(
 
 
 def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[str] = ()) -> TrainResult:
-    """Learn from a checkpoint, or from the beginning without one, to the end or the next stop; then save.
+    """Learn, from a checkpoint or from scratch, to the end or the next stop; then save.
 
     The callback evaluates during training. However the training ends, its folder is complete.
     """
