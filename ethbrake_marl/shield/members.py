@@ -27,9 +27,7 @@ OF_COMMAND, OF_LATENCY, OF_MASS, OF_LIMIT, OF_BRAKE_RATE, OF_RELEASE_RATE, OF_CA
 
 
 class Members(NamedTuple):
-    """Parameters of the members (possible worlds) of one world, or of a whole batch, and working memory for the
-    kernels.
-    """
+    """Parameters of the members (possible worlds) of one world or of a whole batch, and working memory."""
 
     table: Floats  # working table of one world, see ``physics.rows``
     clock: Floats  # [M, CLOCK.WIDTH] clock of each member's episode
@@ -148,9 +146,7 @@ def within_caps(world: Members, m: int) -> bool:
 
 @compiled
 def worst_so_far(world: Members, states: Floats) -> float:
-    """Return the largest harm so far over the members (possible worlds); infinity if a vehicle bears more than its
-    cap.
-    """
+    """Return the largest harm so far over the members (possible worlds); infinity if a vehicle exceeds its cap."""
     worst = 0.0
     for m in range(states.shape[0]):
         enter(world, m, states[m])

@@ -13,8 +13,8 @@ with the operations of the engine's step in the same order, and adds harm in the
 1. *Start.* ``c = B``.
 2. *The proposal is applied* only with a plan from the next state whose harm, computed by ``follow_plan`` from exactly
    that state, is at most the budget. The shield then holds that plan, and ``c`` is its harm. If the proposal is the
-   plan's own action, the shield keeps the rest of the plan with the same ``c``: the same operations on the same
-       numbers.
+   plan's own action, the shield keeps the rest of the plan with the same ``c``, since the same operations act on the
+   same numbers.
 3. *The plan's action is applied* otherwise. ``follow_plan`` passed through the resulting state when it computed ``c``,
    so the harm of the plan's rest is ``c`` to the last bit. A plan that harms less may replace it.
 4. *End.* When the episode ends, nothing is left to execute, and ``c`` is the harm of the episode.
@@ -392,8 +392,8 @@ class StepShield:
         return np.asarray(within | (self._leaves_range(running) & np.isfinite(seen).all(axis=1)), np.bool_)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Return the worlds [n] that may leave the range of their members (possible worlds): one of these had an
-        impact.
+        """Return worlds [n] that may leave the range of their members (possible worlds), after an impact in a
+        member.
         """
         N = running.problem.mass.shape[1]
         predicted = running.states.reshape(running.n, running.members, -1)
