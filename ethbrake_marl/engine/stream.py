@@ -75,9 +75,7 @@ class Roster:
             del self.failed[row]
 
     def mark(self, status: Ints, from_s: Floats, until_s: Floats) -> None:
-        """Record worlds that a step from ``from_s`` to ``until_s`` [n] failed to advance: those with ``status``
-        not 0.
-        """
+        """Record worlds that a step from ``from_s`` to ``until_s`` [n] failed to advance: ``status`` is not 0."""
         new = FLAG.failure(np.where(status == 0, FLAG.DONE, status), from_s, until_s).worlds
         self.failed |= new
         for row, reason in new.items() if self.warns else ():

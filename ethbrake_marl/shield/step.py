@@ -392,9 +392,7 @@ class StepShield:
         return np.asarray(within | (self._leaves_range(running) & np.isfinite(seen).all(axis=1)), np.bool_)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Return worlds [n] that may leave the range of their members (possible worlds), after an impact in a
-        member.
-        """
+        """Return worlds [n] that may leave the range of their members (possible worlds), after an impact in one."""
         N = running.problem.mass.shape[1]
         predicted = running.states.reshape(running.n, running.members, -1)
         return np.asarray((predicted[:, :, 2 * N - 1 : 3 * N - 2] == 1.0).any(axis=(1, 2)), np.bool_)
