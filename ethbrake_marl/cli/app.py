@@ -70,10 +70,10 @@ def main() -> None:
 
 
 def run_command(arguments: Sequence[str]) -> int:
-    """Run a command line and return its exit status: 2, with one line on stderr, for bad input, bad usage or a file
-    error.
+    """Run a command line and return its exit status.
 
-    Other errors are defects, and are raised.
+    It is 2, with one line on stderr, for bad input, bad usage or a file error. Other errors are defects, and are
+    raised.
     """
     asked = _shell_asks(os.environ)
     try:
@@ -254,8 +254,7 @@ def with_installed(group: Any, name: str) -> Any:
 
 
 def whole_command() -> Any:
-    """Return the whole command line: commands of the core, of extensions, of installed packages, and of a user's
-    program.
+    """Return the command line with the commands of core, extensions, installed packages, and a user's program.
 
     Raises ``AlreadyExists`` if a program's command has the name of another command.
     """

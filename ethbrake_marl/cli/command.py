@@ -211,8 +211,6 @@ class _PlainConsole(Console):
         super().__init__(file=file, width=width, markup=False, emoji=False, highlight=False)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
-        """Yield the segments of a line or table, with control characters replaced in all but rich's own control
-        segments.
-        """
+        """Yield the segments of a line or table, with control characters of texts replaced."""
         for piece in super().render(renderable, options):
             yield piece if piece.control else Segment(plain_text(piece.text, keep=_KEPT), piece.style)

@@ -168,9 +168,7 @@ def _scenarios() -> tuple[bool, str]:
 
 
 def _golden_impact() -> tuple[bool, str]:
-    """Check an impact: a car at 10 m/s brakes with 5 m/s2, 8 m behind a standing car; harm ``10^2 - 2 * 5 * 8 =
-    20``.
-    """
+    """Check the harm of a car at 10 m/s that brakes with 5 m/s2, 8 m behind a parked car: ``10^2 - 2 * 5 * 8 = 20``."""
     import numpy as np
 
     from ethbrake_marl.physics.advance import advance
@@ -186,9 +184,7 @@ def _golden_impact() -> tuple[bool, str]:
 
 
 def _golden_baseline() -> tuple[bool, str]:
-    """Check the paper's distance scenario at 7 m and 7 m: E-V2X-BM brakes with 5.17021 m/s2 and predicts harm
-    4.03447.
-    """
+    """Check E-V2X-BM in the paper's distance scenario at 7 m and 7 m: it brakes with 5.17021 m/s2, harm 4.03447."""
     import numpy as np
 
     from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise

@@ -46,9 +46,7 @@ _POLICIES = {"same": "the same", "other": "another", "none": ""}
 
 
 def read_task(scenario: str, settings: Sequence[str] | None) -> Task:
-    """Return the task of a scenario, by name or path, with these settings: its learners, and the harm of
-    ``harm_count``.
-    """
+    """Return the task of a scenario (name or path) with these settings, including ``harm_count``."""
     return _task_of(scenario, training.read_settings(settings, of_agents=("harm_count",)))
 
 
@@ -60,9 +58,7 @@ def _task_of(scenario: str, given: Settings) -> Task:
 
 
 def make_drivers(agents: str | Sequence[str], task: Task, *, bare: bool = False) -> dict[str, Any]:
-    """Return the agents named on the command line (``make_lineup``), and print which policies ``@shipped`` stands
-    for.
-    """
+    """Return the agents named on the command line (``make_lineup``), and print what ``@shipped`` stands for."""
     lineup = evaluation.make_lineup(agents, task.scenario, harm_count=task.harm_count, bare=bare)
     _tell_shipped(lineup)
     return lineup
@@ -102,7 +98,7 @@ def evaluate_command(
 
     `ethbrake agent list` shows all agents; ladder stands for all of them from coast to best_harm. Behind any agent:
     +search, then one shield, +episode or +step; for instance full_brake+step or ppo@PATH+search+episode.
-    PATH is a run or a policy bundle, or shipped. +robust needs an uncertainty, which can only be passed in Python;
+    PATH is a run or a policy bundle, or shipped. +robust needs an uncertainty, which is given in Python;
     +robust:believed needs none. With --set harm_count=total agents minimise the harm of all impacts, not only of first
     impacts. --set measures=injury,my_file.py:worst adds these measures to the usual ones.
     """
@@ -171,9 +167,7 @@ def _tell_worlds(out: Out, worlds: int) -> Callable[[int], None]:
 def _evaluate_group(
     out: Out, output: Path | None, group: Sequence[Task], agents: str, episodes: int | None, seed: int | None
 ) -> None:
-    """Evaluate each agent in each scenario of a group: whether any vehicles collide, and how hard the hardest impact
-    is.
-    """
+    """Evaluate each agent in each scenario of a group: whether vehicles collide, and how hard the worst impact is."""
     told: list[dict[str, Any]] = []
     rows: list[Any] = []
     seed = evaluation.LIST_SEED if seed is None else seed

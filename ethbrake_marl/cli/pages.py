@@ -10,8 +10,7 @@ from ethbrake_marl.registry import Registry
 
 
 def register_page(shows: str, write: Callable[..., None]) -> None:
-    """Register a function that writes a page about ``"evaluation"`` or ``"worlds"``, from the arguments that a command
-    passes.
+    """Register a function that writes a page about ``"evaluation"`` or ``"worlds"``; a command calls it.
 
     An installed package does the same with an entry point of the group ``ethbrake_marl.pages``.
     """

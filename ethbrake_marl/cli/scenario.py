@@ -110,9 +110,7 @@ def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
 
 
 def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tuple[list[str], str, dict[str, Any]]:
-    """Return three parts: a table of the range of each varying quantity, the fixed quantities, and all ranges by
-    column.
-    """
+    """Return a table of the ranges of varying quantities, a text about fixed ones, and all ranges by column."""
     import numpy as np
 
     worlds, varying = sample.worlds, evaluation.drawn_alike(sample.worlds, scenario)

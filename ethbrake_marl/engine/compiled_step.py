@@ -1,5 +1,4 @@
-"""The engine's compiled step: from actions to commands, motion, ends of episodes, and the reward that all vehicles
-share.
+"""The engine's compiled step: actions to commands, motion, ends of episodes, and the reward that vehicles share.
 
 Worlds are rows as in ``physics.columns``; ``clock`` [n, 4] holds the additional state of each episode.
 """

@@ -40,8 +40,9 @@ def take_memory(memory: Memory, rows: Ints) -> Memory:
 
 
 def renew_memory(memory: Memory, rows: Ints, part: Memory) -> Memory:
-    """Return ``memory`` with ``rows`` replaced by those of ``part``; keys that ``part`` lacks, or has as None, are
-    unchanged.
+    """Return ``memory`` with ``rows`` replaced by those of ``part``; what ``part`` lacks or has as None is kept.
+
+    Raises ``InvalidInput`` if ``part`` has keys that ``memory`` lacks.
     """
     if part is None:
         return memory
@@ -97,9 +98,7 @@ def flat(memory: Memory) -> Arrays:
 
 
 def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
-    """Return a copy of the memory at path ``place`` of ``arrays`` (the inverse of ``flat``); numbers are places in a
-    tuple.
-    """
+    """Return a copy of the memory at path ``place`` of ``arrays``: the inverse of ``flat``. Numbers index tuples."""
     if place in arrays:
         return np.array(arrays[place]) if arrays[place].shape != (0,) else None
     inner = dict.fromkeys(name[len(place) + 1 :].partition(".")[0] for name in arrays if name.startswith(f"{place}."))
@@ -110,9 +109,7 @@ def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
 
 
 def _check_kept(before: Memory, after: Memory, who: str) -> None:
-    """Raise ``InvalidInput`` if the memory's keys, shapes or dtypes have changed, because restarted rows would not
-    fit.
-    """
+    """Raise ``InvalidInput`` if a memory's keys, shapes or dtypes changed; restarted rows would not fit then."""
     began, told = (map_memory(lambda array: (array.dtype, *array.shape[1:]), each) for each in (before, after))
     if began != told:
         raise InvalidInput(
@@ -189,9 +186,7 @@ def ask_script(script: Script, worlds: Worlds, memory: Memory, vehicle: int) -> 
 
 @contextmanager
 def _as_it_was(script: Script, vehicle: int) -> Iterator[None]:
-    """Raise ``InvalidInput`` if a script changes its own attributes inside the block, because all episodes share
-    them.
-    """
+    """Raise ``InvalidInput`` if a script changes its own attributes in the block, since all episodes share them."""
     before = dict(getattr(script, "__dict__", {}))
     yield
     for name in {**before, **getattr(script, "__dict__", {})}:
@@ -205,9 +200,7 @@ def _who(script: Script, vehicle: int) -> str:
 
 
 def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle: int) -> Exception:
-    """Return the error to raise for an error of a script: the same for errors of this package, else one that names the
-    script.
-    """
+    """Return the error to raise for a script's error: one that names the script, unless it is the package's own."""
     if isinstance(error, EthBrakeError) or is_ours(script):
         return error
     who = _who(script, vehicle)

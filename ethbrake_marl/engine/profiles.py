@@ -125,9 +125,7 @@ class ProfileProblem(NamedTuple):
         return first, total
 
     def check(self, profiles: Profiles) -> None:
-        """Raise ``InvalidInput`` unless there is one profile per world, within the capacities, with its phases in
-        order.
-        """
+        """Raise ``InvalidInput`` unless there is one profile per world, within the capacities, with ordered phases."""
         n, C = self.n, len(self.vehicles)
         K = profiles.ends.shape[-1]
         if profiles.ends.shape != (n, K) or profiles.commands_mps2.shape != (n, K, C):
@@ -270,9 +268,7 @@ class Profiles(NamedTuple):
     commands_mps2: Floats  # [n, K, C] commands in each phase
 
     def at(self, step: Ints) -> Floats:
-        """Return the commands in force in these steps [n], as [n, C] m/s2; after the last step, the last command
-        continues.
-        """
+        """Return the commands in force in these steps [n], [n, C] m/s2. The last command continues afterwards."""
         phase = np.minimum((self.ends <= step[:, np.newaxis]).sum(axis=1), self.ends.shape[1] - 1)
         return np.asarray(self.commands_mps2[np.arange(len(phase)), phase], np.float64)
 
@@ -282,8 +278,9 @@ class Profiles(NamedTuple):
 
     @staticmethod
     def padded(parts: Sequence[Profiles], least: int) -> list[Profiles]:
-        """Return copies of the profiles in which all have the same number of phases, at least ``least``; added phases
-        are empty.
+        """Return copies in which all profiles have the same number of phases, at least ``least``.
+
+        The added phases are empty.
         """
         width = max([least, *(part.ends.shape[1] for part in parts)])
         return [
@@ -302,9 +299,7 @@ class Profiles(NamedTuple):
 
 @compiled
 def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> SearchWorld:
-    """Return world ``k`` of a problem, with working memory; ``random`` [n] holds the state of every world's random
-    generator.
-    """
+    """Return world ``k`` of a problem with working memory; ``random`` [n] holds the random states of all worlds."""
     N = problem.mass.shape[1]
     table = np.zeros((rows_for(problem.pieces.shape[2]), N))
     for i in range(N):
@@ -318,8 +313,9 @@ def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> Searc
 def follow_worlds(
     problem: ProfileProblem, ends: Ints, commands: Floats, first: Floats, total: Floats, failed: Bools
 ) -> None:
-    """Fill ``first`` and ``total`` [n] with the harm of one profile per world, and ``failed`` [n] where the physics
-    failed.
+    """Fill ``first`` and ``total`` [n] with the harm of one profile per world.
+
+    Sets ``failed`` [n] where the physics fails.
     """
     start, no_random = problem.start, np.zeros(problem.start.shape[0], np.uint64)
     for k in range(start.shape[0]):

@@ -75,9 +75,7 @@ class Roster:
             del self.failed[row]
 
     def mark(self, status: Ints, from_s: Floats, until_s: Floats) -> None:
-        """Record the worlds with a non-zero ``status``, which a step from ``from_s`` to ``until_s`` [n] could not
-        advance.
-        """
+        """Record worlds that a step from ``from_s`` to ``until_s`` [n] failed to advance: ``status`` is not 0."""
         new = FLAG.failure(np.where(status == 0, FLAG.DONE, status), from_s, until_s).worlds
         self.failed |= new
         for row, reason in new.items() if self.warns else ():
@@ -98,7 +96,7 @@ class Stream:
         self._deciders = list(deciders)
         self._state_free = {i: script for i, script in scripts.items() if is_state_free(script)}
         self._pieces = {i: getattr(script, "braking_pieces", ()) for i, script in scripts.items()}
-        # scripts that the ``begin`` of another script gets to know
+        # scripts that are passed to each script's ``begin``
         self.known = {i: script for i, script in scripts.items() if i not in self._deciders}
         self.restart(seed)
 
@@ -144,9 +142,7 @@ class Stream:
         self._drawn += size
 
     def prepare(self, alert: Worlds) -> Start:
-        """Return worlds at t = 0 advanced to their first decision. Raise ``InvalidInput`` if that is not before the
-        horizon.
-        """
+        """Return worlds at t = 0 advanced to their first decision; raise ``InvalidInput`` if the horizon is earlier."""
         alert = alert.play_pieces(self._pieces)
         clock = np.zeros((alert.n, CLOCK_WIDTH))
         clock[:, START] = alert.first_decision_s(self._deciders)

@@ -1,3 +1,1 @@
-"""Environments for each interface: PettingZoo (parallel, AEC), Gymnasium, Gymnasium vector, SB3 ``VecEnv``;
-``render()``.
-"""
+"""Environments: PettingZoo (parallel, AEC), Gymnasium, Gymnasium vector and SB3 ``VecEnv``; and ``render()``."""

@@ -1,5 +1,4 @@
-"""The random draws behind the worlds of an environment: every quantity at the alert, type and scenario, as flat
-columns.
+"""The draws behind the worlds of an environment: every quantity at the alert, type and scenario, as flat columns.
 
 Worlds are pure functions of scenario, seed and number. So nothing is stored while episodes run; the worlds are drawn
 again on request.

@@ -33,9 +33,7 @@ class Specified:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """How the environment was made; None without an id. ``max_episode_steps`` is an upper limit of every episode's
-        length.
-        """
+        """How the environment was made; None without an id. No episode is longer than its ``max_episode_steps``."""
         return self._spec
 
     @spec.setter

@@ -49,9 +49,7 @@ _FLOAT32 = np.dtype(np.float32)
 
 
 def shield_columns(engine: Engine, rows: Ints | None = None) -> Columns:
-    """Return the infos of the shield in an engine as ``shield_NAME`` -> [n, N], of all worlds or of the worlds
-    ``rows``.
-    """
+    """Return the infos of the engine's shield as ``shield_NAME`` -> [n, N], of all worlds or of ``rows`` only."""
     if engine.guard is None or engine.guarded is None:
         return {}
     every = slice(None) if rows is None else rows
@@ -81,9 +79,7 @@ class Report(NamedTuple):
 
     @classmethod
     def of(cls, engine: Engine, step: Step | None = None, rows: Ints | None = None) -> Report:
-        """Return the report of an engine's current worlds, before any of them is renewed; of all worlds or of the
-        worlds ``rows``.
-        """
+        """Return the report of an engine's current worlds, or of ``rows`` only, before any of them is renewed."""
         now, world = engine.state, engine.roster.numbers
         motion, params, wanted = now.motion, now.params, now.wanted
         if rows is not None:
@@ -150,8 +146,7 @@ class Report(NamedTuple):
         return infos
 
     def batch_info(self, vehicle: int, rows: Bools, stepped: Bools) -> dict[str, Any]:
-        """Return one vehicle's infos in all worlds as Gymnasium's vector infos: ``name`` [n] and its mask ``_name``
-        [n].
+        """Return one vehicle's infos in all worlds in Gymnasium's vector format: ``name`` [n] and its mask ``_name``.
 
         Only the worlds marked by ``rows`` have infos. Values about the last step are 0 except in the worlds marked by
         ``stepped``.
@@ -255,8 +250,7 @@ class Begun:
         self._np_random, self._np_random_seed = np.random.default_rng(seed), seed
 
     def _restart(self, seed: int | None, options: Mapping[str, Any] | None) -> None:
-        """Start new episodes in all worlds, from the start of the stream of ``seed``, or from the stream's current
-        position.
+        """Start new episodes in all worlds, from the start of the stream of ``seed``, or from where the stream is.
 
         With ``options["initial_state"]`` (see ``scenario.tables.worlds_from_state``) every world starts in that state.
         With ``options["listed_world"] = {"seed": 7, "number": 3}`` the episode starts in that world of the evaluation
@@ -295,9 +289,7 @@ class Begun:
             raise InvalidInput(f"{what}: no episode was started; call reset first")
 
     def describe_worlds(self) -> Columns:
-        """Return the draw of each running world, as columns by name, each [worlds]; see
-        ``envs.draws.describe_worlds``.
-        """
+        """Return the draw of each running world: columns by name, [worlds]; see ``envs.draws.describe_worlds``."""
         self._check_started("describe_worlds")
         return describe_worlds(self.engine)
 
@@ -313,9 +305,7 @@ class OneWorld(Begun):
         return {name: column[0].item() for name, column in describe_worlds(self.engine).items()}
 
     def render(self) -> Any:
-        """Return a picture in the render mode: a frame [H, W, 3] uint8, a list of new frames, a text, or None for
-        ``human``.
-        """
+        """Return a frame [H, W, 3] uint8, a list of new frames, a text, or None for ``human``, by render mode."""
         return self.viewer.render()
 
     def close(self) -> None:

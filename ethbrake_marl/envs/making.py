@@ -32,9 +32,7 @@ def feature_box(features: Sequence[Feature]) -> Box[np.float32]:
 
 
 def action_box() -> Box[np.float32]:
-    """Return the action space: a float32 box [1]; -1 is full braking capacity, 0 coasts, +1 is full driving
-    capacity.
-    """
+    """Return the action space, a float32 box [1]: -1 full braking capacity, 0 coasts, +1 full driving capacity."""
     return Box(-1.0, 1.0, (1,), dtype=np.float32)
 
 

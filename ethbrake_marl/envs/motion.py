@@ -280,9 +280,7 @@ class Viewer:
         return {"render_modes": list(self.modes), "render_fps": round(fps) if abs(fps - round(fps)) < 1e-9 else fps}
 
     def began(self) -> None:
-        """Handle the start of an episode: restart the list of frames, and show the time up to the first decision in the
-        window.
-        """
+        """Handle the start of an episode: begin a new list of frames, and show the time up to the first decision."""
         self._shown = 0
         if self._window is not None:
             self._window.closed_by_user = False
@@ -310,8 +308,7 @@ class Viewer:
         return shown if self._batch else shown[0]
 
     def step_frames(self, fps: float = SMOOTH_FPS) -> list[Frame]:
-        """Return the frames [H, W, 3] from the last decision, or the alert, up to now, with ``fps`` frames per second
-        of the world.
+        """Return the frames [H, W, 3] from the last decision, or the alert, up to now, at ``fps`` per second.
 
         Raises ``InvalidInput`` before the first reset, with render_mode=None, and for an ``fps`` below 1.
         """

@@ -89,10 +89,10 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
     """A line of vehicles ``vehicle_1`` (front) ... ``vehicle_N``, all of which are agents from the alert to the end.
 
     Learners need an action [1] in [-1, 1] in each step: -1 full braking capacity, 0 coasts, +1 full driving capacity.
-    Actions of scripted vehicles are ignored; ``infos[agent]`` shows the commands of their scripts. All agents end
-    together:
-    terminated when all are at rest and no command would move one, truncated at the horizon. ``state()`` is the full
-    state of the line, for central critics. Observations, rewards, infos and ``reset`` are as in ``EthBrakeEnv``.
+    Actions of scripted vehicles are ignored; ``infos[agent]`` shows the commands of their scripts. All agents end at
+    the same time: terminated when all are at rest and no command would move one, truncated at the horizon. ``state()``
+    is the full state of the line, for central critics. Observations, rewards, infos and ``reset`` are as in
+    ``EthBrakeEnv``.
 
     Args:
         scenario: a shipped name, the path of a YAML file, its content as a mapping, or a ``Scenario``.

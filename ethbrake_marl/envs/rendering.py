@@ -34,9 +34,7 @@ LATE_S = 3.0  # longest latency that the view makes room for
 
 
 class View(NamedTuple):
-    """Left and right end of the road in view (m from Vehicle 1's front at the alert), constant in an episode if
-    possible.
-    """
+    """Ends of the road in view (m from Vehicle 1's front at the alert); constant during an episode if possible."""
 
     left_m: float
     right_m: float
@@ -98,9 +96,7 @@ class Scene(NamedTuple):
         return f"{'brakes' if command < 0.0 else 'drives'} {abs(command):.1f} m/s2"
 
     def text(self) -> str:
-        """Return the moment as plain text, without control characters: the road to scale, then a line for each
-        vehicle.
-        """
+        """Return the moment as text without control characters: the road to scale, then a line for each vehicle."""
         left, right = self.view
 
         def column(place_m: float) -> int:
@@ -326,9 +322,7 @@ def _share(scene: Scene, i: int) -> float:
 
 
 def _panel(scene: Scene, i: int) -> tuple[float, float]:
-    """Return left edge and width (pixels) of a vehicle's panel; panels are in the order of the line, Vehicle 1 on the
-    right.
-    """
+    """Return left edge and width (pixels) of a vehicle's panel; panels are ordered with Vehicle 1 on the right."""
     count = len(scene.front_m)
     gap = 24.0 if count <= 5 else 10.0
     width = min((WIDTH - 2 * _MARGIN - gap * (count - 1)) / count, 240.0)

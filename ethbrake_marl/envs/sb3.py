@@ -81,8 +81,7 @@ def make_sb3_vec_env(
 
 
 class EthBrakeVecEnv(Begun, VecEnv):
-    """``VecEnv`` whose rows are learners: row ``k * L + l`` is learner l (front to rear) of world k, of L learners
-    each.
+    """``VecEnv`` whose rows are learners: row ``k * L + l`` is learner l of L (front to rear) in world k.
 
     With several learners, all rows share one policy, and the rows of a world end together. All worlds take their
     episodes from one stream. At the end of an episode, its rows' infos hold ``TimeLimit.truncated``,
@@ -208,8 +207,9 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return arrays | {"return": self._return.copy(), "steps": self._steps.copy(), "begun": self._begun.copy()}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a ``snapshot`` of the same scenario and size, without a reset; raise ``InvalidInput`` if it
-        does not fit.
+        """Continue from a ``snapshot`` of the same scenario and size, without a reset.
+
+        Raises ``InvalidInput`` for a snapshot that does not fit.
         """
         prefix = "engine."
         self.engine.restore({n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)})
@@ -233,8 +233,9 @@ class EthBrakeVecEnv(Begun, VecEnv):
         setattr(self, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        """Call a method of the batch once and return its result once per row; raise ``InvalidInput`` if only some rows
-        are named.
+        """Call a method of the batch once, and return its result once per row.
+
+        Raises ``InvalidInput`` if only some rows are named.
         """
         self._refuse_some_rows("env_method", indices)
         return [getattr(self, method_name)(*args, **kwargs)] * self.num_envs

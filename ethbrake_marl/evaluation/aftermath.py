@@ -1,6 +1,4 @@
-"""Watchers that measure more than harm while episodes run: how far Vehicle 1 is shoved, and the paper's sampled
-harm.
-"""
+"""Watchers that measure more than harm during episodes: how far Vehicle 1 is shoved, and the paper's sampled harm."""
 
 from __future__ import annotations
 
@@ -47,9 +45,7 @@ class ShovedFront:
         return cls(worlds, way[:, 0])
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Add Vehicle 1's distance in one step, measured as the change of its gap to an obstacle, real or out of
-        reach.
-        """
+        """Add Vehicle 1's distance in one step: the change of its gap to an obstacle, real or out of reach."""
         post = before.with_post_ahead(until_s - before.time_s)
         after, _ = advance(post, command_mps2, until_s=until_s)
         self._way_m += post.obstacle_gap_m - after.obstacle_gap_m

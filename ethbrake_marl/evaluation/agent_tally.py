@@ -101,9 +101,7 @@ def tally_agents(
 def estimate_all(
     tallies: Mapping[str, AgentTally], agent: str, worlds: int, *, baseline: str
 ) -> dict[str, Estimate | None]:
-    """Return the estimate of every measure of one agent; None for a measure without a value in some of the
-    ``worlds``.
-    """
+    """Return the estimate of every measure of one agent; None for a measure that some ``worlds`` lack."""
     own = tallies[agent]
     columns = [name.removeprefix(COLUMN) for name in (*own.counts, *own.moments) if name.startswith(COLUMN)]
     registered = list(REGISTERED.values())
@@ -133,8 +131,9 @@ def _estimate(
 
 
 def lower_bounds(tally: AgentTally, worlds: int) -> frozenset[str]:
-    """Return the measures whose means are only lower bounds, because their set's condition holds only in some
-    worlds.
+    """Return the measures whose means are only lower bounds.
+
+    These are the measures of a set whose condition (``MeasureSet.whole``) holds in some worlds only.
     """
 
     def is_partial(each: MeasureSet) -> bool:

@@ -86,9 +86,7 @@ class Lineup:
         return replace(lineup, same=same, packages=versions_used())
 
     def make(self) -> Mapping[str, Driver]:
-        """Return the agents in this process; raise ``InvalidInput`` where they differ from the requesting process's
-        agents.
-        """
+        """Return the agents in this process; raise ``InvalidInput`` if the requesting process has different ones."""
         if self.same not in _MADE:
             load_measures(self.measures)
             made = self._make_anew()
@@ -166,10 +164,10 @@ def tally_list(
     ray: str | None = None,
     on_done: OnDone | None = None,
 ) -> Tally:
-    """Return the statistics of worlds 0 to ``episodes - 1`` of a list of any length, without holding its worlds in
-    memory.
+    """Return the statistics of worlds 0 to ``episodes - 1`` of a list of any length.
 
-    Sets of measures that take longer than driving are omitted. ``jobs`` and ``ray`` as in ``run_each``.
+    The worlds are not held in memory together. Sets of measures that take longer than driving are omitted. ``jobs`` and
+    ``ray`` as in ``run_each``.
     """
     check_whole_number("episodes", episodes, 1, MOST_EPISODES)
     check_whole_number("seed", seed, 0)

@@ -30,9 +30,7 @@ _STAY = "\u00a0"  # a non-breaking space
 
 
 class Conditions(dict[str, Any]):
-    """Conditions of a result as plain data: scenario, controlled vehicles, scripts, and every quantity of the
-    worlds.
-    """
+    """Conditions of a result as plain data: scenario, controlled vehicles, scripts, and quantities of the worlds."""
 
     @classmethod
     def of(cls, worlds: Worlds) -> Conditions:

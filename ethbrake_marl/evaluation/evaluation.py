@@ -218,9 +218,7 @@ class Evaluation:
         return self
 
     def outcome(self, agent: str) -> Outcome:
-        """Return the outcome of one agent; raise ``InvalidInput`` naming the evaluated agents if it is not among
-        them.
-        """
+        """Return the outcome of one agent; raise ``InvalidInput``, naming the evaluated agents, for any other."""
         if agent not in self.outcomes:
             raise InvalidInput(f"agent {agent!r} was not evaluated; evaluated: {', '.join(self.outcomes)}")
         return self.outcomes[agent]

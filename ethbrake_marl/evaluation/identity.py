@@ -71,8 +71,7 @@ def _arrays_sha256(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _arrays(value: Any) -> dict[str, np.ndarray]:
-    """Return the arrays of a dataclass and of the dataclasses inside it, by name, without those that carry no
-    information.
+    """Return the arrays of a dataclass and of the dataclasses inside it, by name, except those without information.
 
     These are empty arrays of messages and braking pieces, and infinite build-up rates of brakes.
     """
@@ -87,8 +86,9 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
 
 
 def scenario_sha256(scenario: Scenario) -> str:
-    """Return the SHA-256 of everything in a scenario that affects an episode, defaults included, names and texts
-    excluded.
+    """Return the SHA-256 of everything in a scenario that affects an episode, including defaults.
+
+    Name, title and other texts are excluded.
     """
     content = scenario.content(without=_WORDS)
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
@@ -116,11 +116,10 @@ def own_versions() -> dict[str, str]:
 def result_identity(
     kind: Kind, scenario: Scenario, sample: Sample | None, left_out: Collection[int] = ()
 ) -> dict[str, Any]:
-    """Return the identity written into a results file of this kind: ``kind``, hashes of worlds and scenario,
-    ``versions``.
+    """Return the identity that a results file of this kind contains: ``kind``, hashes and ``versions``.
 
-    ``left_out`` are rows of the sample that no figure counts. Without a sample there is no hash of the worlds, because
-    different parts of the file have different worlds.
+    The hashes are those of the worlds and of the scenario. ``left_out`` are rows of the sample that no figure counts.
+    Without a sample there is no hash of the worlds, because different parts of the file have different worlds.
     """
     found: dict[str, Any] = {"kind": kind, "scenario_sha256": scenario_sha256(scenario), "versions": result_versions()}
     if sample is not None:

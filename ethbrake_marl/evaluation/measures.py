@@ -190,11 +190,10 @@ EPISODE = EpisodeMeasures()
 
 
 def register_measure_set(name: str, measures: MeasureSet) -> None:
-    """Add a set of measures to every evaluation. Entry points of ``ethbrake_marl.measure_sets`` are added by this
-    function.
+    """Add a set of measures to every evaluation.
 
-    Raises ``InvalidInput`` if ``measures`` is not a ``MeasureSet``, ``AlreadyExists`` if the name of the set or of one
-    of its measures is taken.
+    This function also adds the entry points of ``ethbrake_marl.measure_sets``. Raises ``InvalidInput`` if ``measures``
+    is not a ``MeasureSet``, ``AlreadyExists`` if the name of the set or of one of its measures is taken.
     """
     if not isinstance(measures, MeasureSet):
         raise InvalidInput(f"set of measures {name!r}: must be a MeasureSet")

@@ -82,7 +82,7 @@ class _Follower(Tape):
             self._ruling = ruling
 
     def motions(self, episodes: Episodes) -> list[EpisodeMotion]:
-        """What was seen, world by world."""
+        """Return the recorded motion of each world."""
         n, N = self.worlds.n, self.worlds.N
         impacts, pieces = self.impacts(), self._pieces()
         ends = np.searchsorted(impacts.world, np.arange(n + 1))

@@ -83,9 +83,7 @@ def _no_impact(rows: Sequence[SummaryRow]) -> str:
 
 
 def _knowledge(rows: Sequence[SummaryRow]) -> str:
-    """Return the note about agents that know what the channel hides, and about agents that do not state what they
-    know.
-    """
+    """Return the note about agents that know what the channel hides, and agents that do not state their knowledge."""
     hidden = rows[0].hidden_share
     if not hidden:
         return ""

@@ -168,9 +168,7 @@ class LeftOut(NamedTuple):
 
     @staticmethod
     def line(worlds: Sequence[str], whole: int) -> str:
-        """Return the note that these worlds, out of ``whole`` many, are left out; each text names a world and its
-        reason.
-        """
+        """Return the note that these of ``whole`` worlds are left out; each text names a world and the reason."""
         named = [*worlds[:_NAMED], *(["and so on"] if len(worlds) > _NAMED else [])]
         return (
             f"LEFT OUT for every agent: {len(worlds):,} of {whole:,} worlds, which the physics could not advance"

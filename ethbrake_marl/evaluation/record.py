@@ -95,11 +95,10 @@ def record_episode(
 
 
 def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float) -> Iterator[tuple[Floats, ...]]:
-    """Yield arrays of samples (time, gaps, speeds, positions, command), segment by segment; only the last includes its
-    end.
+    """Yield arrays of samples (time, gaps, speeds, positions, command), segment by segment.
 
-    Worlds hold gaps and speeds, not positions. So Vehicle 1's position is measured as its gap to an obstacle ahead,
-    which is the world's own or one out of reach.
+    Only the last segment includes its end. Worlds hold gaps and speeds, not positions. So Vehicle 1's position is
+    measured as its gap to an obstacle ahead, which is the world's own or one out of reach.
     """
     front = 0.0  # position of Vehicle 1 at the start of the segment
     for number, (before, command, until_s) in enumerate(segments):

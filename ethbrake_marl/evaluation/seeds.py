@@ -104,9 +104,7 @@ def share_over_seeds(values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, se
 
 
 def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
-    """Return the sides as arrays [seeds, worlds]. Raise ``InvalidInput`` unless they have the same worlds and are
-    finite.
-    """
+    """Return the sides as arrays [seeds, worlds]; raise ``InvalidInput`` unless worlds agree and all are finite."""
     arrays = tuple(np.atleast_2d(np.asarray(given, np.float64)) for given in sides)
     if any(side.ndim != 2 or not side.size or side.shape[1] != arrays[0].shape[-1] for side in arrays):
         shapes = " and ".join(str(side.shape) for side in arrays)

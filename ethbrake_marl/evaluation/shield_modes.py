@@ -87,9 +87,7 @@ class ShieldModes(list[ModeRow]):
         return all(row.against_episode is None for row in self)
 
     def to_json(self, sample: Sample, task: Task) -> list[dict[str, Any]]:
-        """Return the content of a results file of ``ethbrake shield``: one object per row, about the worlds of
-        ``sample``.
-        """
+        """Return the content of a results file of ``ethbrake shield``: one object per row."""
         left_out = [world for world, _ in self[0].left_out]
         about = result_identity("shield", task.scenario, sample, left_out)
         about |= {"harm_count": task.harm_count, "episodes": sample.worlds.n - len(left_out)}

@@ -111,9 +111,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", ["Agent", "Knows", *columns], lines)
 
     def terminal(self) -> Sheet:
-        """Return the table for a terminal of 80 columns or more: our rows, rows from other sources, and their
-        conditions.
-        """
+        """Return the table for a terminal of 80 columns or more, with rows from other sources and the conditions."""
         narrow = self._narrow()
         columns = [
             replace(each, wide=each.name not in narrow, interval="below" if each.name in _BELOW else "hidden")
@@ -127,9 +125,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", [Column("Agent,\nwhat it knows", text=True), *columns], lines, self._conditions(), gap=1)
 
     def _narrow(self) -> tuple[str, ...]:
-        """Return the columns of a narrow terminal: the usual ones, and those of the last set that has values for
-        them.
-        """
+        """Return the columns of a narrow terminal: the usual ones, and those of the last set that has values."""
         last: tuple[str, ...] = EPISODE.narrow
         for _, each in every_set():
             if self and any(self[0].estimates.get(name) is not None for name in each.narrow):
@@ -137,9 +133,7 @@ class SummaryTable(list[SummaryRow]):
         return (*_ALWAYS_SHOWN, *last)
 
     def tables(self) -> list[Sheet]:
-        """Return ``terminal`` and, if there are registered measures, a table with their means or rates, a line per
-        agent each.
-        """
+        """Return ``terminal`` and, if there are registered measures, a second table with one line for each of them."""
         lines = [(row.agent, heading_of(column), value) for row in self for column, value in row.metrics.items()]
         own = Sheet("Measures", ["Agent", Column("Measure", text=True), Column("Mean or rate")], lines)
         return [self.terminal(), own] if lines else [self.terminal()]

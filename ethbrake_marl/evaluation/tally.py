@@ -21,8 +21,9 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """Statistics of some worlds of a list; tallies can be added in any order. ``worlds_hash`` as in
-    ``worlds_sha256``.
+    """Statistics of some worlds of a list; tallies can be added in any order.
+
+    ``worlds_hash`` is the hash of the worlds as in ``worlds_sha256``.
     """
 
     worlds: int = 0  # number of worlds that all agents drove
@@ -73,9 +74,7 @@ class Tally:
         )
 
     def rescore(self, objectives: Sequence[str], vehicles: int) -> Rescores:
-        """Return the mean harm of every agent under these objectives and both counts, as ``Evaluation.rescore``
-        does.
-        """
+        """Return the mean harm of every agent under these objectives and both counts, as in ``Evaluation.rescore``."""
         return Rescores(
             [
                 Rescored(

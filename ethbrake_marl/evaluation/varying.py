@@ -35,8 +35,7 @@ _LONGEST_OWNERS = 30  # longest list of vehicle or pair names, in characters
 
 
 def drawn_alike(worlds: Worlds, scenario: Scenario) -> dict[str, dict[str, Floats]]:
-    """Return every quantity that varies between the worlds, by key, in groups of vehicles or pairs with the same
-    bounds.
+    """Return every quantity that varies between the worlds, by key, in groups with the same bounds.
 
     Each group maps a short name of its vehicles or pairs, or "" if it contains all of them, to its values [n, entries].
     """

@@ -132,9 +132,7 @@ class Attached:
         return getattr(getattr(self._env, "unwrapped", self._env), "engine", None)
 
     def check_open(self) -> None:
-        """Raise ``InvalidInput`` where this shield protects nothing: it was closed, or the inner environment was
-        replaced.
-        """
+        """Raise ``InvalidInput`` if this shield was closed, or if the inner environment was replaced."""
         if self._reached() is not self.engine:
             raise InvalidInput(
                 f"{self.options.where}: another environment is inside than the one that is shielded; put a shield"

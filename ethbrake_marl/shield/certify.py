@@ -52,8 +52,8 @@ NEARLY = 1e-9
 def best_constant(world: Members, states: Floats, ended: Bools, step: int, constants: Floats) -> tuple[int, float]:
     """Return the constant action of ``constants`` [C, K] with the least worst-case harm, as its index, and that harm.
 
-    Each action is held from now to the horizon, simulated in one segment; the worst case is over the members of the
-    world.
+    Each action is held from now to the horizon, simulated in one segment. The worst case is over the members (possible
+    worlds) of the world.
     """
     best, least, critical = 0, math.inf, 0
     for c in range(constants.shape[0]):
@@ -145,8 +145,9 @@ def try_action(
 
 @compiled
 def tell_action(out: Floats, action: Floats, bound: float, margin: float) -> None:
-    """Write applied action, bound and margin into ``out`` [K, 4]; vehicles without a certificate keep their own
-    margin.
+    """Write applied action, bound and margin into ``out`` [K, 4].
+
+    Vehicles whose proposal has no certificate keep the margin that is there already.
     """
     for c in range(action.shape[0]):
         out[c, APPLIED], out[c, BOUND] = action[c], bound
@@ -162,10 +163,9 @@ def decide_world(
     """Decide in one world: certify the proposed actions [K], or replace them; see ``certify``.
 
     All proposals are tried together first. If they have no certificate, the vehicles are tried one by one, front to
-    rear, each beside the actions that the plan holds by then. Fills ``after`` and ``over`` (by member) and ``out`` (by
-    vehicle:
-    applied action, reason, bound, margin). Afterwards ``plan`` is the plan whose harm is the bound in ``out``. Returns
-    False where the physics fails with the applied actions.
+    rear, each beside the actions that the plan holds by then. Fills ``after`` and ``over`` (by member, that is,
+    possible world) and ``out`` (by vehicle: applied action, reason, bound, margin). Afterwards ``plan`` is the plan
+    whose harm is the bound in ``out``. Returns False where the physics fails with the applied actions.
     """
     deviating = 0
     for c in range(proposed.shape[0]):
@@ -236,10 +236,10 @@ def certify_worlds(
 
 @compiled
 def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Floats) -> None:
-    """Fill ``value`` [n] with the worst harm, over the members, of executing the plans from now on; infinity where it
-    fails.
+    """Fill ``value`` [n] with the harm of executing the plans from now on, in the worst member (possible world).
 
-    Where one of the ``constants`` harms less than a plan, it replaces the rest of that plan in place first.
+    The value is infinity where the physics fails. Where one of the ``constants`` (constant actions) harms less than a
+    plan, it replaces the rest of that plan in place first.
     """
     n, every = running.steps.shape[0], all_members(running)
     trial = np.zeros((plans.shape[1], plans.shape[2]))
@@ -258,9 +258,8 @@ def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Flo
 def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) -> None:
     """Simulate the plans from now on and report how the episodes end.
 
-    Fills ``rests`` [n]: whether every member comes to rest before the horizon and stays at rest; and ``borne`` [n * M,
-    N]:
-    the harm that each vehicle bears by then (an obstacle ahead bears none).
+    Fills ``rests`` [n]: whether every member (possible world) comes to rest before the horizon and stays at rest; and
+    ``borne`` [n * M, N]: the harm that each vehicle bears by then (an obstacle ahead bears none).
     """
     n, every = running.steps.shape[0], all_members(running)
     M = running.states.shape[0] // max(n, 1)
@@ -278,7 +277,7 @@ def descend_constants(running: Running, grid: Floats, rounds: int, action: Float
     """Improve constant actions ``action`` [n, K] by coordinate descent over the vehicles, in place.
 
     Each vehicle's action is replaced in turn by the action of ``grid`` with the least harm, simulated in one segment.
-    Every world must have exactly one member.
+    Every world must have exactly one member (possible world).
     """
     every, states, ended, steps = all_members(running), running.states, running.ended, running.steps
     for k in range(states.shape[0]):
@@ -323,9 +322,7 @@ class Decision(NamedTuple):
         return np.array(texts).reshape(self.reason.shape)
 
     def put(self, rows: Ints, other: Decision, taken: Ints) -> Decision:
-        """Return a copy with some worlds replaced: world ``rows[j]`` of this decision by world ``taken[j]`` of
-        ``other``.
-        """
+        """Return a copy with world ``rows[j]`` of this decision replaced by world ``taken[j]`` of ``other``."""
         columns: dict[str, Any] = {
             name: put(getattr(self, name), rows, getattr(other, name)[taken]) for name in self._fields[:5]
         }
@@ -340,16 +337,17 @@ class Decision(NamedTuple):
 
 
 def plan_harm(running: Running, plan: Floats) -> Floats:
-    """Return the harm of the episodes if the plans are executed from now on, in the worst member, [n] m2/s2.
+    """Return the harm of the episodes if the plans are executed from now on, [n] m2/s2.
 
-    Equals the harm that the engine would count, to the bit. Caps are ignored.
+    It is the harm in the worst member (possible world), and equals the engine's to the bit. Caps are ignored.
     """
     return bettered_plan(running, plan, np.zeros(0))[1]
 
 
 def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Floats, Floats]:
-    """Return each plan, or the best constant action where it harms less in the worst member, and the harm of the
-    result.
+    """Return each plan, or the best constant action if that harms less, and the harm of the result.
+
+    Harm is that in the worst member (possible world).
     """
     value = np.empty(running.n)
     _check_plan(running, plan)
@@ -362,16 +360,15 @@ def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Fl
 
 
 def from_now(past: Floats, later: Floats | float, steps: Ints) -> Floats:
-    """Return plans with the actions of ``past`` before decision ``steps`` [n], and of ``later`` from that decision
-    on.
-    """
+    """Return plans with the actions of ``past`` before decision ``steps`` [n], and of ``later`` afterwards."""
     made = np.arange(past.shape[1]) < steps[:, np.newaxis]
     return np.where(made if past.ndim == 2 else made[:, :, np.newaxis], past, later)
 
 
 def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) -> Decision:
-    """Decide in every world: apply the proposed action if it can be certified, else the backup plan's. Changes no
-    argument.
+    """Decide in every world: apply the proposed action if it can be certified, else the backup plan's.
+
+    No argument is changed.
 
     Args:
         running: the episodes at this decision.

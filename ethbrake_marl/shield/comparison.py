@@ -33,9 +33,7 @@ def seen_columns(packed: Packed) -> Floats:
 
 
 def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
-    """Return ``worlds`` with speeds, gaps and hit flags (also the obstacle's) replaced by those of ``states`` [n,
-    S].
-    """
+    """Return ``worlds`` with the speeds, gaps and hit flags of ``states`` [n, S], also those of an obstacle."""
     added = (states.shape[1] + 4) // 6 - worlds.N  # 1 if each group starts with the column of an obstacle, else 0
     N = worlds.N + added
     gaps, hit = states[:, N : 2 * N - 1], states[:, 2 * N - 1 : 3 * N - 2] == 1.0
@@ -50,9 +48,7 @@ def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
 
 
 def difference(predicted: Floats, seen: Floats) -> str:
-    """Describe the first number in which a world's seen state [S] differs from its predicted state; "nothing" if none
-    does.
-    """
+    """Describe the first number in which a seen state [S] differs from its prediction; "nothing" if none does."""
     vehicles = (len(predicted) + 4) // 6
     for column in np.flatnonzero(~(seen == predicted[: len(seen)])).tolist():
         if column < vehicles:
@@ -67,9 +63,9 @@ def difference(predicted: Floats, seen: Floats) -> str:
 def ends_under(running: Running, plan: Floats) -> tuple[Bools, Floats]:
     """Return how the episodes end if the plans are executed from now on.
 
-    Returns two arrays: whether all vehicles rest at the horizon in every member, [n]; and the harm of the whole episode
-    that each vehicle bears, [n * M, N] m2/s2. Harm is split by mass with the operations of the ledger, so both agree to
-    the bit. With an obstacle ahead, its column comes first and is 0.
+    Returns two arrays: whether all vehicles rest at the horizon in every member (possible world), [n]; and the harm of
+    the whole episode that each vehicle bears, [n * M, N] m2/s2. Harm is split by mass with the operations of the
+    ledger, so both agree to the bit. With an obstacle ahead, its column comes first and is 0.
     """
     rests, borne = np.empty(running.n, np.bool_), np.empty(running.problem.mass.shape)
     plans = np.ascontiguousarray(plan).reshape(*plan.shape[:2], len(running.problem.vehicles))

@@ -68,9 +68,7 @@ class Guarded(NamedTuple):
 
     @property
     def told(self) -> dict[str, Any]:
-        """Predicted harm and choice of driver in each world, under the names that an agent's memory uses; None where
-        unknown.
-        """
+        """Predicted harm and chosen driver of each world, under the names in an agent's memory; None if unknown."""
         return {what: getattr(self.shield, what, None) for what in ("predicted_harm", "chosen_policy")}
 
 
@@ -119,8 +117,9 @@ class ShieldGuard(ABC):
         return Guarded(self._started(copy.copy(shield), alert, rows), policies)
 
     def check(self, ruling: Ruling, after: Engine) -> Guarded:
-        """Return the memory to keep after the step. This base class accepts every step and returns the ruling's
-        memory.
+        """Return the memory to keep after the step.
+
+        This base class accepts every step, and returns the ruling's memory.
         """
         memory: Guarded = ruling.memory
         return memory
@@ -147,8 +146,9 @@ class ShieldGuard(ABC):
         return last
 
     def _of_vehicles(self, infos: Mapping[str, Any], running: Engine) -> dict[str, NDArray[Any]]:
-        """Expand the infos to all vehicles, [n, N]. An unshielded vehicle gets reason ``NO_DECISION``, and 0
-        elsewhere.
+        """Expand the infos to all vehicles, [n, N].
+
+        A vehicle without a shield gets reason ``NO_DECISION``, and 0 in all other entries by learner.
         """
         shape, spread = running.wanted_mps2.shape, dict[str, NDArray[Any]]()
         for name, value in infos.items():
@@ -161,9 +161,7 @@ class ShieldGuard(ABC):
         return spread
 
     def _of_step(self, ruling: Ruling | None) -> dict[str, Any]:
-        """Return mode, proposed action, applied action and whether they differ; the actions are 0 before the first
-        step.
-        """
+        """Return mode, proposed action, applied action and whether they differ; 0 before the first step."""
         infos: dict[str, Any] = {"mode": self.mode}
         if ruling is None:
             return infos | {"proposed_action": 0.0, "applied_action": 0.0, "intervened": False}
@@ -173,8 +171,9 @@ class ShieldGuard(ABC):
     def _asked(
         self, worlds: Worlds | None, memories: dict[int, Memory], proposed: Floats
     ) -> tuple[Floats, dict[int, Memory]]:
-        """Return all proposals [n, L], with the policies' actions where the caller gave none, and the policies' new
-        memories.
+        """Return all proposals [n, L], and the policies' new memories.
+
+        The policies propose for the learners whose action the caller left out.
         """
         left_out = np.isnan(proposed).all(axis=0)
         if left_out.any() and not self._policies:

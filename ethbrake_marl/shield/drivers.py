@@ -81,9 +81,7 @@ class ShieldedDriver(ByPolicy):
 
     @classmethod
     def around(cls, driver: Driver, task: Task, **settings: Any) -> Team:
-        """Return the task's vehicles driven by copies of ``driver`` behind one shield; ``settings`` as for the
-        class.
-        """
+        """Return the task's vehicles driven by copies of ``driver`` behind one shield; ``settings`` as in the class."""
         if isinstance(driver, Team) and len(task.vehicles) == 1:
             driver = Team.of(driver, task.vehicles).drivers[task.vehicle]
         elif isinstance(driver, Agent) and len(task.vehicles) > 1:

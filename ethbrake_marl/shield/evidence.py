@@ -77,8 +77,9 @@ def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
 
 
 def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: Ints, step: Ints) -> Floats:
-    """Return the harm in worlds ``world`` [m] if the applied actions are repeated before decision ``step`` [m], and the
-    policy drives from that decision on.
+    """Return the harm in worlds ``world`` [m] if the policy drives unshielded from decision ``step`` [m] on.
+
+    Before that decision, the applied actions are repeated.
     """
     scenario, plan = shield.scenario, shield.memory.backup.plan[world]
     actions = plan.reshape(*plan.shape[:2], len(shield.vehicles))

@@ -17,9 +17,7 @@ def shield_episodes(policy: Agent, argument: str | None, settings: AgentSettings
 
 
 def shield_steps(policy: Driver, argument: str | None, settings: AgentSettings) -> Driver:
-    """Return the agent or team behind step mode: ``+step``. Where several vehicles learn, each gets a copy of the
-    agent.
-    """
+    """Return the agent or team behind step mode: ``+step``. Each of several learners gets a copy of the agent."""
     return shielded(policy, settings.needed_scenario(), "step", harm_count=settings.harm_count)
 
 

@@ -123,9 +123,7 @@ class StepGuard(ShieldGuard):
         return memory._replace(shield=shield)
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a step: action and reason, bound, whether the world is trusted, and the harm of each
-        vehicle.
-        """
+        """Return the infos of a step: action, reason, bound, trust in the world, and the harm of each vehicle."""
         shield: StepShield = memory.shield
         infos = self._of_step(ruling) | why(ruling)
         infos |= {"bound_harm": shield.bound, "trusted": ~shield.memory.distrusted, "settles": shield.memory.settles}

@@ -13,7 +13,7 @@ from ethbrake_marl.shield.running import Running
 
 
 class Intervention(NamedTuple):
-    """One replaced action."""
+    """Log entry: one action that the shield replaced."""
 
     world: int  # row of the batch
     vehicle: int  # index of the shielded vehicle, 0 = front

@@ -27,7 +27,7 @@ OF_COMMAND, OF_LATENCY, OF_MASS, OF_LIMIT, OF_BRAKE_RATE, OF_RELEASE_RATE, OF_CA
 
 
 class Members(NamedTuple):
-    """Parameters of the members of one world, or of all worlds of a batch, with working memory for the kernels."""
+    """Parameters of the members (possible worlds) of one world or of a whole batch, and working memory."""
 
     table: Floats  # working table of one world, see ``physics.rows``
     clock: Floats  # [M, CLOCK.WIDTH] clock of each member's episode
@@ -40,7 +40,7 @@ class Members(NamedTuple):
 
 @compiled
 def all_members(running: Running) -> Members:
-    """Return the members of every world of a batch."""
+    """Return the members (possible worlds) of every world of a batch, as input for the kernels."""
     problem = running.problem
     rows, N = problem.mass.shape
     lines = np.empty((rows, OF_CAP + 1 if running.caps.shape[1] > 0 else OF_CAP, N))
@@ -60,14 +60,14 @@ def all_members(running: Running) -> Members:
 
 @compiled
 def members_from(every: Members, a: int, b: int) -> Members:
-    """Return the members in rows ``a`` to ``b - 1``, usually those of one world."""
+    """Return the members (possible worlds) in rows ``a`` to ``b - 1``, usually those of one world."""
     clock, bounds, lines, pieces = every.clock[a:b], every.bounds[a:b], every.lines[a:b], every.pieces[a:b]
     return Members(every.table, clock, bounds, lines, pieces, every.vehicles, every.critical)
 
 
 @compiled
 def enter(world: Members, m: int, state: Floats) -> None:
-    """Load member ``m`` in a saved state into the working table."""
+    """Load member (possible world) ``m`` in a saved state into the working table."""
     table, lines = world.table, world.lines
     for i in range(table.shape[1]):
         table[ROW.COMMAND, i], table[ROW.LATENCY, i] = lines[m, OF_COMMAND, i], lines[m, OF_LATENCY, i]
@@ -78,7 +78,7 @@ def enter(world: Members, m: int, state: Floats) -> None:
 
 @compiled(apart=True)
 def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, after: Floats) -> int:
-    """Advance member ``m`` from ``state`` by one decision with ``action``, and write the new state into ``after``.
+    """Advance member (possible world) ``m`` by one decision with ``action``; write the new state into ``after``.
 
     Returns the outcome code of ``step_episode``.
     """
@@ -97,7 +97,7 @@ def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, 
 def take_steps(
     world: Members, states: Floats, ended: Bools, step: int, action: Floats, after: Floats, over: Bools
 ) -> int:
-    """Advance every member of a world by one decision with the same action.
+    """Advance every member (possible world) of a world by one decision with the same action.
 
     Fills ``after`` and ``over``. Returns how many members' episodes continue, or -1 if the physics failed.
     """
@@ -136,7 +136,7 @@ def borne_by(table: Floats, total: float, i: int) -> float:
 
 @compiled
 def within_caps(world: Members, m: int) -> bool:
-    """Return whether each vehicle of member ``m``, as loaded in the table, has borne no more harm than its cap."""
+    """Return whether no vehicle of member (possible world) ``m``, as loaded in the table, bears more than its cap."""
     if world.lines.shape[1] > OF_CAP:
         for i in range(world.lines.shape[2]):
             if borne_by(world.table, world.clock[m, CLOCK.HARM_IS_TOTAL], i) > world.lines[m, OF_CAP, i]:
@@ -146,7 +146,7 @@ def within_caps(world: Members, m: int) -> bool:
 
 @compiled
 def worst_so_far(world: Members, states: Floats) -> float:
-    """Return the largest harm so far over the members; infinity where a vehicle has borne more than its cap."""
+    """Return the largest harm so far over the members (possible worlds); infinity if a vehicle exceeds its cap."""
     worst = 0.0
     for m in range(states.shape[0]):
         enter(world, m, states[m])
@@ -158,10 +158,10 @@ def worst_so_far(world: Members, states: Floats) -> float:
 
 @compiled(apart=True)
 def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, plan: Floats, most: float) -> float:
-    """Return the harm of member ``m``'s whole episode if the plan is executed from ``state`` at decision ``step`` on.
+    """Return the harm of member (possible world) ``m`` if the plan is executed from ``state`` at decision ``step`` on.
 
-    Every operation is the engine's. Returns infinity as soon as the harm exceeds ``most`` (harm never falls), where a
-    vehicle bears more than its cap, or where the physics fails.
+    It is the harm of the whole episode, computed with the engine's operations. Returns infinity as soon as the harm
+    exceeds ``most`` (harm never falls), where a vehicle bears more than its cap, or where the physics fails.
     """
     table, no_rows, total = world.table, world.table[:0], world.clock[m, CLOCK.HARM_IS_TOTAL]
     restitution, grid = world.clock[m, CLOCK.RESTITUTION], grid_of(world.clock[m])
@@ -182,7 +182,7 @@ def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, p
 
 @compiled
 def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan: Floats, most: float) -> float:
-    """Return the largest harm of a plan over the members; infinity as soon as it exceeds ``most`` in one of them."""
+    """Return the largest harm of a plan over the members (possible worlds); infinity as soon as it exceeds ``most``."""
     worst, first = 0.0, world.critical[0]
     for j in range(ended.shape[0]):
         m = (first + j) % ended.shape[0]
@@ -195,10 +195,9 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
 
 @compiled
 def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int, constants: Floats, c: int) -> float:
-    """Return the harm of member ``m`` if constant action ``c`` of ``constants`` [C, K] is held, simulated in one
-    segment.
+    """Return the harm of member (possible world) ``m`` if constant action ``c`` of ``constants`` [C, K] is held.
 
-    Returns infinity where the physics fails.
+    The action is held to the horizon, simulated in one segment. Returns infinity where the physics fails.
     """
     table, clock, vehicles, bounds = world.table, world.clock[m], world.vehicles, world.bounds
     enter(world, m, state)

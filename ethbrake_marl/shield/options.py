@@ -63,9 +63,7 @@ class ShieldOptions:
     where: str = field(default="shield", compare=False)
 
     def __new__(cls, mode: str | None = None, **settings: Any) -> ShieldOptions:
-        """Create an instance of the subclass that has these settings, as ``pathlib.Path`` chooses its platform's
-        class.
-        """
+        """Create an instance of the subclass that has these settings, as ``pathlib.Path`` does for its platform."""
         if cls is ShieldOptions:
             cls = _class_with("step" if mode is None else check_mode(mode), settings)
         return object.__new__(cls)

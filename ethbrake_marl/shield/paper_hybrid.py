@@ -120,8 +120,6 @@ class EpisodeGuard(ShieldGuard):
         return np.asarray(abs(ruling.applied - ruling.proposed) > ROUNDING, np.bool_)
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos: the chosen driver and the compared harms. ``proposed_action`` is NaN where nothing was
-        proposed.
-        """
+        """Return the infos: chosen driver and compared harms. ``proposed_action`` is NaN where nothing was proposed."""
         compared = {name: memory.shield[name] for name in ("chosen_policy", "policy_harm", "bound_harm")}
         return self._of_step(ruling) | compared

@@ -6,8 +6,7 @@ from enum import IntEnum
 
 
 class ShieldReason(IntEnum):
-    """Reason why a shield accepted or replaced an action: the code ``shield_reason`` in the infos. ``text`` is in
-    words.
+    """Reason why a shield accepted or replaced an action: the code ``shield_reason`` in the infos.
 
     >>> import ethbrake_marl as eb
     >>> eb.ShieldReason(3).name, eb.ShieldReason.NO_CERTIFICATE.text
@@ -27,7 +26,7 @@ class ShieldReason(IntEnum):
 
     @property
     def text(self) -> str:
-        """Reason in words."""
+        """The reason in words, such as "no certificate"."""
         return self.name.lower().replace("_", " ")
 
 

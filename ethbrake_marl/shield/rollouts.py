@@ -39,10 +39,9 @@ class Proposer(NamedTuple):
 def rolled_out(
     worlds: Worlds, policies: Mapping[int, Agent], scenario: Scenario, vehicle: int | tuple[int, ...], width: int
 ) -> Floats:
-    """Return the actions of policies that drive unshielded from the alert: [n, width], or [n, width, K] for several
-    vehicles.
+    """Return the actions of policies that drive unshielded from the alert, as plans.
 
-    After the end of an episode, the action is full braking.
+    They are [n, width], or [n, width, K] for several vehicles. After the end of an episode, the action is full braking.
     """
     team = Team({i: _Rounded(policy) for i, policy in policies.items()}, next(iter(policies.values())).name)
     engine = episode_engine(worlds, team, scenario)
@@ -70,8 +69,7 @@ def certify_by_policy(
 def certify_rollouts(
     running: Running, proposed: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
 ) -> Decision:
-    """Decide again in ``rows``, whose proposals have no certificate, with a rollout of the policy as the plan behind
-    them.
+    """Decide again in ``rows``, whose proposals have no certificate, with rollouts of the policy as plans.
 
     The plan that is tried consists of the clipped proposal and the policy's actions from the state after it. Where this
     plan keeps the budget, it becomes the backup and the proposal is accepted. Elsewhere the reason stays
@@ -85,7 +83,7 @@ def certify_rollouts(
         held: current plans of the whole batch.
         proposer: the policies.
 
-    Returns a decision for ``rows`` alone.
+    Returns a decision for ``rows`` only.
 
     """
     part, least, silent = running.take(rows), budget[rows], np.isnan(proposed[rows])

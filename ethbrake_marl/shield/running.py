@@ -38,30 +38,30 @@ class Running(NamedTuple):
 
     @property
     def members(self) -> int:
-        """Number of members of each world (M)."""
+        """Number of members (possible worlds) of each world, M."""
         return len(self.ended) // max(self.n, 1)
 
     @property
     def finished(self) -> Bools:
-        """Worlds in which the episode of every member is over, [n]."""
+        """Worlds in which the episode of every member (possible world) is over, [n]."""
         return np.asarray(self.ended.reshape(self.n, -1).all(axis=1), np.bool_)
 
     @property
     def time_s(self) -> Floats:
-        """Time of the decision in the nominal member, [n] s."""
+        """Time of the decision in each world's nominal member (the world itself), [n] s."""
         clock = self.problem.clock[:: self.members]
         return Decisions(clock[:, CLOCK.START], clock[:, CLOCK.TIME_STEP]).at(self.steps)
 
     def rows_of(self, worlds: Ints) -> Ints:
-        """Return the rows that hold the members of these worlds."""
+        """Return the rows that hold the members (possible worlds) of these worlds."""
         return np.asarray((worlds[:, np.newaxis] * self.members + np.arange(self.members)).ravel(), np.int64)
 
     def take(self, worlds: Ints) -> Running:
-        """Return the episodes of some worlds, with all their members."""
+        """Return the episodes of some worlds, with all their members (possible worlds)."""
         return self._select(self.rows_of(worlds), worlds)
 
     def nominal(self) -> Running:
-        """Return every world with its nominal member only."""
+        """Return every world with only its nominal member, the world itself, without its other possible worlds."""
         if self.members == 1:
             return self
         return self._select(np.arange(self.n) * self.members, np.arange(self.n))
@@ -72,8 +72,9 @@ class Running(NamedTuple):
 
 
 def begin_running(problem: ProfileProblem, members: int = 1) -> Running:
-    """Return the episodes of a problem at their first decision. Every ``members`` rows of the problem form one
-    world.
+    """Return the episodes of a problem at their first decision.
+
+    Every ``members`` rows of the problem are the possible worlds of one world.
     """
     steps, ended = np.zeros(problem.n // members, np.int64), np.zeros(problem.n, np.bool_)
     return Running(problem, problem.start, steps, ended)

@@ -1,6 +1,4 @@
-"""The shield as a Stable-Baselines3 ``VecEnvWrapper``, for training under the shield. Importing this module imports
-torch.
-"""
+"""The shield as a Stable-Baselines3 ``VecEnvWrapper``, for training under the shield. Imports torch."""
 
 from __future__ import annotations
 

@@ -13,8 +13,8 @@ with the operations of the engine's step in the same order, and adds harm in the
 1. *Start.* ``c = B``.
 2. *The proposal is applied* only with a plan from the next state whose harm, computed by ``follow_plan`` from exactly
    that state, is at most the budget. The shield then holds that plan, and ``c`` is its harm. If the proposal is the
-   plan's own action, the shield keeps the rest of the plan with the same ``c``: the same operations on the same
-       numbers.
+   plan's own action, the shield keeps the rest of the plan with the same ``c``, since the same operations act on the
+   same numbers.
 3. *The plan's action is applied* otherwise. ``follow_plan`` passed through the resulting state when it computed ``c``,
    so the harm of the plan's rest is ``c`` to the last bit. A plan that harms less may replace it.
 4. *End.* When the episode ends, nothing is left to execute, and ``c`` is the harm of the episode.
@@ -210,7 +210,7 @@ class StepShield:
         self.memory = self.memory.put(rows, self._begun(worlds, rows, policy, possible))
 
     def members_of(self, worlds: Worlds) -> Worlds:
-        """Return the members of worlds at the alert, [n * M]. Here each world is its only member."""
+        """Return the members (possible worlds) of worlds at the alert, [n * M]. Here each world is its only member."""
         return worlds
 
     def _begun(
@@ -338,7 +338,7 @@ class StepShield:
     def _also_certified(
         self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
     ) -> Decision:
-        """Restrict a decision that all members allow; this class leaves it unchanged. ``memory`` is the one before."""
+        """Restrict a decision that all members allow; ``held`` is the backup before it. This class changes nothing."""
         return decision
 
     def as_seen(self, seen: Floats) -> Floats:
@@ -373,7 +373,7 @@ class StepShield:
         return np.asarray(within | (self._leaves_range(running) & np.isfinite(seen).all(axis=1)), np.bool_)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Return the worlds [n] that may leave the range of their members, because a member has had an impact."""
+        """Return worlds [n] that may leave the range of their members (possible worlds), after an impact in one."""
         N = running.problem.mass.shape[1]
         predicted = running.states.reshape(running.n, running.members, -1)
         return np.asarray((predicted[:, :, 2 * N - 1 : 3 * N - 2] == 1.0).any(axis=(1, 2)), np.bool_)

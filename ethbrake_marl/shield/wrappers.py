@@ -1,6 +1,4 @@
-"""The shield as a wrapper for each interface. A wrapper puts a guard into the engine, and the guard reports in the
-infos.
-"""
+"""The shield as a wrapper for each interface: it puts a guard into the engine, which reports in the infos."""
 
 from __future__ import annotations
 
@@ -156,9 +154,7 @@ class ShieldedEnv(
         return begun
 
     def step(self, action: NDArray[Any]) -> Any:
-        """Advance by one time step with the action certified or replaced; around ``CostEnv`` the result includes its
-        cost.
-        """
+        """Advance by one time step with the action certified or replaced; around ``CostEnv``, also return its cost."""
         self.attached.check_open()
         observation, reward, *others = self.env.step(action)
         return observation, float(reward) - self.attached.penalty().item(), *others

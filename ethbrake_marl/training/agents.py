@@ -21,8 +21,7 @@ from ethbrake_marl.training.team import has_policy_each, load_team
 
 
 def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
-    """Return the policy of a run or a bundle as an agent, or the team of a run in which each learner has its own
-    policy.
+    """Return the policy of a run or a bundle as an agent, or as a team if each learner of the run has its own.
 
     ``PATH`` may also be ``shipped``, the policy that comes with the package for this scenario and harm count, or
     ``shipped/NAME``. ``universal@shipped`` is for all scenarios; ``team@shipped`` is the same as ``policy@shipped``.

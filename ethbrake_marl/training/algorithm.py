@@ -29,9 +29,7 @@ class Algorithm(ABC):
         """Return a new model on the CPU, seeded by the recipe. The model must depend on the two arguments only."""
 
     def actors(self, model: BaseAlgorithm) -> tuple[BasePolicy, ...]:
-        """Return the policies that drive: one for all learners, or, under scheme ``independent``, one for each, front
-        to rear.
-        """
+        """Return the policies that drive: one for all learners, or one for each, front to rear (``independent``)."""
         return (model.policy,)
 
     def tensors(self, actor: BasePolicy, network: NetworkSpec) -> dict[str, Float32s]:

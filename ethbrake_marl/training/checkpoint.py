@@ -1,6 +1,4 @@
-"""Checkpoint of a training between two updates: a folder with arrays and plain numbers, written completely or not at
-all.
-"""
+"""Checkpoint of a training between two updates: a folder with arrays and plain numbers, written atomically."""
 
 from __future__ import annotations
 

@@ -164,9 +164,7 @@ def check_counter(name: str, value: object, kind: type) -> None:
 
 
 def _like(model: NDArray[Any], arrays: Arrays, name: str) -> NDArray[Any]:
-    """Return the array of this name; raise ``ValueError`` unless it is finite, with the shape and dtype of
-    ``model``.
-    """
+    """Return the array of this name; raise ``ValueError`` unless it is finite, with shape and dtype of ``model``."""
     found = arrays[name]
     if (found.shape, found.dtype) != (model.shape, model.dtype) or not np.isfinite(found).all():
         raise ValueError(f"{name}: {model.shape} finite {model.dtype} are needed")

@@ -66,9 +66,7 @@ def make_model(algorithm: Algorithm, training: Training, environment: EthBrakeVe
 def make_policies(
     training: Training, steps: int, tensors: Callable[[int, NetworkSpec], Mapping[str, Float32s]]
 ) -> Trained:
-    """Return one policy for all learners, or one for each; ``tensors(k, network)`` returns the weights of the k-th
-    policy.
-    """
+    """Return one policy for all learners, or one for each; ``tensors(k, network)`` are the weights of the k-th."""
     recipe, scenario = training.recipe, training.scenario
     names = tuple(training.drivers)
     apart = training.scheme == "independent"

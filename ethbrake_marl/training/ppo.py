@@ -19,9 +19,7 @@ from ethbrake_marl.training.training import Training
 
 
 class Ppo(Algorithm):
-    """Stable-Baselines3's PPO: one policy for all learners, optionally with a central critic, or one policy for
-    each.
-    """
+    """Stable-Baselines3's PPO with one policy for all learners, optionally a central critic, or one policy for each."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> PPO:
         """Return the model for the training's scheme."""

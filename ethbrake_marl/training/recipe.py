@@ -171,9 +171,7 @@ class TrainingRecipe(FileModel):
         """Raise ``InvalidInput`` if the recipe does not fit this number of learners."""
 
     def begins(self, scenario: Scenario) -> str | None:
-        """Describe the initial weights on a scenario, in words; None if the algorithm always begins with random
-        weights.
-        """
+        """Describe the initial weights on a scenario; None if the algorithm always begins with random weights."""
         return None
 
     def derived(self) -> dict[str, float]:
@@ -226,17 +224,14 @@ class TrainingRecipe(FileModel):
 
     @staticmethod
     def of(content: Any) -> TrainingRecipe:
-        """Return the recipe with this content, as ``model_dump(mode="json")`` returns it; raise ``InvalidInput`` if it
-        is invalid.
-        """
+        """Return the recipe with this content of ``model_dump(mode="json")``; raise ``InvalidInput`` if invalid."""
         return _checked(Document("recipe", content, {}))
 
     def new_text(self, name: str) -> str:
-        """Return the text of a commented YAML file for a new recipe ``name``, with all keys and the values of this
-        recipe.
+        """Return the text of a commented YAML file for a new recipe ``name`` that starts from this recipe.
 
-        A key without a value stands in a comment. Save the text as ``<name>.yaml``. Raises ``InvalidInput`` for an
-        invalid name.
+        All keys are written; a key without a value stands in a comment. Save the text as ``<name>.yaml``. Raises
+        ``InvalidInput`` for an invalid name.
         """
         check_file_name("recipe", name)
         words = {
@@ -264,9 +259,7 @@ class TrainingRecipe(FileModel):
         return "".join(lines)
 
     def replace(self, **changes: Any) -> Self:
-        """Return the same recipe with other values in some fields, checked again; raise ``InvalidInput`` if it is
-        invalid.
-        """
+        """Return the same recipe with other values in some fields; raise ``InvalidInput`` if it is invalid."""
         content = {**self.model_dump(mode="json"), **changes}
         changed = _checked(Document(f"recipe {self.name!r}", content, {}))
         assert isinstance(changed, type(self)) or "algorithm" in changes

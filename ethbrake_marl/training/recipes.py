@@ -82,9 +82,7 @@ class SquashedShape(Shape):
 
 
 class SacRecipe(TrainingRecipe):
-    """SAC recipe: collect ``steps_per_update`` decisions of every learner, then ``gradient_steps`` steps from the
-    memory.
-    """
+    """SAC recipe: collect ``steps_per_update`` decisions of every learner, then take ``gradient_steps`` steps."""
 
     algorithm: Literal["sac"]
     batch_size: int = Field(ge=2, description=BATCH_SIZE)

@@ -108,9 +108,7 @@ class RunDirectory:
 
     @classmethod
     def chosen_by(cls, evaluations: Sequence[Mapping[str, Any]], harm_count: HarmCount, prefix: str = "") -> str:
-        """Return the metric that chooses the best policy: the objective, or the line's harm if there is no
-        objective.
-        """
+        """Return the metric that chooses the best policy: the objective, or the line's harm without an objective."""
         found = evaluations and all(entry.get(prefix + cls.OBJECTIVE) not in (None, "") for entry in evaluations)
         return prefix + (cls.OBJECTIVE if found else cls.HARM[harm_count])
 
@@ -119,8 +117,9 @@ class RunDirectory:
         return list(csv.DictReader(self.progress.read_text("utf-8").splitlines()))
 
     def cpu_s(self) -> dict[int, float]:
-        """Return the processor time of learning (s) until each evaluation, by step; raise ``InvalidInput`` if none is
-        recorded.
+        """Return the processor time of learning (s) until each evaluation, by step.
+
+        Raises ``InvalidInput`` if none is recorded.
         """
         kept = read_object(self.status).get("cpu_s") or {}
         if not kept:

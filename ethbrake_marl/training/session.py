@@ -180,7 +180,7 @@ def build(
 
 
 def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[str] = ()) -> TrainResult:
-    """Learn from a checkpoint, or from the beginning without one, to the end or the next stop; then save.
+    """Learn, from a checkpoint or from scratch, to the end or the next stop; then save.
 
     The callback evaluates during training. However the training ends, its folder is complete.
     """
@@ -226,9 +226,7 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
 
 
 def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
-    """Save the best and the last good policy, and record how the run ended. Delete the checkpoints of a finished
-    run.
-    """
+    """Save the best and the last good policy, and record how the run ended. A finished run loses its checkpoints."""
     run, training, course = callback.run, callback.learner.training, callback.course
     for policy, folder in ((course.kept, run.policy), (course.policy, run.last_policy)):
         if policy is not None:

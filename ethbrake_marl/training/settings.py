@@ -47,8 +47,7 @@ class Settings(NamedTuple):
 def read_settings(
     texts: Sequence[str] | None, recipes: Sequence[TrainingRecipe] = (), *, of_agents: Sequence[str] = ()
 ) -> Settings:
-    """Sort settings by owner: ``mass_t=40`` and ``scenario.mass_t=40`` are the scenario's, ``gamma=0.9`` is the
-    recipe's.
+    """Sort settings by owner: ``mass_t=40`` and ``scenario.mass_t=40`` are the scenario's, ``gamma=0.9`` a recipe's.
 
     ``of_agents`` lists which of ``harm_count=total`` and ``measures=A,B`` are allowed. Raises ``UnknownName`` with a
     suggestion for an unknown key, ``InvalidInput`` for an unknown harm count.

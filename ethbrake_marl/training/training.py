@@ -68,9 +68,7 @@ class Training:
         return self.recipe.begins(self.scenario)
 
     def content(self) -> dict[str, dict[str, Any]]:
-        """Return everything that affects the training as plain data, with every default, without titles and
-        descriptions.
-        """
+        """Return everything that affects the training as plain data, including defaults, without descriptive texts."""
         recipe = self.recipe.model_dump(mode="json", exclude=set(WORDS))
         return {"recipe": recipe, "scenario": self.scenario.content(without=WORDS)}
 
