@@ -63,7 +63,7 @@ def make_sb3_vec_env(
             the horizon. Harm is counted up to the horizon only, and an estimate beyond it can grow without limit
             (docs/exploits.md). False: ``TimeLimit.truncated`` marks episodes that the horizon cut off.
         appended: numbers appended to a learner's own observation. ``number``: the learner's index among the learners
-            (0 = the foremost); ``state``: the full state of the line (``scenario.observed.full_state``), for a central
+            (0 = the foremost); ``state``: the full state of the line (``game.full_state.full_state``), for a central
             critic.
         step_infos: fill the infos of every step as the other interfaces do, not only at the end of an episode; slower.
         render_mode: ``rgb_array`` or None; ``render`` and ``VecVideoRecorder`` show all worlds side by side.

@@ -1,7 +1,7 @@
 """A scenario as a TorchRL environment and as a BenchMARL task. Needs the extra ``marl``.
 
 The environment runs ``n`` worlds in one engine. All learners of a world form one group and end together, because
-``done`` belongs to the world. The critic's ``state`` is the full state of the line (``scenario.observed.full_state``).
+``done`` belongs to the world. The critic's ``state`` is the full state of the line (``game.full_state.full_state``).
 
 Shapes: ``n`` worlds, ``L`` learners, ``F`` features of an observation, ``S`` features of the state.
 """
