@@ -227,7 +227,8 @@ class Entry:
     @property
     def is_ours(self) -> bool:
         """Whether this package makes the agent; errors of other agents are reported as theirs."""
-        return str(getattr(self.make, "__module__", "")).startswith("ethbrake_marl.") and self.make != make_from_file
+        is_from_file = ":" in self.name
+        return str(getattr(self.make, "__module__", "")).startswith("ethbrake_marl.") and not is_from_file
 
     @property
     def whole_form(self) -> str:
@@ -489,7 +490,7 @@ def register_agent(
     ``InvalidInput`` for a name that is not plain.
 
     """
-    if parse_spec(name) != AgentSpec(name, None, None, ()):
+    if ScriptSpec.parse(name) != ScriptSpec(name, None) or "@" in name:
         raise InvalidInput(f"agent name {name!r}: must be a plain name without argument")
     if name in group_names():
         raise AlreadyExists(f"agent {name!r}: stands for several agents in --agents; give another name")

@@ -232,7 +232,7 @@ class Engine:
 
     @property
     def packed(self) -> Packed:
-        """The running worlds themselves, as rows in the layout of ``physics.columns``: for kernels to read, not to be changed."""
+        """The running worlds as rows (``physics.columns``), not a copy: kernels read them, nobody changes them."""
         return self._now.state.packed
 
     @property
