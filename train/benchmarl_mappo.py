@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ethbrake_marl.scenario.observed import observation_for
+from ethbrake_marl.game.observed import observation_for
 from numpy.typing import NDArray
 
 import ethbrake_marl as eb
