@@ -1,7 +1,7 @@
 """Registries of agents, of the shields and searches around them, of their variants, and of groups of agents.
 
-Names are entry points (``pyproject.toml``), loaded when they are first used (``ethbrake_marl.registry``). So policies, searches and shields,
-which belong to layers above this folder, have names without being imported here.
+Names are entry points (``pyproject.toml``), loaded when they are first used (``ethbrake_marl.registry``). So policies,
+searches and shields, which belong to layers above this folder, have names without being imported here.
 """
 
 from __future__ import annotations
