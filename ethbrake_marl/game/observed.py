@@ -1,4 +1,4 @@
-"""What each vehicle of a game observes."""
+"""Observations of the vehicles of a game: which features each vehicle observes."""
 
 from __future__ import annotations
 
