@@ -109,8 +109,8 @@ class Registry(Mapping[str, T]):
             raise InvalidInput(f"{self.kind} {name!r}: {why}")
         return self.loaded[name]
 
-    def load(self, name: str) -> None:
-        """Load what has this name, once; raises ``UnknownName``."""
+    def load(self, name: str) -> list[str]:
+        """Load what has this name; raises ``UnknownName``. Gives the names of the parts that it stands for."""
         given = points(self.group).get(name, [])
         givers = [OURS] * (name in self._built_in) + [giver(point) for point in given]
         if len(givers) > 1:
@@ -118,16 +118,16 @@ class Registry(Mapping[str, T]):
                 f"{self.kind} {name!r}: the installed packages {' and '.join(givers)} give it; uninstall all but one"
             )
         if name in self.loaded or name in self._loading:
-            return
+            return [name]
         if not given:
             raise self.unknown(name)
         self._loading.add(name)
         try:
-            self._load(name, given[0])
+            return self._load(name, given[0])
         finally:
             self._loading.discard(name)
 
-    def _load(self, name: str, point: EntryPoint) -> None:
+    def _load(self, name: str, point: EntryPoint) -> list[str]:
         where = f"{self.kind} {name!r}, {point.value} of the installed package {giver(point)}"
         try:
             with naming_extras():
@@ -137,14 +137,15 @@ class Registry(Mapping[str, T]):
         except (Exception, SystemExit) as error:
             raise InvalidInput(f"{where}: cannot be imported: {describe_error(error)}") from error
         try:
-            # Several parts under one name are a mapping.
-            for each, part in (found if isinstance(found, dict) else {name: found}).items():
+            parts = found if isinstance(found, dict) else {name: found}  # several under one name are a mapping
+            for each, part in parts.items():
                 given, settings = (part.given, part.settings) if isinstance(part, Part) else ((part,), {})
                 self._register(each, *given, **settings)
         except (EthBrakeError, TypeError) as error:
             raise InvalidInput(f"{where}: {error}") from error
         if point.dist is not None and giver(point) != OURS:
             _VERSIONS[giver(point)] = point.dist.version
+        return list(parts)
 
     def add(self, name: str, part: T, is_same: Callable[[T], bool]) -> None:
         """Put a part here; raises ``AlreadyExists`` where another one has its name."""

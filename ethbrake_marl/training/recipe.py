@@ -269,7 +269,7 @@ class TrainingRecipe(FileModel):
     def json_schema() -> dict[str, Any]:
         """JSON Schema of a recipe file, for editors that complete and check YAML.
 
-        Which keys there are depends on ``algorithm``. Registered algorithms and reward terms are known, too.
+        Which keys there are depends on ``algorithm``. Registered algorithms and measures are known, too.
         """
         classes = {name: recipe for name, (recipe, _) in ALGORITHMS.usable().items()}
         places, whole = models_json_schema(
@@ -279,7 +279,7 @@ class TrainingRecipe(FileModel):
         for name, recipe in classes.items():
             keys = parts[str(places[recipe, "validation"]["$ref"]).rpartition("/")[2]]["properties"]
             keys["algorithm"] |= {"description": key_meanings(recipe)["algorithm"], "const": name}
-        weight = {"type": "number", "minimum": 0, "description": "weight of a registered term"}
+        weight = {"type": "number", "description": "weight of a registered measure"}
         properties = parts["RewardParams"]["properties"]
         properties |= {name: weight for name in setting_names() if name not in properties}
         ways = [
@@ -375,5 +375,5 @@ def _checked(source: Path | Document) -> TrainingRecipe:
 
 class _RecipeWording(Wording):
     def known(self, path: YamlPath) -> list[str]:
-        """Registered terms have their weights beside the others."""
+        """Registered measures have their weights beside the others."""
         return setting_names() if path[:-1] == ("reward",) else super().known(path)
