@@ -43,7 +43,7 @@ from ethbrake_marl.engine.terms import Terms
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep, renumbered
 from ethbrake_marl.game.actions import checked_action
 from ethbrake_marl.game.harm import Ledger, empty_ledger
-from ethbrake_marl.game.impacts import EpisodeImpacts, impacts_within
+from ethbrake_marl.game.impacts import EpisodeImpacts
 from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec, Plan
 from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.columns import Packed
@@ -439,7 +439,7 @@ class Engine:
         asked = self._ask_scripts()
         harm_before = self._terms.objective_harm(self.state) if self._terms.by_objective else None
         impacts = self.state.impacts
-        worlds = None if impacts is None else self.worlds
+        start = None if impacts is None else self.worlds
         step, some_failed = self._move(columns)
         if asked:
             self._change(memories=self.memories | asked)
@@ -447,21 +447,13 @@ class Engine:
             times = self.state.motion[:, 0]
             self.roster.mark(step.failed, times, np.minimum(times + self.scenario.time_step_s, self.scenario.horizon_s))
         if self._terms.add_something:
-            if worlds is not None:
-                self._count_impacts(worlds, self.wanted_mps2, worlds.time_s < self.state.time_s)
+            if impacts is not None and start is not None:
+                moved = start.time_s < self.state.time_s
+                self._change(impacts=impacts.and_then(self.segments(start, self.wanted_mps2), moved))
             worlds = self.worlds if self.reward.shaping > 0.0 else None
             state = self._terms.add(step, self.state, self.scenario, harm_before, impacts, worlds)
             self._now = self._now._replace(state=state)
         return step
-
-    def _count_impacts(self, before: Worlds, last_mps2: Floats, rows: Bools) -> None:
-        """Add to the state every impact on the way from ``before`` to now, in these rows; see ``segments``."""
-        assert self.state.impacts is not None
-        *stops, last = self.segments(before, last_mps2)
-        moved = [(*part, rows & (part[2] > part[0].time_s)) for part in stops]
-        moved.append((*last, rows & ((last[2] > last[0].time_s) | (last[2] == 0.0))))  # an impact at the very alert
-        found = [impacts_within(*part, np.flatnonzero(moving)) for *part, moving in moved]
-        self._change(impacts=self.state.impacts.and_then(found))
 
     def _change(self, **fields: Any) -> None:
         """Replace fields of the state."""
@@ -554,9 +546,10 @@ class Engine:
             hear_rows(at_alert, heard, wanted[rows], start_s, start_s, self.scenario.time_step_s, self._now.pieces)
             params[rows] = heard
         if self._terms.count_impacts:
-            alert, now, so_far = start.alert, self.worlds, self.state.impacts
-            self._change(impacts=EpisodeImpacts.of(alert) if so_far is None else so_far.renewed(rows, alert))
-            self._count_impacts(now.assign(rows, alert), now.command_mps2, np.isin(np.arange(self.n), rows))
+            alert, now, before = start.alert, self.worlds, self.state.impacts
+            impacts = EpisodeImpacts.of(alert) if before is None else before.renewed(rows, alert)
+            way = self.segments(now.assign(rows, alert), now.command_mps2)
+            self._change(impacts=impacts.and_then(way, np.isin(np.arange(self.n), rows)))
         if self.reward.shaping > 0.0:
             worlds = self._unpacked(Packed(motion[rows], params[rows]))
             potential[rows] = self._terms.potentials(worlds, self.scenario)

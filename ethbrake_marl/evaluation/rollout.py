@@ -207,7 +207,7 @@ def _roll_out(
         outcome,
         shoved_m=None if shoved is None else shoved.metres,
         sampled_harm=None if sampled is None else sampled.finish(),
-        metrics=measure_columns(episodes.terms, impacts and impacts.episodes()) if aftermath else {},
+        metrics=measure_columns(episodes.terms, None if impacts is None else impacts.episodes()) if aftermath else {},
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.left_out import ImpactRows
-from ethbrake_marl.physics.state import Floats, Ints, Vehicles, Worlds
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Vehicles, Worlds
 
 _OF_WORLDS = [field.name for field in fields(Worlds) if field.name != "vehicles"]
 _OF_VEHICLES = [field.name for field in fields(Vehicles)]
 _OF_ROWS = [field.name for field in fields(ImpactRows)]
-_DTYPES = (np.int64, np.int64, np.float64, np.float64, np.bool_, np.float64, np.float64)  # of these
-_NO_ROWS = ImpactRows(*(np.empty(0, dtype) for dtype in _DTYPES))
+_NO_INTS, _NO_FLOATS = np.empty(0, np.int64), np.empty(0)
+_NO_ROWS = ImpactRows(_NO_INTS, _NO_INTS, _NO_FLOATS, _NO_FLOATS, np.empty(0, np.bool_), _NO_FLOATS, _NO_FLOATS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +50,15 @@ class EpisodeImpacts:
         np.maximum.at(change, (rows.world[pairs], rows.pair[pairs]), np.abs(rows.front_speed_change_mps[pairs]))
         return change
 
-    def and_then(self, parts: Sequence[ImpactRows]) -> EpisodeImpacts:
-        """These impacts and later ones."""
-        return EpisodeImpacts.of(self.worlds, [self.rows, *parts])
+    def and_then(self, way: Iterable[tuple[Worlds, Floats, Floats]], some: Bools) -> EpisodeImpacts:
+        """These impacts, and those on the ``way`` that some of the worlds [n] go on: see ``Engine.segments``."""
+        parts, found = list(way), [self.rows]
+        for k, (before, command_mps2, until_s) in enumerate(parts, 1):
+            moving = until_s > before.time_s
+            if k == len(parts):
+                moving |= until_s == 0.0  # an impact at the very alert
+            found.append(impacts_within(before, command_mps2, until_s, np.flatnonzero(some & moving)))
+        return EpisodeImpacts.of(self.worlds, found)
 
     def renewed(self, rows: Ints, alert: Worlds) -> EpisodeImpacts:
         """The same with new episodes, without an impact so far, in these rows."""
@@ -88,11 +94,11 @@ class EpisodeImpacts:
             if have is None or have.ndim != own.ndim or (len(have) != len(own) and name != "impacts.rows"):
                 shape = "nothing" if have is None else have.shape
                 raise InvalidInput(f"engine snapshot: {name} is {shape}; {own.shape} is needed")
-        columns = zip(np.array(arrays["impacts.rows"]).T, _DTYPES, strict=True)
-        rows = ImpactRows(*(column.astype(dtype) for column, dtype in columns))
+        columns = zip(_OF_ROWS, np.array(arrays["impacts.rows"]).T, strict=True)
+        rows = ImpactRows(**{name: column.astype(getattr(_NO_ROWS, name).dtype) for name, column in columns})
         vehicles = Vehicles(**{name: arrays[f"impacts.{name}"] for name in _OF_VEHICLES})
         worlds = Worlds(vehicles, **{name: arrays[f"impacts.{name}"] for name in _OF_WORLDS})
-        return EpisodeImpacts.of(worlds.copy(), [rows])
+        return EpisodeImpacts.of(worlds.take(np.arange(worlds.n)), [rows])
 
 
 def _some(rows: ImpactRows, index: NDArray[Any]) -> ImpactRows:

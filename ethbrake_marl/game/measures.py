@@ -75,32 +75,32 @@ class NamedMeasure:
     def _numbers(self, given: StepOutcome | EpisodeImpacts, what: str) -> Any:
         """What the function gives: [n] or [n, N], numbers, or truths by impacts. ``InvalidInput`` for anything else."""
         assert self.function is not None
-        by_step = isinstance(given, StepOutcome)
-        n, vehicles = (given if by_step else given.worlds).speeds_mps.shape
+        learners = given.learners if isinstance(given, StepOutcome) else None
+        n, vehicles = (given.worlds if isinstance(given, EpisodeImpacts) else given).speeds_mps.shape
         try:
-            value = self.function(given)
+            value: Any = self.function(given)
             value = np.asarray(None if np.ma.isMaskedArray(value) else value)
         except (Exception, SystemExit) as error:
             raise InvalidInput(f"{what}: its function fails: {describe_error(error)}") from error
         right = {(n,): "one per world", (n, vehicles): "one per vehicle"}
-        if by_step:
-            right.setdefault((n, len(given.learners)), "one per learner")
+        if learners is not None:
+            right.setdefault((n, len(learners)), "one per learner")
         if value.shape not in right or value.dtype.kind not in "fiub":
             shapes = " or ".join(f"{shape}, {each}" for shape, each in right.items())
             raise InvalidInput(f"{what}: gave {value.dtype} of shape {value.shape}; must be numbers of shape {shapes}")
-        if value.dtype != np.bool_ or by_step:
-            value = value.astype(np.float64)
-        if right[value.shape] == "one per learner":
-            whole = np.zeros((n, vehicles))
-            whole[:, given.learners] = value
-            return whole
-        return value
+        if learners is None:
+            return value if value.dtype == np.bool_ else value.astype(np.float64)
+        if right[value.shape] != "one per learner":
+            return value.astype(np.float64)
+        whole = np.zeros((n, vehicles))
+        whole[:, learners] = value
+        return whole
 
     def change(self, before: EpisodeImpacts, after: EpisodeImpacts, steps: Ints) -> Floats:
         """How much the impacts that are new in ``after`` change a measure by impacts, [n] or [n, N]."""
         if len(before.rows.world) == len(after.rows.world):
             return np.zeros(after.worlds.speeds_mps.shape[: 2 if self.form.endswith("vehicle") else 1])
-        return np.subtract(self.of(after, steps=steps), self.of(before, steps=steps), dtype=np.float64)
+        return np.asarray(1.0 * self.of(after, steps=steps) - self.of(before, steps=steps))
 
 
 def register_measure(name: str, function: MeasureFunction, *, unit: str = "1", by: By = "impacts") -> None:
