@@ -1,4 +1,4 @@
-"""Names that stand for parts: agents, shields, measures, terms, features, objectives, algorithms and commands.
+"""Names that stand for parts: agents, shields, measures, features, objectives, algorithms and commands.
 
 One registry for each kind. A running program gives a name with ``register_...``; an installed package, ours among them,
 with an entry point in its ``pyproject.toml``, which goes through the same function when the name is first used:

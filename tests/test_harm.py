@@ -13,6 +13,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.game.actions import action_to_command, checked_action, command_to_action
 from ethbrake_marl.game.harm import Ledger, empty_ledger, split
+from ethbrake_marl.game.measures import BUILT_IN
 from ethbrake_marl.game.objectives import STANDARD, objective_harm, objectives_of, scored
 from ethbrake_marl.game.rewards import REWARDS, RewardParams, WithoutEffect, reward_params
 from ethbrake_marl.game.step_outcome import StepOutcome
@@ -120,7 +121,8 @@ def terms_of(
     step = StepOutcome(*harm_of_count, end, *motion, 0.5, after.time_s, *constants, np.array([1]))
     harm = step.first_impact_harm if params.harm_count == "first" else step.total_harm
     shared = params.shared(harm, step.safe_end.astype(np.float64))
-    every = shared | {measure.name: measure.built_in(step, params) for measure in params.measures("step")}
+    counted = [BUILT_IN[name] for name in params.counted if BUILT_IN[name].function]
+    every = shared | {measure.name: measure.built_in(step, params) for measure in counted}
     return {
         name: np.repeat(term[:, np.newaxis], after.N, axis=1) if term.ndim == 1 else term
         for name, term in every.items()

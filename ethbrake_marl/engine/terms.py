@@ -9,7 +9,7 @@ import numpy as np
 from ethbrake_marl.engine.compiled_step import Step
 from ethbrake_marl.engine.state import State
 from ethbrake_marl.game.impacts import EpisodeImpacts
-from ethbrake_marl.game.measures import BUILT_IN
+from ethbrake_marl.game.measures import BUILT_IN, MEASURES
 from ethbrake_marl.game.objectives import objective_harm
 from ethbrake_marl.game.rewards import Reward, reward_params
 from ethbrake_marl.game.step_outcome import StepOutcome
@@ -30,12 +30,16 @@ class Terms:
     def __init__(self, reward: Reward, scenario: Scenario, learners: Sequence[int]) -> None:
         self.params, self._objectives = reward_params(reward).settled(scenario.objective, scenario.vehicles)
         self._learners, self._learner_index = tuple(learners), np.array(learners, np.int64)
-        self._by_step, self._by_impacts = self.params.measures("step"), self.params.measures("impacts")
+        self._built_in = [
+            BUILT_IN[name] for name in self.params.counted if name in BUILT_IN and BUILT_IN[name].function
+        ]
+        registered = [MEASURES[name] for name in self.params.terms]
+        self._by_step = [measure for measure in registered if measure.by == "step"]
+        self._by_impacts = [measure for measure in registered if measure.by == "impacts"]
         self.count_impacts = bool(self._by_impacts)  # a measure of them has a weight
         self.by_objective = bool(self._objectives)  # each vehicle's harm by an objective
-        self.are_foreign = bool(self.params.terms)  # one is code that somebody registered, and so may fail
-        counts = bool(self._by_step or self._by_impacts)
-        self.add_something = counts or self.params.shaping > 0.0 or self.by_objective
+        self.are_foreign = bool(registered)  # one is code that somebody registered, and so may fail
+        self.add_something = bool(self._built_in or registered) or self.params.shaping > 0.0 or self.by_objective
 
     @property
     def shared_harm(self) -> float:
@@ -63,14 +67,11 @@ class Terms:
         if before is not None and self.params.harm > 0.0:
             step.further["harm"] = before - self.objective_harm(state)
         standing = state.ended & ~step.ended
-        if self._by_step:
-            outcome, counts = self._outcome(step, state, scenario.time_step_s), ~standing & (step.failed == 0)
-            for measure in self._by_step:
-                step.further[measure.name] = (
-                    measure.built_in(outcome, self.params)
-                    if measure.name in BUILT_IN
-                    else measure.of(outcome, counts, state.steps)
-                )
+        if self._built_in or self._by_step:
+            outcome = self._outcome(step, state, scenario.time_step_s)
+            step.further.update({each.name: each.built_in(outcome, self.params) for each in self._built_in})
+            counts = ~standing & (step.failed == 0) if self._by_step else None
+            step.further.update({each.name: each.of(outcome, counts, state.steps) for each in self._by_step})
         if impacts_before is not None and state.impacts is not None:
             for measure in self._by_impacts:
                 step.further[measure.name] = measure.change(impacts_before, state.impacts, state.steps)

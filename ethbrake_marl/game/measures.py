@@ -58,6 +58,8 @@ class NamedMeasure:
         ``counts`` [n]: the worlds to look at; the others have 0. ``steps`` [n]: how many each world has made, for
         messages. ``InvalidInput`` names the measure, and the world, vehicle and step of a number that is not finite.
         """
+        if isinstance(given, StepOutcome):
+            given.protect()
         what = f"measure {self.name!r}" + ("" if steps is None else f" at step {int(steps.max())}")
         value = self._numbers(given, what)
         if counts is not None:

@@ -29,7 +29,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.model import UNSHOWN, FileModel, first_mistake, require
 from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.game.measures import BUILT_IN, MEASURES, By, NamedMeasure
+from ethbrake_marl.game.measures import BUILT_IN, MEASURES
 from ethbrake_marl.game.objectives import Declared, Objective, check_declared, objectives_of
 from ethbrake_marl.physics.forecast import forecast
 from ethbrake_marl.physics.state import Floats, Worlds
@@ -153,11 +153,6 @@ class RewardParams(FileModel):
     def counted(self) -> tuple[str, ...]:
         """Names of the terms that this reward counts, in the order of the table."""
         return tuple(name for name, weight in self.weights.items() if weight != 0.0)
-
-    def measures(self, by: By) -> list[NamedMeasure]:
-        """The measures that this reward counts and that are computed from this by a function."""
-        counted = (MEASURES[name] for name in self.counted)
-        return [measure for measure in counted if measure.by == by and measure.function is not None]
 
     def shared(self, harm: Value, safe_end: Value) -> dict[str, Value]:
         """The terms that all vehicles share and that need no more than the step's facts, of many worlds [n] or of one.

@@ -12,7 +12,7 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 @dataclass(frozen=True, slots=True)
 class StepOutcome:
-    """What measures by step are computed from, for n worlds of N vehicles (P pairs); its arrays cannot be written to.
+    """What measures by step are computed from, for n worlds of N vehicles (P pairs); read it, do not change it.
 
     Vehicles are counted from 0, the front one.
     """
@@ -32,7 +32,8 @@ class StepOutcome:
     mass_t: Floats  # [n, N]
     learners: Ints  # [L] the vehicles that learn, or that an evaluated agent controls
 
-    def __post_init__(self) -> None:
+    def protect(self) -> None:
+        """Make its arrays read-only."""
         for name in StepOutcome.__slots__:
             if isinstance(array := getattr(self, name), np.ndarray):
                 array.flags.writeable = False

@@ -18,6 +18,7 @@ from ethbrake_marl.files.json_schema import FileSchema, schema_lines
 from ethbrake_marl.files.model import NAME_PATTERN, FileModel, Wording, read_model, refuse
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 from ethbrake_marl.game.features import ListedFeatures, listed_features
+from ethbrake_marl.game.measures import MEASURES
 from ethbrake_marl.game.rewards import RewardParams, setting_names
 from ethbrake_marl.policies.network_spec import Activation, NetworkSpec
 from ethbrake_marl.registry import Registry
@@ -281,7 +282,7 @@ class TrainingRecipe(FileModel):
             keys["algorithm"] |= {"description": key_meanings(recipe)["algorithm"], "const": name}
         weight = {"type": "number", "description": "weight of a registered measure"}
         properties = parts["RewardParams"]["properties"]
-        properties |= {name: weight for name in setting_names() if name not in properties}
+        properties |= {name: weight for name in MEASURES.usable() if name not in properties}
         ways = [
             {
                 "if": {"properties": {"algorithm": {"const": name}}, "required": ["algorithm"]},
