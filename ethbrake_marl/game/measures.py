@@ -2,12 +2,14 @@
 
 A measure is given either by step or by impacts:
 
-=======  =====================  ============================================  ==========================
-by       computed from          the reward of a step                          an evaluation shows
-=======  =====================  ============================================  ==========================
-step     ``StepOutcome``        its value in this step                        its sum over the episode
-impacts  ``EpisodeImpacts``     its change, by the impacts of this step       its value of all impacts
-=======  =====================  ============================================  ==========================
+=======  ==================  ===================================  =========================
+by       computed from       a reward counts in each step         an evaluation shows
+=======  ==================  ===================================  =========================
+step     ``StepOutcome``     its value                            its sum over the episode
+impacts  ``EpisodeImpacts``  its change by the step's impacts     its value for all impacts
+=======  ==================  ===================================  =========================
+
+So the rewards of an episode add up to what evaluations show, minus the value before the first decision.
 """
 
 from __future__ import annotations
@@ -29,7 +31,6 @@ from ethbrake_marl.registry import Registry
 _NAME = re.compile(r"(?!.*_([0-9]+|interval|low|high)\Z)[a-z][a-z0-9_]{0,63}")  # column x_2 is that of vehicle 2
 
 By = Literal["step", "impacts"]
-
 
 MeasureFunction = Callable[[Any], Any]  # from a ``StepOutcome`` or ``EpisodeImpacts`` to numbers
 
