@@ -113,7 +113,7 @@ def test_shield__step_mode_bounds_the_harm_of_the_obstacle_too_to_the_last_bit(v
     agent = ShieldedDriver(make_agent("coast"), scenario, harm_count="total")
     episodes = drive(scenario.sample(40, 7).worlds, agent, scenario, vehicle)
     harm, shield = episodes.ledger.world_harm("total"), episodes.guarded.shield
-    assert not shield.distrusted.any()
+    assert not shield.memory.distrusted.any()
     assert (harm <= shield.predicted_harm).all() and np.array_equal(harm, shield.bound)
     assert (shield.interventions > 0).sum() > 5 and (episodes.ledger.obstacle_count > 0).any()
 

@@ -14,6 +14,7 @@ from ethbrake_marl.agents.registry import agent_entries
 from ethbrake_marl.cli.app import Installed, whole_command
 from ethbrake_marl.evaluation.measures import measures
 from ethbrake_marl.game.features import Feature
+from ethbrake_marl.game.full_state import state_features
 from ethbrake_marl.game.measures import BUILT_IN
 from ethbrake_marl.game.objectives import OBJECTIVES
 from ethbrake_marl.game.observations import ObservationSpec, choose_observation
@@ -22,7 +23,6 @@ from ethbrake_marl.policies.shipped import load_shipped, shipped_policies
 from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 from ethbrake_marl.scenario.channel import CHANNELS, V2X
 from ethbrake_marl.scenario.fields import QUANTITY
-from ethbrake_marl.scenario.observed import state_features
 from ethbrake_marl.scenario.schema import Scenario, scenario_json_schema
 from ethbrake_marl.training.recipe import TrainingRecipe
 

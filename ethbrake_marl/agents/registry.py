@@ -1,7 +1,7 @@
-"""Agents: what one is and what it knows, the list of them by name, and the loop that lets them drive episodes.
+"""The registry of agents, shields and variants by name, and how an agent is written: ``ppo@shipped+search+step``.
 
-Names are those of entry points (``ethbrake_marl.registry``), which are loaded when they are first used: so policies,
-searches and shields, which stand above this folder, have names without being imported here.
+Names are entry points (``ethbrake_marl.registry``), loaded when they are first used. So policies, searches and shields,
+which belong to layers above this folder, have names without being imported here.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.roles import ScriptSpec
 from ethbrake_marl.scenario.schema import Scenario
 
-# The grammar of agents: ``name[:argument][:variant][@policy]``, and behind it what is put around that agent.
+# Syntax of an agent: ``name[:argument][:variant][@policy]``, followed by the wrappers around it.
 #
-# ``+search`` comes first, then one shield, for instance ``+episode:pairwise`` or ``+step``. A shield has variants, too.
-# A name may be a function of a Python file, ``my_file.py:make_agent``.
+# ``+search`` comes first, then one shield, for example ``+episode:pairwise`` or ``+step``. Shields have variants too.
+# A name may be a function in a Python file, ``my_file.py:make_agent``.
 #
-# Each of ``, + @ :`` may stand in a path, too. A path that exists wins: what stands in it separates nothing.
+# The separators ``, + @ :`` may occur in a path. If such a path exists, they do not separate anything there.
 
 _IN_FILE = re.compile(r":(?P<function>[A-Za-z_]\w*)(:(?P<argument>[^\s@]+))?(@(?P<policy>.+))?")
 
@@ -41,28 +41,28 @@ _BEGINS_WITH_FILE = re.compile(r"[^:@]+\.py(:.*)?")
 
 @dataclass(frozen=True, slots=True)
 class AgentSpec:
-    """An agent as it is written, in its parts."""
+    """A parsed agent specification."""
 
     name: str  # or FILE.py:FUNCTION
     argument: str | None  # after the colon
     policy: str | None  # after the @: a path, or "shipped"
-    around: tuple[str, ...]  # names with their arguments, innermost first
+    around: tuple[str, ...]  # wrappers with their arguments, innermost first
 
     @property
     def core(self) -> str:
-        """The agent without what is around it."""
+        """The agent without its wrappers."""
         argument = "" if self.argument is None else f":{self.argument}"
         return f"{self.name}{argument}" + ("" if self.policy is None else f"@{self.policy}")
 
     @property
     def file(self) -> tuple[str, str] | None:
-        """The Python file and its function that makes the agent, where the name is one of those."""
+        """The Python file and the function in it that makes the agent; None for any other agent."""
         file, _, function = self.name.rpartition(":")
         return (file, function) if file else None
 
     @property
     def shield(self) -> str | None:
-        """The shield around it, if there is one."""
+        """The outermost wrapper if it is a shield; otherwise None."""
         return self.around[-1] if self.around and not _around(self.around[-1]).inner else None
 
     def __str__(self) -> str:
@@ -70,11 +70,11 @@ class AgentSpec:
 
 
 def parse_spec(spec: str) -> AgentSpec:
-    """The parts of a spec. A path may hold any character.
+    """Parse an agent specification. A path in it may contain any character.
 
-    ``ppo@c+step`` is the folder ``c+step`` where that exists, and else the folder ``c`` behind the shield;
-    ``ppo@c/+step`` is always the latter. Raises ``InvalidInput`` for what is not written so, and for two shields or
-    another order; ``UnknownName`` for something else behind a ``+``.
+    ``ppo@c+step`` is the folder ``c+step`` if it exists, otherwise the folder ``c`` behind the shield; ``ppo@c/+step``
+    is always the latter. Raises ``InvalidInput`` for invalid syntax, two shields or another order; ``UnknownName`` for
+    an unknown wrapper.
     """
     core, around = _split_around(spec)
     if file := _python_file(core):
@@ -93,7 +93,7 @@ def parse_spec(spec: str) -> AgentSpec:
 
 
 def split_names(text: str, is_one: Callable[[str], bool] = os.path.lexists) -> list[str]:
-    """The names in a list with commas between them: as many parts as possible are one name where ``is_one`` says so."""
+    """Split a comma-separated list of names; commas inside a name are kept if ``is_one`` accepts the longer text."""
     parts, names = text.split(","), list[str]()
     while parts:
         joined = (k for k in range(len(parts), 1, -1) if is_one(",".join(parts[:k])))
@@ -104,7 +104,7 @@ def split_names(text: str, is_one: Callable[[str], bool] = os.path.lexists) -> l
 
 
 def split_specs(text: str) -> list[str]:
-    """The specs in a list with commas between them, which may stand in paths that exist."""
+    """Split a comma-separated list of agent specifications; commas in paths that exist are kept."""
     return split_names(text, _is_one_spec)
 
 
@@ -115,13 +115,13 @@ def _is_one_spec(text: str) -> bool:
 
 
 def _existing_file(core: str) -> str:
-    """The longest Python file that exists and with which a spec begins; empty without one."""
+    """Return the longest existing Python file with which a specification begins; empty without one."""
     ends = (match.start() for match in re.finditer(r"(?<=\.py):", core))
     return max((core[:end] for end in ends if os.path.isfile(core[:end])), key=len, default="")
 
 
 def _python_file(core: str) -> str:
-    """The Python file with which a spec begins, whether it exists or not; empty without one."""
+    """Return the Python file with which a specification begins, whether it exists or not; empty without one."""
     return _existing_file(core) or (core.partition(":")[0] if _BEGINS_WITH_FILE.fullmatch(core) else "")
 
 
@@ -130,7 +130,7 @@ def _policy_path(core: str) -> str:
 
 
 def _strip_around(spec: str) -> tuple[str, list[str]]:
-    """What stands before all that is around it, and that; the path of an existing policy is left whole."""
+    """Split a specification into the agent and its wrappers; a path of an existing policy is kept whole."""
     core, around = spec, list[str]()
     while True:
         before, plus, last = core.rpartition("+")
@@ -142,7 +142,7 @@ def _strip_around(spec: str) -> tuple[str, list[str]]:
 def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
     core, around = _strip_around(spec if isinstance(spec, str) else "")
     if not core:
-        ScriptSpec.parse(spec)  # says what is right
+        ScriptSpec.parse(spec)  # raises the error
     before, plus, last = core.rpartition("+")
     if plus and _is_meant_around(before, core, last):
         raise unknown_name("shield or search", last, around_forms())
@@ -160,10 +160,10 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
 
 
 def _is_meant_around(before: str, core: str, last: str) -> bool:
-    """Whether a word behind a ``+`` that is no name of ``_SHIELDS`` is no part of an argument or path either."""
+    """Return whether an unknown word after a ``+`` is a misspelt wrapper, rather than part of an argument or a path."""
     file = _python_file(core)
     if ".py" in last or (file and _IN_FILE.fullmatch(core, len(file))):
-        return False  # the + is part of a file's path, or of its argument
+        return False  # the + belongs to the path of a Python file, or to its argument
     if ":" not in before and "@" not in before:
         return True
     if "/" in last or "\\" in last:
@@ -171,12 +171,12 @@ def _is_meant_around(before: str, core: str, last: str) -> bool:
     return not os.path.lexists(_policy_path(core)) and bool(get_close_matches(last.partition(":")[0], _SHIELDS))
 
 
-HORIZON_S = 8.0  # until when an agent looks ahead that knows no scenario
+HORIZON_S = 8.0  # horizon of agents that look ahead, if there is no scenario
 
 
 @dataclass(frozen=True, slots=True)
 class AgentSettings:
-    """What an agent may need beyond its own argument.
+    """Settings for making an agent, beyond its own argument.
 
     >>> import ethbrake_marl as eb
     >>> eb.AgentSettings("planner:64", scenario=eb.load_scenario("paper-random")).needed_scenario().name
@@ -184,18 +184,18 @@ class AgentSettings:
 
     """
 
-    spec: str  # as it is written, with what is around it so far
-    policy: str | None = None  # what stands after the @
-    scenario: Scenario | None = None  # in which it drives, where that is known
-    harm_count: HarmCount = "first"  # which harm an optimising agent minimises
-    horizon_s: float = HORIZON_S  # until when it looks ahead
-    most_candidates: int | None = None  # of a search, whatever its argument says; None: what that says
-    uncertainty: object = None  # what a shield around it does not know of the worlds, as that shield reads it
-    time_step_s: float = 0.1  # between two decisions
-    role: int | None = None  # index of the vehicle whose role it is; None: a driver, whichever vehicles it drives
+    spec: str  # the specification, with the wrappers so far
+    policy: str | None = None  # text after the @
+    scenario: Scenario | None = None  # scenario of the agent, if known
+    harm_count: HarmCount = "first"  # harm that an optimising agent minimises
+    horizon_s: float = HORIZON_S  # time until which it looks ahead (s)
+    most_candidates: int | None = None  # upper limit for a search, stricter than its argument; None: no limit
+    uncertainty: object = None  # what a shield does not know about the worlds, in that shield's format
+    time_step_s: float = 0.1  # time between two decisions
+    role: int | None = None  # index of the vehicle, if the agent is its role in the scenario; otherwise None
 
     def needed_scenario(self) -> Scenario:
-        """The scenario, for an agent that cannot do without. Raises ``InvalidInput`` if there is none."""
+        """Return the scenario; raise ``InvalidInput`` if there is none."""
         if self.scenario is None:
             raise InvalidInput(
                 f"agent {self.spec!r}: needs a scenario: make_agent({self.spec!r}, scenario='paper-random')"
@@ -212,31 +212,32 @@ Wrapper = Callable[[Any, str | None, AgentSettings], Driver]
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One line of the registry."""
+    """An entry of the registry: an agent, or a wrapper (a shield or search)."""
 
     name: str
-    form: str  # how it is written; without ":" it takes no argument, without "@" no policy
-    about: str  # one line
-    knows: Source | Sequence[Source]  # while it drives; of what goes around an agent: what is added
+    form: str  # how it is written; no argument if there is no ":", no policy if there is no "@"
+    about: str  # description in one line
+    knows: Source | Sequence[Source]  # knowledge while driving; for a wrapper: knowledge that it adds
     make: Factory | Wrapper
-    inner: bool = False  # of what goes around an agent: directly, inside a shield
-    teams: bool = False  # likewise: around a team, too
-    needs: Mapping[str, object] = field(default_factory=dict)  # settings that it cannot do without -> an example
-    options: type | None = None  # of a shield that also goes around environments: the class of its settings
+    inner: bool = False  # for a wrapper: it goes directly around the agent, inside a shield
+    teams: bool = False  # for a wrapper: it can go around a team too
+    needs: Mapping[str, object] = field(default_factory=dict)  # required settings -> an example
+    options: type | None = None  # settings class of a shield that also goes around environments
 
     @property
     def is_ours(self) -> bool:
-        """Whether this package makes it; of others' errors are told as such."""
-        return str(getattr(self.make, "__module__", "")).startswith("ethbrake_marl.") and self.make != make_from_file
+        """Whether this package makes the agent; errors of other agents are reported as theirs."""
+        is_from_file = ":" in self.name
+        return str(getattr(self.make, "__module__", "")).startswith("ethbrake_marl.") and not is_from_file
 
     @property
     def whole_form(self) -> str:
-        """How it is written, its variants included."""
+        """How it is written, including its variants."""
         return self.form + "".join(f"[:{variant}]" for variant in variants_of(self.name))
 
     @property
     def words(self) -> tuple[str, ...]:
-        """How what goes around an agent may be written behind the ``+``, where that is a list of words."""
+        """Everything that may be written after the ``+`` for a wrapper whose arguments are fixed words."""
         name, *options = re.findall(r"[^\[\]+]+", self.whole_form)
         found = [name]
         for option in options:
@@ -244,12 +245,12 @@ class Entry:
         return tuple(found)
 
     def takes(self, argument: str) -> bool:
-        """Whether what goes around an agent takes this argument; empty for none."""
+        """Return whether a wrapper takes this argument; empty: no argument."""
         name = self.words[0]
         return "[:ARGUMENT]" in self.form or (f"{name}:{argument}" if argument else name) in self.words
 
     def call(self, argument: str | None, settings: AgentSettings, *inside: Driver) -> Driver:
-        """What its function makes, of a wrapper around what is ``inside``."""
+        """Make the agent; a wrapper is put around ``inside``."""
         make: Any = self.make
         before, _, last = (argument or "").rpartition(":")
         if last in variants_of(self.name):
@@ -259,10 +260,10 @@ class Entry:
 
 
 class Variant(NamedTuple):
-    """A word behind an agent or a shield, after its argument, that makes another one of it."""
+    """A variant of an agent or a shield, selected by a word after its argument."""
 
     make: Factory | Wrapper
-    about: str  # one line
+    about: str  # description in one line
 
 
 def make_agent(
@@ -275,22 +276,24 @@ def make_agent(
     uncertainty: object = None,
     time_step_s: float | None = None,
 ) -> Driver:
-    """A fresh agent for one vehicle in one batch, or the team of a run.
+    """Make a new agent for one vehicle in one batch, or a team of agents from one training run.
 
     Args:
-        spec: ``name[:argument][@policy]`` and what is put around it, for instance ``constant:3.5``, ``planner:64``,
-            ``ppo@shipped+search+step``; ``ethbrake agent list`` has all. ``my_file.py:make_agent`` runs that file,
-            which can do whatever you can: its function gets what a factory of ``register_agent`` gets, or nothing.
-        scenario: also its name or the path of its file; needed by teams, by what is put around an agent, and to find
-            the shipped policy of this scenario.
-        harm_count: which harm an optimising agent minimises, ``first`` or ``total``.
-        horizon_s: until when it looks ahead, s; None: the scenario's horizon, or 8 s.
-        most_candidates: for trying an agent out: no search of it takes more.
-        uncertainty: what a shield that certifies uncertain worlds does not know, such as ``"gaps_m=0.5"``.
-        time_step_s: between two decisions of what searches or follows a law; None: the scenario's, or 0.1 s.
+        spec: ``name[:argument][@policy]`` and wrappers, for example ``constant:3.5``, ``planner:64``,
+            ``ppo@shipped+search+step``; ``ethbrake agent list`` lists all. ``my_file.py:make_agent`` runs that file,
+            which can do whatever you can: its function gets the arguments of a factory (see ``register_agent``), or
+            none.
+        scenario: scenario, its name or the path of its file; needed by teams, by wrappers, and to find the shipped
+            policy for this scenario.
+        harm_count: harm that an optimising agent minimises, ``first`` or ``total``.
+        horizon_s: time until which it looks ahead, s; None: the scenario's horizon, or 8 s.
+        most_candidates: upper limit for the candidates of a search, to try an agent out quickly.
+        uncertainty: what a shield for uncertain worlds does not know, for example ``"gaps_m=0.5"``.
+        time_step_s: time between two decisions for agents that search or follow a control law; None: the scenario's, or
+            0.1 s.
 
-    Raises ``UnknownName`` with a suggestion for an unknown name, ``InvalidInput`` for a bad argument, harm count or
-    horizon, and for a scenario that is missing.
+    Raises ``UnknownName`` with a suggestion for an unknown name; ``InvalidInput`` for an invalid argument, harm count
+    or horizon, and for a missing scenario.
 
     >>> import ethbrake_marl as eb
     >>> eb.make_agent("ppo@shipped+step", scenario="paper-random").name
@@ -328,10 +331,10 @@ def _make_driver(written: AgentSpec, settings: AgentSettings) -> Driver:
 
 
 def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None = None) -> Agent:
-    """The agent that ``vehicle`` follows as its role: the one that would drive it, made for first-impact harm.
+    """Make the agent for the role of ``vehicle`` in the scenario, optimising first-impact harm.
 
-    ``most_candidates`` is as in ``make_agent``. Raises what that raises, and ``InvalidInput`` for what goes around an
-    agent, and for a team without this vehicle.
+    ``most_candidates`` is as in ``make_agent``. Raises what ``make_agent`` raises, and ``InvalidInput`` for a wrapper,
+    and for a team without this vehicle.
     """
     spec = scenario.scripts[vehicle]
     name, _, argument = spec.partition(":")
@@ -350,9 +353,9 @@ def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None =
 
 
 def find_entry(spec: AgentSpec | str) -> Entry:
-    """The registry's entry of an agent.
+    """Return the registry's entry of an agent.
 
-    Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for an argument or a policy that it does not take.
+    Raises ``UnknownName`` with a suggestion; ``InvalidInput`` for an argument or a policy that the agent does not take.
     """
     written = parse_spec(spec) if isinstance(spec, str) else spec
     if written.file is not None:
@@ -372,23 +375,23 @@ def find_entry(spec: AgentSpec | str) -> Entry:
 
 
 def _around(each: str) -> Entry:
-    """The entry of what is written behind a ``+``."""
+    """Return the entry of a wrapper as written after a ``+``."""
     return _SHIELDS[each.partition(":")[0]]
 
 
 def agent_names() -> tuple[str, ...]:
-    """Names that ``make_agent`` knows, in alphabetical order."""
+    """Return the names that ``make_agent`` knows, in alphabetical order."""
     return tuple(sorted({*_AGENTS} - {_PROFILE}))
 
 
 def agent_entries() -> tuple[Entry, ...]:
-    """All agents, and then all that can be put around one, each with its variants: those that can be loaded."""
+    """Return the entries of all agents and then of all wrappers that can be loaded, each with its variants."""
     agents = [entry for name, entry in _AGENTS.usable().items() if name != _PROFILE]
     return tuple(_with_variants(entry) for entry in (*agents, *_SHIELDS.usable().values()))
 
 
 def _with_variants(entry: Entry) -> Entry:
-    """The entry with the forms and texts of its variants, of those that can be loaded, for a list."""
+    """Return the entry with the forms and descriptions of its variants that can be loaded, for a list."""
     usable = _VARIANTS.usable()
     for word in variants_of(entry.name):
         if variant := usable.get(f"{entry.name}.{word}"):
@@ -397,65 +400,65 @@ def _with_variants(entry: Entry) -> Entry:
 
 
 def agents_refused() -> list[str]:
-    """Why some of the installed agents, shields and variants cannot be loaded."""
+    """Return why some of the installed agents, shields and variants cannot be loaded."""
     found = [each.why_not(name) for each in (_AGENTS, _SHIELDS, _VARIANTS) for name in each]
     return [reason for reason in found if reason is not None]
 
 
 def around_forms() -> tuple[str, ...]:
-    """All that may stand behind a ``+``."""
+    """Return everything that may follow a ``+``."""
     return tuple(word for entry in _SHIELDS.usable().values() for word in entry.words)
 
 
 def shield_forms() -> tuple[str, ...]:
-    """The shields among that, without their variants."""
+    """Return the shields that may follow a ``+``, without their variants."""
     return tuple(each for each in around_forms() if not (_around(each).inner or is_variant(each)))
 
 
 def around_one_vehicle() -> list[str]:
-    """The names of all that goes around an agent but not around a team: first what goes inside a shield."""
+    """Return the names of the wrappers that cannot go around a team; those that go inside a shield come first."""
     return [entry.name for inner in (True, False) for entry in _SHIELDS.usable().values()
             if entry.inner is inner and not entry.teams]  # fmt: skip
 
 
 def shield_settings(name: object) -> Any:
-    """The class of settings of a shield that also goes around environments; None for any other name."""
+    """Return the settings class of a shield that also goes around environments; None for any other name."""
     return _SHIELDS[name].options if isinstance(name, str) and name in _SHIELDS else None
 
 
 def shield_modes() -> dict[str, Any]:
-    """Name -> class of settings of every shield that also goes around environments, and can be loaded."""
+    """Return name -> settings class of every loadable shield that also goes around environments."""
     return {name: entry.options for name, entry in _SHIELDS.usable().items() if entry.options is not None}
 
 
 def variants_of(name: str) -> tuple[str, ...]:
-    """The words that may stand behind an agent or a shield, after its argument, and make another one of it."""
+    """Return the variants of an agent or a shield: words that may follow its argument."""
     keys = (key.rpartition(".") for key in _VARIANTS)
     return tuple(variant for of, _, variant in keys if of == name)
 
 
 def is_variant(form: str) -> bool:
-    """Whether the last word of ``NAME:WORD`` makes another agent or shield of it."""
+    """Return whether the last word of ``NAME:WORD`` is a variant."""
     return form.rpartition(":")[2] in variants_of(form.partition(":")[0])
 
 
 def settings_needed(shield: str | None) -> Mapping[str, object]:
-    """Settings that a shield cannot do without, each with an example; a variant of it needs none."""
+    """Return the settings that a shield requires, each with an example; a variant requires none."""
     return {} if shield is None or is_variant(shield) else _around(shield).needs
 
 
 def shields_with(setting: str) -> tuple[str, ...]:
-    """The installed shields that cannot do without a setting."""
+    """Return the installed shields that require a setting."""
     return tuple(entry.words[0] for entry in _SHIELDS.usable().values() if setting in entry.needs)
 
 
 def group_names() -> tuple[str, ...]:
-    """Names that stand for several agents in ``--agents``."""
+    """Return the names that stand for several agents in ``--agents``."""
     return tuple(dict.fromkeys(name.partition(".")[0] for name in _GROUPS))
 
 
 def agents_of_group(group: str) -> tuple[str, ...]:
-    """The agents for which a group's name stands; its own come first, then those of ``GROUP.MORE``, by name."""
+    """Return the agents of a group: first its own, then those of ``GROUP.MORE``, sorted by name."""
     return tuple(spec for name in sorted(_GROUPS) if name.partition(".")[0] == group for spec in _GROUPS[name])
 
 
@@ -468,25 +471,26 @@ def register_agent(
     form: str | None = None,
     takes_policy: bool = False,
 ) -> None:
-    """Make ``name`` and ``name:argument`` known to ``make_agent``, and so to every command.
+    """Register an agent, so that ``make_agent`` and every command know ``name`` and ``name:argument``.
 
-    An installed package does the same with an entry point of the group ``ethbrake_marl.agents``: its factory, or a
-    ``Part`` of it.
+    An installed package registers an agent with an entry point of the group ``ethbrake_marl.agents``: its factory, or a
+    ``Part`` with the factory.
 
     Args:
-        name: plain, without argument.
-        factory: makes the agent, from what stands after the colon (or None) and ``AgentSettings``. The same one again
-            changes nothing.
-        about: one line for ``ethbrake agent list``.
-        knows: of the line while it drives, for ``ethbrake agent list`` too.
-        form: how it is written, for ``ethbrake agent list`` too; without ``:`` in it, it takes no argument, without
-            ``@`` no policy. None: ``name[:ARGUMENT]``.
-        takes_policy: whether ``name@policy`` is known, too; the factory finds it in ``AgentSettings.policy``.
+        name: plain name without argument.
+        factory: ``factory(argument, settings)`` makes the agent; ``argument`` is the text after the colon, or None, and
+            ``settings`` an ``AgentSettings``.
+        about: description in one line, for ``ethbrake agent list``.
+        knows: what the agent knows about the line while it drives, for ``ethbrake agent list``.
+        form: how the agent is written, for ``ethbrake agent list``. Without ``:`` it takes no argument, without ``@``
+            no policy. None: ``name[:ARGUMENT]``.
+        takes_policy: whether ``name@policy`` is allowed; the factory finds the policy in ``AgentSettings.policy``.
 
-    Raises ``AlreadyExists`` for a name that another factory has, ``InvalidInput`` for one that is not plain.
+    Registering the same factory again changes nothing. Raises ``AlreadyExists`` if the name belongs to another factory,
+    ``InvalidInput`` for a name that is not plain.
 
     """
-    if parse_spec(name) != AgentSpec(name, None, None, ()):
+    if ScriptSpec.parse(name) != ScriptSpec(name, None) or "@" in name:
         raise InvalidInput(f"agent name {name!r}: must be a plain name without argument")
     if name in group_names():
         raise AlreadyExists(f"agent {name!r}: stands for several agents in --agents; give another name")
@@ -506,25 +510,26 @@ def register_shield(
     needs: Mapping[str, object] | None = None,
     options: type | None = None,
 ) -> None:
-    """Make ``+name`` known behind every agent.
+    """Register a shield or another wrapper, so that ``+name`` may follow every agent.
 
-    An installed package does the same with an entry point of the group ``ethbrake_marl.shields``: its wrapper, or a
-    ``Part`` of it.
+    An installed package registers a shield with an entry point of the group ``ethbrake_marl.shields``: its wrapper, or
+    a ``Part`` with the wrapper.
 
     Args:
-        name: plain, without argument.
-        wrapper: makes the agent around an agent, from that, what stands after the colon (or None) and
-            ``AgentSettings``. The same one again changes nothing.
-        about: one line for ``ethbrake agent list``.
-        knows: what it adds to what the agent knows.
-        form: how it is written, ``+name[:WORD]`` with every word that it takes; None: with any argument.
-        inner: it is no shield, and goes around the agent before one.
-        teams: it also goes around a team.
-        needs: settings of ``AgentSettings`` that it cannot do without, each with an example.
-        options: the class of its settings, ``shield.options.ShieldOptions`` or one derived from it, which makes its
-            guard: then ``eb.shield(env, mode=name)`` knows it, too.
+        name: plain name without argument.
+        wrapper: ``wrapper(agent, argument, settings)`` makes the agent around ``agent``; ``argument`` is the text after
+            the colon, or None, and ``settings`` an ``AgentSettings``.
+        about: description in one line, for ``ethbrake agent list``.
+        knows: knowledge that it adds to the agent's.
+        form: how it is written, ``+name[:WORD]`` with every word that it takes; None: any argument.
+        inner: it is not a shield, and goes around the agent before a shield.
+        teams: it can also go around a team.
+        needs: required settings of ``AgentSettings``, each with an example.
+        options: its settings class, ``shield.options.ShieldOptions`` or a subclass, which makes its guard. Then
+            ``eb.shield(env, mode=name)`` knows it too.
 
-    Raises ``AlreadyExists`` for a name that another one has, ``InvalidInput`` for one that is not plain.
+    Registering the same wrapper again changes nothing. Raises ``AlreadyExists`` if the name belongs to another wrapper,
+    ``InvalidInput`` for a name that is not plain.
 
     """
     if not isinstance(name, str) or not _PLAIN.fullmatch(name):
@@ -535,17 +540,17 @@ def register_shield(
 
 
 def register_variant(key: str, make: Factory | Wrapper, *, about: str = "a variant of your own") -> None:
-    """Make ``name:variant`` and ``name:argument:variant`` known, of an agent or a shield that has a name already.
+    """Register a variant of an agent or a shield: ``name:variant`` and ``name:argument:variant``.
 
-    An installed package does the same with an entry point of the group ``ethbrake_marl.variants``.
+    An installed package registers a variant with an entry point of the group ``ethbrake_marl.variants``.
 
     Args:
         key: ``name.variant``.
-        make: makes it in the place of the factory, or wrapper, of that name, from the same arguments; the variant is
-            not in the argument.
-        about: one line for ``ethbrake agent list``.
+        make: replaces the factory or wrapper of that name, with the same arguments; the argument does not contain the
+            variant.
+        about: description in one line, for ``ethbrake agent list``.
 
-    Raises ``AlreadyExists`` for a variant that another one has.
+    Raises ``AlreadyExists`` if the key belongs to another variant.
 
     """
     _VARIANTS.add(key, Variant(make, about), lambda variant: variant.make is make)
@@ -553,7 +558,7 @@ def register_variant(key: str, make: Factory | Wrapper, *, about: str = "a varia
 
 _PLAIN = re.compile(r"[a-z][a-z0-9_.-]*")
 
-_PROFILE = "profile"  # a role of scenarios alone
+_PROFILE = "profile"  # allowed only as a role in a scenario
 
 _AGENTS: Registry[Entry] = Registry("agent", "agents", register_agent)
 
@@ -570,7 +575,7 @@ _GROUPS: Registry[tuple[str, ...]] = Registry("group of agents", "agent_groups",
 
 
 def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: Driver) -> Driver:
-    """The driver of an entry; of one that is not ours, what it raises becomes ``InvalidInput``, and it is looked at."""
+    """Make the driver of an entry; check it, and turn errors of other people's agents into ``InvalidInput``."""
     try:
         driver = entry.call(argument, settings, *inside)
     except Exception as error:
@@ -582,14 +587,14 @@ def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: 
     return driver
 
 
-# An agent from a Python file of the user's: ``my_file.py:make_agent``, loaded only where a person names it.
+# An agent from the user's Python file, ``my_file.py:make_agent``; loaded only if the user names it.
 
 
 def make_from_file(argument: str | None, settings: AgentSettings) -> Driver:
-    """What the function of the file makes, from the argument (or None) and the settings, or from nothing.
+    """Return what the named function of a Python file makes, called with argument and settings, or without arguments.
 
-    A function without parameters takes neither argument nor policy: ``InvalidInput`` says so, and what is wrong with
-    the file.
+    A function without parameters takes neither argument nor policy. Raises ``InvalidInput`` if one is given, and if
+    something is wrong with the file.
     """
     named = parse_spec(settings.spec).file
     assert named is not None
@@ -597,7 +602,7 @@ def make_from_file(argument: str | None, settings: AgentSettings) -> Driver:
     if not callable(function):
         raise InvalidInput(f"file {named[0]!r}: {named[1]!r} is no function; name the one that makes the agent")
     given: tuple[Any, ...] = (argument, settings)
-    with suppress(TypeError, ValueError):  # of something built in there is no signature
+    with suppress(TypeError, ValueError):  # a built-in function may have no signature
         if not inspect.signature(function).parameters:
             given = ()
     if not given and (argument, settings.policy) != (None, None):

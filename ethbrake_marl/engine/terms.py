@@ -8,13 +8,13 @@ import numpy as np
 
 from ethbrake_marl.engine.compiled_step import Step
 from ethbrake_marl.engine.state import State
+from ethbrake_marl.game.definition import Game
 from ethbrake_marl.game.impacts import EpisodeImpacts
 from ethbrake_marl.game.measures import BUILT_IN, MEASURES
 from ethbrake_marl.game.objectives import objective_harm
 from ethbrake_marl.game.rewards import Reward, reward_params
 from ethbrake_marl.game.step_outcome import StepOutcome
 from ethbrake_marl.physics.state import Floats, Worlds
-from ethbrake_marl.scenario.schema import Scenario
 
 
 class Terms:
@@ -27,7 +27,7 @@ class Terms:
 
     """
 
-    def __init__(self, reward: Reward, scenario: Scenario, learners: Sequence[int]) -> None:
+    def __init__(self, reward: Reward, scenario: Game, learners: Sequence[int]) -> None:
         self.params, self._objectives = reward_params(reward).settled(scenario.objective, scenario.vehicles)
         self._learners, self._learner_index = tuple(learners), np.array(learners, np.int64)
         self._built_in = [
@@ -54,7 +54,7 @@ class Terms:
         self,
         step: Step,
         state: State,
-        scenario: Scenario,
+        scenario: Game,
         before: Floats | None,
         impacts_before: EpisodeImpacts | None,
         worlds: Worlds | None,
@@ -105,7 +105,7 @@ class Terms:
             self._learner_index.view(),
         )
 
-    def potentials(self, worlds: Worlds, scenario: Scenario) -> Floats:
+    def potentials(self, worlds: Worlds, scenario: Game) -> Floats:
         """Potential of every learner, 0 for other vehicles, [n, N]."""
         potentials = np.zeros(worlds.speeds_mps.shape)
         shared = self.params.potential(worlds, self._learners, scenario.horizon_s)

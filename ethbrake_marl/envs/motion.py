@@ -1,7 +1,7 @@
-"""The motion of an engine's worlds, kept while they run, so that any moment of it can be shown exactly.
+"""Recorded motion of an engine's worlds, so that every moment can be shown exactly; and the viewer that shows it.
 
-Between decisions the motion follows from the state and the command alone: each moment is advanced from the beginning
-of its step. A ``Trace`` looks on at the engine; without one nothing is kept and nothing costs time.
+Between two decisions, the motion follows from the state and the command alone, so each moment is advanced from the
+beginning of its step. A ``Trace`` watches the engine; without a ``Trace`` nothing is recorded and nothing costs time.
 """
 
 from __future__ import annotations
@@ -36,29 +36,29 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """One step of every world, or the way from its alert to its first decision."""
+    """One step of every world, or the time from its alert to its first decision."""
 
-    start: Worlds  # [n]
-    command_mps2: Floats  # [n, N] where ``fresh``: what is in force when it ends
-    until_s: Floats  # [n] NaN: it ends where the engine is
-    fresh: Bools  # [n] from the alert on
-    front_m: Floats  # [n] place of Vehicle 1 at the start, from that at the alert
-    harm: Floats  # [n, 2] at the start, by first impacts and in total (m2/s2)
-    left_m: Floats  # [n] the view of the episode
-    right_m: Floats  # [n]
+    start: Worlds  # the n worlds at the start
+    command_mps2: Floats  # [n, N] commands; where ``fresh``, set to the commands in force at the end
+    until_s: Floats  # [n] end; NaN: the engine's current time
+    fresh: Bools  # [n] whether the motion begins at the alert
+    front_m: Floats  # [n] position of Vehicle 1 at the start, relative to the alert
+    harm: Floats  # [n, 2] first-impact harm and total harm at the start (m2/s2)
+    left_m: Floats  # [n] left end of the view of the episode
+    right_m: Floats  # [n] right end
     struck: Floats  # [k, 4] impacts shortly before the start: world, pair, time, closing speed
-    stepped_in: Bools | None  # [n] by a shield; None: there is none
-    parts: tuple[tuple[Worlds, Floats, Floats], ...] = ()  # once it is closed: ``Engine.segments``
+    stepped_in: Bools | None  # [n] whether a shield replaced an action; None: no shield
+    parts: tuple[tuple[Worlds, Floats, Floats], ...] = ()  # parts from ``Engine.segments``, once the motion is closed
 
     def closed(self, engine: Engine) -> Motion:
-        """The motion that has led to where the engine is."""
+        """Return this motion with its end set to the engine's current state."""
         worlds = engine.worlds
         command = np.where(self.fresh[:, np.newaxis], worlds.command_mps2, self.command_mps2)
         parts = tuple(engine.segments(self.start, command))
         return replace(self, command_mps2=command, until_s=worlds.time_s, parts=parts)
 
     def scenes(self, engine: Engine, row: int, times_s: Floats | None = None) -> list[Scene]:
-        """What world ``row`` shows at these times of a closed motion [k], or at its end alone."""
+        """Return the scenes of world ``row`` at these times [k] of a closed motion, or the scene at its end."""
         times = self.until_s[[row]] if times_s is None else times_s
         alert_view = View(float(self.left_m[row]), float(self.right_m[row]))
         obstacle = self.start.obstacle_gap_m[row] + self.front_m[row]
@@ -108,16 +108,16 @@ class Motion:
         return shown
 
 
-Memory = tuple[Motion, ...]  # the motions that are kept, the running one last
+Memory = tuple[Motion, ...]  # recorded motions, the running one last
 
 
 class Trace:
-    """Follows the motion of an engine's worlds (an ``engine.Watcher``).
+    """Record the motion of an engine's worlds; a ``Watcher`` of ``engine.engine``.
 
     Args:
-        engine: to be followed from its next reset on.
-        whole: keep every step since the episode began (one world); else the last one only.
-        alert: the worlds with which the engine, still at its first decision, began: followed from there at once.
+        engine: engine to watch, from its next reset on.
+        whole: keep every step since the episode began (one world); else the last step only.
+        alert: the worlds at the alert of an engine that is still at its first decision; recording starts there at once.
 
     """
 
@@ -126,15 +126,15 @@ class Trace:
         engine.watch(self, () if alert is None else self.begun((), alert, np.arange(alert.n)))
 
     def begun(self, memory: Memory, alert: Worlds, rows: Ints) -> Memory:
-        """Forget the worlds in these rows; they begin at their alert."""
+        """Return the memory after the worlds in these rows were replaced by new ones at their alert."""
         v, n = alert.vehicles, alert.n
-        # The view holds each line from the alert to rest, if all brake fully as soon as they can; a vehicle behind that
-        # stops later is taken to push the ones ahead so far.
+        # The view contains each line from the alert to rest if all brake fully as soon as they can. A rear vehicle that
+        # would stop further on is assumed to push the vehicles ahead that far.
         behind = np.concatenate([np.zeros((n, 1)), np.cumsum(alert.gaps_m, axis=1)], axis=1)
         reaction = alert.speeds_mps * np.minimum(v.latency_s, LATE_S)
         rising = (
             alert.speeds_mps * v.braking_capacity_mps2 / (2.0 * v.brake_rate_mps3)
-        )  # at most, while brakes build up
+        )  # upper bound while brakes build up
         way = reaction + rising + alert.speeds_mps**2 / (2.0 * v.braking_capacity_mps2)
         left = -behind[:, -1] - alert.N * BODY_M - BEHIND_M
         right = np.minimum((way - behind).max(axis=1), alert.obstacle_gap_m) + AHEAD_M
@@ -153,7 +153,7 @@ class Trace:
         return (replace(last, start=last.start.assign(rows, alert), struck=struck, **columns),)
 
     def stepped(self, memory: Memory, before: Engine, after: Engine) -> Memory:
-        """Close the motion that led to this step, and begin the step's own."""
+        """Close the motion that led to this step, and begin the motion of the step."""
         last = memory[-1].closed(before)
         front_m, met = last.front_m, [last.struck]
         for start, command, until_s in last.parts:
@@ -178,7 +178,7 @@ class Trace:
         return (*memory[:-1], last, new) if self._whole else (new,)
 
     def motions(self, engine: Engine) -> Memory:
-        """The motions that are kept, all ended. Raises ``InvalidInput`` before the first reset."""
+        """Return all recorded motions, closed. Raise ``InvalidInput`` before the first reset."""
         memory: Memory = engine.memory(self)
         if not memory:
             raise InvalidInput("render: no episode was started; call reset first")
@@ -187,34 +187,34 @@ class Trace:
 
 def _rows(worlds: Worlds, command: Floats, until_s: Floats) -> ImpactRows:
     rows = advance(worlds, command, until_s=until_s, record=True)[1].rows
-    assert rows is not None  # they were asked for
+    assert rows is not None  # because of ``record=True``
     return rows
 
 
-# ``render()`` of every interface: modes, frames since the last call, and the window.
+# ``render()`` of every interface: modes, frames, and the window.
 
 
 class Window:
-    """The window of ``render_mode="human"``; it opens with its first frame, and stays closed once its user closes it.
+    """Window of ``render_mode="human"``. It opens with its first frame, and stays closed after the user closes it.
 
-    A copy is a window of its own. Raises ``MissingExtra`` where its library is missing.
+    A copy is a separate window. Raises ``MissingExtra`` if pygame is missing.
     """
 
     def __init__(self) -> None:
         need("pygame")
-        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # importing a library says nothing
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # no greeting on import
         import pygame
 
         self._pygame: Any = pygame
         self._screen: Any = None
         self._clock: Any = None
-        self.closed_by_user = False  # until an episode begins
+        self.closed_by_user = False  # reset when an episode begins
 
     def __reduce__(self) -> tuple[type[Window], tuple[()]]:
         return Window, ()
 
     def show(self, frame: Frame, fps: float) -> None:
-        """Show a frame [H, W, 3] for 1/fps seconds. Raises ``InvalidInput`` where there is no display."""
+        """Show a frame [H, W, 3] for 1/fps seconds. Raise ``InvalidInput`` if there is no display."""
         if self.closed_by_user:
             return
         pygame = self._pygame
@@ -242,22 +242,22 @@ class Window:
             self._screen = self._clock = None
 
 
-SMOOTH_FPS = 50  # frames per second of the window, and of ``step_frames``
+SMOOTH_FPS = 50  # frames per second in the window and from ``step_frames``
 
 
 class Viewer:
-    """Shows the running episodes of an engine; the window is imported when it is first asked for.
+    """Show the running episodes of an engine. The window's library is imported only for mode ``human``.
 
     Args:
-        engine: what is shown, from its next reset on.
-        mode: one of the interface's modes, or None: nothing is kept, and nothing can be shown.
-        batch: the interface has many worlds at once, and shows each.
+        engine: the engine to show, from its next reset on.
+        mode: a render mode of the interface, or None: nothing is recorded, and nothing can be shown.
+        batch: whether the interface has many worlds, and shows each of them.
 
-    Raises ``InvalidInput`` for another mode, and for ``human`` where its library is missing.
+    Raises ``InvalidInput`` for another mode, ``MissingExtra`` for ``human`` if pygame is missing.
 
     """
 
-    METADATA: ClassVar[dict[str, Any]] = {  # of a class; each environment has its own fps
+    METADATA: ClassVar[dict[str, Any]] = {  # defaults of a class; each environment has its own fps
         "render_modes": ["human", "rgb_array", "rgb_array_list", "ansi"],
         "render_fps": 10,
     }
@@ -271,7 +271,7 @@ class Viewer:
         self._engine, self._batch = engine, batch
         self._window = Window() if mode == "human" else None
         self._trace = None if mode is None else Trace(engine, whole=mode == "rgb_array_list")
-        self._shown = 0  # motions of the running episode that a list of frames has shown
+        self._shown = 0  # number of motions of the running episode that a list of frames has already shown
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -280,24 +280,27 @@ class Viewer:
         return {"render_modes": list(self.modes), "render_fps": round(fps) if abs(fps - round(fps)) < 1e-9 else fps}
 
     def began(self) -> None:
-        """An episode has begun: the list of frames starts anew, and the window shows the way to the first decision."""
+        """Handle the start of an episode: begin a new list of frames, and show the time up to the first decision."""
         self._shown = 0
         if self._window is not None:
             self._window.closed_by_user = False
             self.play()
 
     def play(self) -> None:
-        """Show what the last step brought in the window, in real time; nothing in other modes."""
+        """Show the last step in the window, in real time; do nothing in other modes."""
         if self._window is not None:
             for frame in self.step_frames():
                 self._window.show(frame, SMOOTH_FPS)
 
     def render(self) -> Any:
-        """What the mode says of the world, or of each of a batch; None for ``human``, where every step shows itself."""
+        """Return the frame, list of frames or text of the mode, for each world of a batch.
+
+        Returns None for ``human``, where every step is shown in the window anyway.
+        """
         motions = self._motions(f"render: made with render_mode=None; give one of {', '.join(self.modes)}")
         if self.mode == "human":
             return None
-        if self.mode == "rgb_array_list":  # one frame for the beginning and each step that no list has shown yet
+        if self.mode == "rgb_array_list":  # one frame for the beginning and for each step not in an earlier list
             new, self._shown = motions[self._shown :], len(motions)
             return [motion.scenes(self._engine, 0)[-1].frame() for motion in new]
         scenes = [motions[-1].scenes(self._engine, k)[-1] for k in range(self._engine.n)]
@@ -305,14 +308,14 @@ class Viewer:
         return shown if self._batch else shown[0]
 
     def step_frames(self, fps: float = SMOOTH_FPS) -> list[Frame]:
-        """The frames [H, W, 3] between the last decision, or the alert, and now: ``fps`` in a second of the world.
+        """Return the frames [H, W, 3] from the last decision, or the alert, up to now, at ``fps`` per second.
 
         Raises ``InvalidInput`` before the first reset, with render_mode=None, and for an ``fps`` below 1.
         """
         check_whole_number("step_frames: fps", fps, 1)
         motion = self._motions("step_frames: made with render_mode=None; give 'rgb_array'")[-1]
         start, until = float(motion.start.time_s[0]), float(motion.until_s[0])
-        times: Floats = np.linspace(start, until, max(round((until - start) * fps), 1) + 1)[1:]  # the last is its end
+        times: Floats = np.linspace(start, until, max(round((until - start) * fps), 1) + 1)[1:]  # includes the end
         return [scene.frame() for scene in motion.scenes(self._engine, 0, times)]
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Scenarios: strict YAML files that describe families of worlds, and the reproducible lists drawn from them."""
+"""Scenarios: strict YAML files that describe families of worlds, and reproducible lists of worlds drawn from them."""
 
 from typing import TYPE_CHECKING
 
@@ -19,15 +19,6 @@ if TYPE_CHECKING:
     from ethbrake_marl.scenario.channel import CHANNELS as CHANNELS, register_preset as register_preset
     from ethbrake_marl.scenario.distributions import Uniform as Uniform
     from ethbrake_marl.scenario.fields import QUANTITY as QUANTITY
-    from ethbrake_marl.scenario.observed import (
-        Appended as Appended,
-        common_observation as common_observation,
-        full_state as full_state,
-        observation_for as observation_for,
-        observations_of as observations_of,
-        row_features as row_features,
-        state_features as state_features,
-    )
     from ethbrake_marl.scenario.roles import ScriptSpec as ScriptSpec
     from ethbrake_marl.scenario.sample import Sample as Sample
     from ethbrake_marl.scenario.schema import Scenario as Scenario, scenario_json_schema as scenario_json_schema

@@ -27,7 +27,7 @@ from ethbrake_marl.envs.registration import GYMNASIUM_ID, PETTINGZOO_ID, registe
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.features import Feature
-from ethbrake_marl.scenario.observed import full_state, state_features
+from ethbrake_marl.game.full_state import full_state, state_features
 from tests.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial_state, line
 
 near = pytest.approx

@@ -339,7 +339,7 @@ def test_robust_shield__trusts_a_longer_line_inside_its_box() -> None:
     uncertain = parse_uncertainty("gaps_m.pair_1=0.5")
     shielded = ShieldedDriver.around(make_agent("full_brake"), task, mode="robust", uncertainty=uncertain, told=told)
     driven = drive(replace(told, gaps_m=told.gaps_m + shift), shielded, five)
-    assert driven.guarded.shield.distrusted.sum() == 0
+    assert driven.guarded.shield.memory.distrusted.sum() == 0
     assert driven.ledger.world_harm("first").sum() > 0.0
 
 

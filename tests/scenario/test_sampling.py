@@ -280,7 +280,7 @@ def test_friction__no_truth_of_its_box_is_distrusted_and_no_corner_is_above_the_
     for corners, spec in ((True, "coast"), (True, "full_brake"), (False, "full_brake")):
         shield = ShieldedDriver(make_agent(spec), wet, told=told, uncertainty=uncertainty)
         found = drive(uncertainty.draw(told, rng, corners=corners), shield, wet, 1)
-        assert not found.guarded.shield.distrusted.any()
+        assert not found.guarded.shield.memory.distrusted.any()
         harm = found.ledger.world_harm("first")
         assert not corners or (harm <= found.guarded.shield.predicted_harm + 1e-9).all()
 

@@ -12,12 +12,12 @@ from ethbrake_marl.agents.driving import script_agents
 from ethbrake_marl.engine.profiles import identities
 from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.evaluation.identity import worlds_sha256
+from ethbrake_marl.game.full_state import full_state, state_features
 from ethbrake_marl.game.observations import observe
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.episode import CLOCK
 from ethbrake_marl.physics.messages import CHANNEL, Messages, chance
 from ethbrake_marl.scenario.channel import CHANNELS, PER_LINK, PRESETS, V2X, Channel, Equipage, Equipped, burst_periods
-from ethbrake_marl.scenario.observed import full_state, state_features
 from ethbrake_marl.scenario.tables import worlds_from_state
 from tests.fixtures.knowledge import alter_unreceived
 

@@ -48,7 +48,7 @@ def test_review__tells_the_harm_of_the_engine_also_where_the_bound_is_not_it(mod
     assert abs(shield.bound - harm).max() > 1.0
     found = review(shield, wavering, worlds)
     assert found.realised.tolist() == harm[found.world].tolist()
-    assert found.trusted.tolist() == (~shield.distrusted[found.world]).tolist()
+    assert found.trusted.tolist() == (~shield.memory.distrusted[found.world]).tolist()
     assert found.trusted.all() == (mode == "robust")
 
 

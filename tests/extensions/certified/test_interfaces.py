@@ -79,7 +79,7 @@ def test_world__that_goes_on_after_the_shields_own_end_is_braked_fully():
     engine = episode_engine(worlds, ShieldedDriver(drives_off, PAPER, told=slower, uncertainty="gaps_m=0.02"), PAPER, 1)
     braking, after = -worlds.vehicles.braking_capacity_mps2[:, 1], np.zeros(40, bool)
     while not engine.ended.all():
-        over = engine.guarded.shield.running.finished & ~engine.ended
+        over = engine.guarded.shield.memory.running.finished & ~engine.ended
         engine.step({})
         assert (engine.wanted_mps2[over, 1] == braking[over]).all()
         after |= over

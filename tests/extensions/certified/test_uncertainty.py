@@ -74,7 +74,7 @@ def test_every_member__realises_at_most_the_bound_to_the_bit(N, harm_count, who)
         episodes = drive(members.take(np.arange(worlds.n) * M + m), driver, scenario, vehicle)
         harm, shield = episodes.ledger.world_harm(harm_count), episodes.guarded.shield
         assert (harm <= shield.bound).all() and (shield.bound <= shield.predicted_harm).all()
-        assert not shield.distrusted.any()
+        assert not shield.memory.distrusted.any()
         tight += int((harm > 0.9 * shield.bound).sum())
     assert tight > 0  # the bound is not out of reach
 
@@ -103,7 +103,7 @@ def test_seen__inside_the_range_of_the_members_is_no_surprise_outside_is_one(gap
     driver = ShieldedDriver(make_agent("full_brake"), STANDING, uncertainty=OPEN, told=told)
     episodes = drive(truth, driver, STANDING, 1)
     shield = episodes.guarded.shield
-    assert shield.distrusted.tolist() == [surprising]
+    assert shield.memory.distrusted.tolist() == [surprising]
     assert surprising or 0.0 < episodes.ledger.world_harm("first")[0] <= shield.predicted_harm[0]
 
 
@@ -143,12 +143,12 @@ def test_bound_at_the_alert__is_that_of_the_best_constant_in_the_worst_corner() 
     )  # fmt: skip
     worlds, uncertainty = scenario.sample(1, 0).worlds, parse_uncertainty("gaps_m=3")
     shield = begun(scenario, worlds, RobustShield, uncertainty=uncertainty)
-    alone = [begun(scenario, uncertainty.members(worlds).take([m])).first_bound[0] for m in range(5)]
-    tried = [plan_harm(shield.running, np.full((1, 81), -a))[0] for a in np.linspace(0.0, 1.0, 41)]
-    assert shield.running.members == 5
+    alone = [begun(scenario, uncertainty.members(worlds).take([m])).memory.first_bound[0] for m in range(5)]
+    tried = [plan_harm(shield.memory.running, np.full((1, 81), -a))[0] for a in np.linspace(0.0, 1.0, 41)]
+    assert shield.memory.running.members == 5
     assert len(set(alone)) > 2
     # No single deceleration is best in all of them.
-    assert max(*alone, alone[0] + 1.0) - 1e-9 <= shield.first_bound[0] <= min(tried)
+    assert max(*alone, alone[0] + 1.0) - 1e-9 <= shield.memory.first_bound[0] <= min(tried)
 
 
 def test_seen__counts_from_then_on() -> None:
