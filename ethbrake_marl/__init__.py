@@ -54,11 +54,9 @@ if TYPE_CHECKING:
     from ethbrake_marl.agents.foreign import policy_agent as policy_agent
     from ethbrake_marl.agents.learned import LearnedAgent as LearnedAgent
     from ethbrake_marl.agents.protocol import Agent as Agent, Team as Team
-    from ethbrake_marl.agents.registry import (
-        AgentSettings as AgentSettings,
-        agent_names as agent_names,
-        make_agent as make_agent,
-    )
+    from ethbrake_marl.agents.making import make_agent as make_agent
+    from ethbrake_marl.agents.registry import agent_names as agent_names
+    from ethbrake_marl.agents.settings import AgentSettings as AgentSettings
     from ethbrake_marl.policies.bundle import load_policy as load_policy
     from ethbrake_marl.policies.policy import Policy as Policy
     from ethbrake_marl.policies.shipped import load_shipped as load_shipped

@@ -29,7 +29,7 @@ TRAINED = "training: torch's own sums differ by machine, too"
 SEARCHED = "a search, whose finds are written down as numbers"
 PRINTED = "drawn or printed, with few digits"
 REMAINS = {
-    ("envs/motion.py", "**"): SQUARES,
+    ("envs/trace.py", "**"): SQUARES,
     ("envs/rendering.py", "math.cos"): PRINTED,
     ("envs/rendering.py", "math.sin"): PRINTED,
     ("evaluation/seeds.py", "scipy.stats"): "resampling and sorting: sums and products alone",

@@ -8,8 +8,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from ethbrake_marl.agents.making import make_role
 from ethbrake_marl.agents.protocol import Agent, Driver, Team
-from ethbrake_marl.agents.registry import around_one_vehicle, make_role
+from ethbrake_marl.agents.registry import around_one_vehicle
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.memory import Memory
 from ethbrake_marl.errors import InvalidInput, PhysicsError

@@ -102,7 +102,7 @@ def evaluate_command(
     +robust:believed needs none. With --set harm_count=total agents minimise the harm of all impacts, not only of first
     impacts. --set measures=injury,my_file.py:worst adds these measures to the usual ones.
     """
-    from ethbrake_marl.agents.registry import split_specs
+    from ethbrake_marl.agents.spec import split_specs
 
     with Out(as_json=as_json, force=force) as out:
         _check_outputs(out, output, per_world, report=report)

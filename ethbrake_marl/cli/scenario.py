@@ -159,7 +159,7 @@ def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> Non
 
 def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
     """Yield a sentence about each part of the scenario; empty if there is nothing to say."""
-    from ethbrake_marl.agents.registry import find_entry
+    from ethbrake_marl.agents.making import find_entry
     from ethbrake_marl.game.objectives import OBJECTIVES
 
     yield f"{scenario.name}: {scenario.title or 'no title'}. {scenario.description}".rstrip()

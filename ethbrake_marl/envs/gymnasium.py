@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.infos import OneWorld, Report
 from ethbrake_marl.envs.making import AnyScenario, action_box, feature_box, learner_actions, make_engine, only_learner
-from ethbrake_marl.envs.motion import Viewer
+from ethbrake_marl.envs.viewer import Viewer
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec
 from ethbrake_marl.game.rewards import Reward, RewardParams

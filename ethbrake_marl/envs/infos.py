@@ -24,7 +24,7 @@ from ethbrake_marl.engine.compiled_step import Step
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.draws import Columns, describe_worlds
 from ethbrake_marl.envs.making import INITIAL_STATE, LISTED_WORLD, chosen_seed, wanted_worlds, warn_of_unknown
-from ethbrake_marl.envs.motion import Viewer
+from ethbrake_marl.envs.viewer import Viewer
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.actions import action_of
 from ethbrake_marl.game.harm import front_share

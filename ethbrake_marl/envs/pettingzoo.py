@@ -15,7 +15,7 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.infos import OneWorld, Report
 from ethbrake_marl.envs.making import AnyScenario, IgnoredAction, action_box, feature_box, learner_actions, make_engine
-from ethbrake_marl.envs.motion import Viewer
+from ethbrake_marl.envs.viewer import Viewer
 from ethbrake_marl.errors import InvalidInput, check_whole_number, unknown_name
 from ethbrake_marl.game.actions import checked_action
 from ethbrake_marl.game.full_state import full_state, state_features

@@ -24,7 +24,7 @@ from ethbrake_marl.envs.making import (
     make_engine,
     warn_of_unknown,
 )
-from ethbrake_marl.envs.motion import Viewer
+from ethbrake_marl.envs.viewer import Viewer
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.actions import own_actions
 from ethbrake_marl.game.full_state import Appended, full_state, row_features

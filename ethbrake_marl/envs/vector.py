@@ -25,7 +25,7 @@ from ethbrake_marl.envs.making import (
     only_learner,
     warn_of_unknown,
 )
-from ethbrake_marl.envs.motion import Viewer
+from ethbrake_marl.envs.viewer import Viewer
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.game.actions import own_actions
 from ethbrake_marl.game.observations import Observation, Observations

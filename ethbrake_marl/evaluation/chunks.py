@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ethbrake_marl.agents.protocol import Driver, Knowledge, Team
-from ethbrake_marl.agents.registry import parse_spec
+from ethbrake_marl.agents.spec import parse_spec
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation

@@ -5,15 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from ethbrake_marl.agents.driving import episode_engine, script_agents
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Agent, Driver, Team
-from ethbrake_marl.agents.registry import (
-    agents_of_group,
-    make_agent,
-    parse_spec,
-    settings_needed,
-    shields_with,
-    split_specs,
-)
+from ethbrake_marl.agents.registry import agents_of_group, settings_needed, shields_with
+from ethbrake_marl.agents.spec import parse_spec, split_specs
 from ethbrake_marl.engine.memory import ask_script, begin_script
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.evaluation.familiar import warn_unfamiliar

@@ -9,14 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from ethbrake_marl.agents.driving import Episodes, script_agents
-from ethbrake_marl.agents.registry import (
-    agents_of_group,
-    find_entry,
-    make_agent,
-    make_role,
-    settings_needed,
-    shield_forms,
-)
+from ethbrake_marl.agents.making import find_entry, make_agent, make_role
+from ethbrake_marl.agents.registry import agents_of_group, settings_needed, shield_forms
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.memory import ask_script, begin_script
 from ethbrake_marl.errors import AgentFailed, InvalidInput, check_one_learner

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ethbrake_marl.agents.protocol import Agent, Driver, Source
-from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shield.drivers import shielded
 from ethbrake_marl.shield.options import ShieldOptions

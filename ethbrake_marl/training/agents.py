@@ -10,7 +10,7 @@ from typing import Any
 
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Driver, Source, Team
-from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.shipped import SHIPPED, load_named_policy, shipped_name

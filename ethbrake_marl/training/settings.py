@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from ethbrake_marl.agents.registry import split_names
+from ethbrake_marl.agents.spec import split_names
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.overrides import Override
 from ethbrake_marl.game.harm import HarmCount, check_harm_count

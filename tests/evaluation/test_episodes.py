@@ -17,8 +17,8 @@ from PIL import Image, ImageSequence
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.evaluation.evaluation import Evaluation

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.evaluation.shield_modes import ShieldModes, compare_modes
 from ethbrake_marl.evaluation.statistics import mean, paired_difference

@@ -14,7 +14,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.motion import stopping_distances

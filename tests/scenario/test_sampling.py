@@ -13,7 +13,7 @@ from scipy import stats
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.evaluation.identity import worlds_sha256
 from ethbrake_marl.physics.state import Vehicles
 from ethbrake_marl.scenario.catalogue import load_scenario

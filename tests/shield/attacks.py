@@ -15,7 +15,7 @@ import numpy as np
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive, script_agents
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.episode import CLOCK
 from ethbrake_marl.physics.state import Floats, Worlds

@@ -8,7 +8,8 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl import registry
-from ethbrake_marl.agents.registry import _AGENTS, _SHIELDS, _VARIANTS, agent_entries, make_agent
+from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.agents.registry import AGENTS as _AGENTS, SHIELDS as _SHIELDS, VARIANTS as _VARIANTS, agent_entries
 from ethbrake_marl.errors import UnknownName
 from tests.refused import refused
 

@@ -12,7 +12,7 @@ from gymnasium.wrappers import Autoreset
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive, episode_engine
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.engine.compiled_step import STEP
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep

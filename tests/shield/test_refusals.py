@@ -11,8 +11,8 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.envs.gymnasium import EthBrakeEnv
 from ethbrake_marl.envs.pettingzoo import env as aec_env, parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env

@@ -19,7 +19,8 @@ from ethbrake_marl.agents.e_v2x_bm.constants import make_line
 from ethbrake_marl.agents.e_v2x_bm.pairwise import CANDIDATES, closed_form, find_breakpoints, onset_s, optimise_pairwise
 from ethbrake_marl.agents.e_v2x_bm.search import make_room, search_line
 from ethbrake_marl.agents.protocol import Agent, Source, fixed_commands
-from ethbrake_marl.agents.registry import AgentSettings, variants_of
+from ethbrake_marl.agents.registry import variants_of
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.engine.memory import Memory, is_state_free
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, renumbered

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ethbrake_marl.agents.e_v2x_bm.coupled import make_e_v2x_bm
 from ethbrake_marl.agents.protocol import Agent, Driver, Source, Team
-from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.enclosure import CORNERS, checked_robust
 from ethbrake_marl.extensions.certified.estimating_agents import Believing, BelievingHybrid

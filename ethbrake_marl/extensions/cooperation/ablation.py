@@ -6,7 +6,7 @@ from collections import Counter
 from functools import partial
 from pathlib import Path
 
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.extensions.cooperation.joint_optimum import measure, questions
 from ethbrake_marl.extensions.cooperation.levels import Json, Plan, common_worlds
 from ethbrake_marl.extensions.cooperation.page import write_ablation

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.registry import split_names
+from ethbrake_marl.agents.spec import split_names
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.evaluation.identity import LIST_SEED
 from ethbrake_marl.evaluation.trial import load_runnable

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Source
-from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.extensions.certified.estimated import Told

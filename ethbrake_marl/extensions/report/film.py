@@ -11,8 +11,8 @@ import numpy as np
 
 from ethbrake_marl.agents.driving import episode_engine
 from ethbrake_marl.agents.protocol import Driver, Team
-from ethbrake_marl.envs.motion import Trace
 from ethbrake_marl.envs.rendering import Frame, Scene
+from ethbrake_marl.envs.trace import Trace
 from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, need
 from ethbrake_marl.extensions.report.moving_drawing import animate_films
 from ethbrake_marl.physics.state import Worlds

@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.registry import split_names
+from ethbrake_marl.agents.spec import split_names
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.identity import result_identity, worlds_sha256
 from ethbrake_marl.evaluation.seeds import interquartile_mean

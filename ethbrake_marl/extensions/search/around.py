@@ -8,7 +8,7 @@ import numpy as np
 
 from ethbrake_marl.agents.driving import record_commands
 from ethbrake_marl.agents.protocol import Agent, AgentAround, Source, check_agent, fixed_commands
-from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.engine.memory import Memory
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import check_whole_number

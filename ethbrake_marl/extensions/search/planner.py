@@ -10,7 +10,7 @@ import numpy as np
 
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
 from ethbrake_marl.agents.protocol import Agent, Source, fixed_commands
-from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.engine.memory import Memory, renew_memory, take_memory
 from ethbrake_marl.engine.profiles import TIME_STEP_S, ProfileProblem, Profiles, profile_problem
 from ethbrake_marl.engine.scripts import Script

@@ -8,8 +8,9 @@ import numpy as np
 
 from ethbrake_marl.agents.driving import record_commands
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Source, fixed_commands
-from ethbrake_marl.agents.registry import AgentSettings, make_agent
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.engine.memory import Memory
 from ethbrake_marl.engine.profiles import TIME_STEP_S, ProfileProblem, Profiles
 from ethbrake_marl.engine.scripts import Script

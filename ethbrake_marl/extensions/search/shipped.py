@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent, Source
-from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.engine.profiles import ProfileProblem, Profiles
 from ethbrake_marl.extensions.search.best_harm import task_problem
 from ethbrake_marl.extensions.search.recall import BestHarm

@@ -308,7 +308,7 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
     """Measure the worlds of a file once more, and compare. Exit status 1 if one is worse or could not be driven."""
     import numpy as np
 
-    from ethbrake_marl.agents.registry import parse_spec
+    from ethbrake_marl.agents.spec import parse_spec
     from ethbrake_marl.extensions.studies.named_worlds import NamedWorlds
     from ethbrake_marl.extensions.studies.weakness import Measure
     from ethbrake_marl.scenario.sample import Sample

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.envs.gymnasium import EthBrakeEnv
 from ethbrake_marl.envs.pettingzoo import parallel_env
 from ethbrake_marl.errors import UnknownName

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.extensions.certified.options import checked_uncertainty
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty

@@ -1,4 +1,4 @@
-"""Recorded motion of an engine's worlds, so that every moment can be shown exactly; and the viewer that shows it.
+"""``Trace``: recorded motion of an engine's worlds, so that every moment can be shown exactly.
 
 Between two decisions, the motion follows from the state and the command alone, so each moment is advanced from the
 beginning of its step. A ``Trace`` watches the engine; without a ``Trace`` nothing is recorded and nothing costs time.
@@ -6,9 +6,8 @@ beginning of its step. A ``Trace`` watches the engine; without a ``Trace`` nothi
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -18,17 +17,14 @@ from ethbrake_marl.envs.rendering import (
     BEHIND_M,
     BODY_M,
     FLASH_S,
-    HEIGHT,
     LATE_S,
     LEAST_WIDTH_M,
-    WIDTH,
-    Frame,
     Scene,
     Struck,
     View,
     follow,
 )
-from ethbrake_marl.errors import InvalidInput, check_whole_number, need
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.left_out import ImpactRows
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
@@ -189,141 +185,3 @@ def _rows(worlds: Worlds, command: Floats, until_s: Floats) -> ImpactRows:
     rows = advance(worlds, command, until_s=until_s, record=True)[1].rows
     assert rows is not None  # because of ``record=True``
     return rows
-
-
-# ``render()`` of every interface: modes, frames, and the window.
-
-
-class Window:
-    """Window of ``render_mode="human"``. It opens with its first frame, and stays closed after the user closes it.
-
-    A copy is a separate window. Raises ``MissingExtra`` if pygame is missing.
-    """
-
-    def __init__(self) -> None:
-        need("pygame")
-        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # no greeting on import
-        import pygame
-
-        self._pygame: Any = pygame
-        self._screen: Any = None
-        self._clock: Any = None
-        self.closed_by_user = False  # reset when an episode begins
-
-    def __reduce__(self) -> tuple[type[Window], tuple[()]]:
-        return Window, ()
-
-    def show(self, frame: Frame, fps: float) -> None:
-        """Show a frame [H, W, 3] for 1/fps seconds. Raise ``InvalidInput`` if there is no display."""
-        if self.closed_by_user:
-            return
-        pygame = self._pygame
-        if self._screen is None:
-            try:
-                pygame.display.init()
-                self._screen = pygame.display.set_mode((WIDTH, HEIGHT))
-            except pygame.error as error:
-                raise InvalidInput(
-                    f"render_mode = 'human': no window can be opened here ({error}); 'rgb_array' needs no display"
-                ) from None
-            pygame.display.set_caption("EthBrake")
-            self._clock = pygame.time.Clock()
-        self._screen.blit(pygame.image.frombuffer(frame.tobytes(), (WIDTH, HEIGHT), "RGB"), (0, 0))
-        pygame.display.flip()
-        self._clock.tick(fps)
-        if any(event.type == pygame.QUIT for event in pygame.event.get()):
-            self.close()
-            self.closed_by_user = True
-
-    def close(self) -> None:
-        """Close the window, if it is open."""
-        if self._screen is not None:
-            self._pygame.display.quit()
-            self._screen = self._clock = None
-
-
-SMOOTH_FPS = 50  # frames per second in the window and from ``step_frames``
-
-
-class Viewer:
-    """Show the running episodes of an engine. The window's library is imported only for mode ``human``.
-
-    Args:
-        engine: the engine to show, from its next reset on.
-        mode: a render mode of the interface, or None: nothing is recorded, and nothing can be shown.
-        batch: whether the interface has many worlds, and shows each of them.
-
-    Raises ``InvalidInput`` for another mode, ``MissingExtra`` for ``human`` if pygame is missing.
-
-    """
-
-    METADATA: ClassVar[dict[str, Any]] = {  # defaults of a class; each environment has its own fps
-        "render_modes": ["human", "rgb_array", "rgb_array_list", "ansi"],
-        "render_fps": 10,
-    }
-
-    def __init__(self, engine: Engine, mode: str | None, *, batch: bool = False) -> None:
-        self.modes: list[str] = ["rgb_array", "ansi"] if batch else self.METADATA["render_modes"]
-        if mode is not None and mode not in self.modes:
-            known = ", ".join(map(repr, self.modes))
-            raise InvalidInput(f"render_mode = {mode!r}: must be {known}, or None")
-        self.mode = mode
-        self._engine, self._batch = engine, batch
-        self._window = Window() if mode == "human" else None
-        self._trace = None if mode is None else Trace(engine, whole=mode == "rgb_array_list")
-        self._shown = 0  # number of motions of the running episode that a list of frames has already shown
-
-    @property
-    def metadata(self) -> dict[str, Any]:
-        """``render_modes``, and the ``render_fps`` at which one frame per step plays in real time."""
-        fps = 1.0 / self._engine.scenario.time_step_s
-        return {"render_modes": list(self.modes), "render_fps": round(fps) if abs(fps - round(fps)) < 1e-9 else fps}
-
-    def began(self) -> None:
-        """Handle the start of an episode: begin a new list of frames, and show the time up to the first decision."""
-        self._shown = 0
-        if self._window is not None:
-            self._window.closed_by_user = False
-            self.play()
-
-    def play(self) -> None:
-        """Show the last step in the window, in real time; do nothing in other modes."""
-        if self._window is not None:
-            for frame in self.step_frames():
-                self._window.show(frame, SMOOTH_FPS)
-
-    def render(self) -> Any:
-        """Return the frame, list of frames or text of the mode, for each world of a batch.
-
-        Returns None for ``human``, where every step is shown in the window anyway.
-        """
-        motions = self._motions(f"render: made with render_mode=None; give one of {', '.join(self.modes)}")
-        if self.mode == "human":
-            return None
-        if self.mode == "rgb_array_list":  # one frame for the beginning and for each step not in an earlier list
-            new, self._shown = motions[self._shown :], len(motions)
-            return [motion.scenes(self._engine, 0)[-1].frame() for motion in new]
-        scenes = [motions[-1].scenes(self._engine, k)[-1] for k in range(self._engine.n)]
-        shown = tuple(scene.text() if self.mode == "ansi" else scene.frame() for scene in scenes)
-        return shown if self._batch else shown[0]
-
-    def step_frames(self, fps: float = SMOOTH_FPS) -> list[Frame]:
-        """Return the frames [H, W, 3] from the last decision, or the alert, up to now, at ``fps`` per second.
-
-        Raises ``InvalidInput`` before the first reset, with render_mode=None, and for an ``fps`` below 1.
-        """
-        check_whole_number("step_frames: fps", fps, 1)
-        motion = self._motions("step_frames: made with render_mode=None; give 'rgb_array'")[-1]
-        start, until = float(motion.start.time_s[0]), float(motion.until_s[0])
-        times: Floats = np.linspace(start, until, max(round((until - start) * fps), 1) + 1)[1:]  # includes the end
-        return [scene.frame() for scene in motion.scenes(self._engine, 0, times)]
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._window is not None:
-            self._window.close()
-
-    def _motions(self, refusal: str) -> Memory:
-        if self._trace is None:
-            raise InvalidInput(f"{refusal} when it is made")
-        return self._trace.motions(self._engine)
