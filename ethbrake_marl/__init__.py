@@ -92,11 +92,10 @@ if TYPE_CHECKING:
 
     # Your own parts
     from ethbrake_marl.agents.registry import register_agent as register_agent
-    from ethbrake_marl.evaluation.own_measures import register_measure as register_measure
+    from ethbrake_marl.game.measures import register_measure as register_measure
     from ethbrake_marl.training.recipe import register_algorithm as register_algorithm
     from ethbrake_marl.game.objectives import register_objective as register_objective
     from ethbrake_marl.game.features import register_feature as register_feature
-    from ethbrake_marl.game.rewards import register_term as register_term
     from ethbrake_marl.scenario.catalogue import register_scenarios as register_scenarios
     from ethbrake_marl.scenario.channel import register_preset as register_preset
     from ethbrake_marl.registry import Part as Part

@@ -1,4 +1,4 @@
-"""Registries of parts by name: agents, shields, measures, reward terms, features, objectives, algorithms, commands.
+"""Registries of parts by name: agents, shields, measures, features, objectives, algorithms, commands.
 
 There is one registry per kind of part. A running program adds a part with a ``register_...`` function. An installed
 package adds one with an entry point in its ``pyproject.toml``; this package registers its own extensions in the same
@@ -112,8 +112,11 @@ class Registry(Mapping[str, T]):
             raise InvalidInput(f"{self.kind} {name!r}: {why}")
         return self.loaded[name]
 
-    def load(self, name: str) -> None:
-        """Load the part with this name if it is not loaded yet. Raise ``UnknownName`` if there is none."""
+    def load(self, name: str) -> list[str]:
+        """Load the part with this name if it is not loaded yet, and return the names of all parts it stands for.
+
+        Raise ``UnknownName`` if there is none.
+        """
         given = points(self.group).get(name, [])
         givers = [OURS] * (name in self._built_in) + [giver(point) for point in given]
         if len(givers) > 1:
@@ -121,16 +124,16 @@ class Registry(Mapping[str, T]):
                 f"{self.kind} {name!r}: the installed packages {' and '.join(givers)} give it; uninstall all but one"
             )
         if name in self.loaded or name in self._loading:
-            return
+            return [name]
         if not given:
             raise self.unknown(name)
         self._loading.add(name)
         try:
-            self._load(name, given[0])
+            return self._load(name, given[0])
         finally:
             self._loading.discard(name)
 
-    def _load(self, name: str, point: EntryPoint) -> None:
+    def _load(self, name: str, point: EntryPoint) -> list[str]:
         where = f"{self.kind} {name!r}, {point.value} of the installed package {giver(point)}"
         try:
             with naming_extras():
@@ -141,13 +144,15 @@ class Registry(Mapping[str, T]):
             raise InvalidInput(f"{where}: cannot be imported: {describe_error(error)}") from error
         try:
             # An entry point that defines several parts is a dictionary of them.
-            for each, part in (found if isinstance(found, dict) else {name: found}).items():
+            parts = found if isinstance(found, dict) else {name: found}
+            for each, part in parts.items():
                 given, settings = (part.given, part.settings) if isinstance(part, Part) else ((part,), {})
                 self._register(each, *given, **settings)
         except (EthBrakeError, TypeError) as error:
             raise InvalidInput(f"{where}: {error}") from error
         if point.dist is not None and giver(point) != OURS:
             _VERSIONS[giver(point)] = point.dist.version
+        return list(parts)
 
     def add(self, name: str, part: T, is_same: Callable[[T], bool]) -> None:
         """Add a part under ``name``. Raise ``AlreadyExists`` if the name has another part.

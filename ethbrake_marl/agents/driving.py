@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,6 +15,7 @@ from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.memory import Memory
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.game.harm import Ledger
+from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.state import Bools, Floats, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 
@@ -28,19 +29,30 @@ class Episodes:
     at_rest: Bools  # [n] whether the line came to rest; otherwise the episode ended at the horizon
     guarded: Any  # memory of the shield at the end; None without a shield
     memories: Mapping[int, Memory]  # controlled vehicle -> memory of its agent at the end
+    terms: Mapping[str, Floats] = field(default_factory=dict)  # reward terms summed over the episodes, [n] or [n, N]
 
     @classmethod
-    def of(cls, engine: Engine, worlds: Worlds, watched_by: Sequence[Watch] = ()) -> Episodes:
+    def of(
+        cls, engine: Engine, worlds: Worlds, watched_by: Sequence[Watch] = (), summed: Sequence[str] = ()
+    ) -> Episodes:
         """Run an ``episode_engine`` from the first decision in ``worlds`` to the end; raise ``PhysicsError``."""
         at_rest = np.zeros(worlds.n, np.bool_)
+        terms: dict[str, Floats] = {}
         now = _show(watched_by, worlds, engine, engine.worlds.command_mps2)
-        while not engine.ended.all():
-            at_rest |= engine.step({}).terminated
+        standing = engine.ended
+        while not standing.all():
+            step = engine.step({})
+            at_rest |= step.terminated
+            for name in summed:
+                term = step.terms[name]
+                running = np.where(standing if term.ndim == 1 else standing[:, np.newaxis], 0.0, term)
+                terms[name] = terms.get(name, 0.0) + running
             now = _show(watched_by, now, engine, engine.wanted_mps2.copy())
+            standing = engine.ended
         if engine.roster.failed:
             raise PhysicsError(engine.roster.failed)
         memories = {i: memory for i, memory in engine.memories.items() if i in engine.deciders}
-        return cls(engine.ledger, engine.worlds, at_rest, engine.guarded, memories)
+        return cls(engine.ledger, engine.worlds, at_rest, engine.guarded, memories, terms)
 
 
 class Watch(Protocol):
@@ -61,7 +73,9 @@ def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | Non
     return {i: make_role(scenario, i) for i in scenario.scripts if i not in left_out}
 
 
-def episode_engine(worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None) -> Engine:
+def episode_engine(
+    worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None, reward: Reward = "harm"
+) -> Engine:
     """Return an engine over ``worlds`` in which ``agent`` drives ``vehicle``, or a team drives its vehicles.
 
     The other vehicles follow their scripts. The agents decide when their first vehicle's latency has elapsed and every
@@ -83,11 +97,12 @@ def episode_engine(worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: i
     shield = team.shield
     if shield is None:
         engine = Engine(
-            scenario, worlds.n, learners=(), scripts={**scripts, **drivers}, deciders=tuple(drivers), worlds=worlds
-        )
+            scenario, worlds.n, learners=(), scripts={**scripts, **drivers}, reward=reward, deciders=tuple(drivers),
+            worlds=worlds,
+        )  # fmt: skip
     else:
         engine = Engine(
-            scenario, worlds.n, learners=tuple(drivers), scripts=scripts, worlds=worlds,
+            scenario, worlds.n, learners=tuple(drivers), scripts=scripts, reward=reward, worlds=worlds,
             guard=lambda engine: shield.guard(engine, drivers),
         )  # fmt: skip
         engine.check_time_step(drivers)
@@ -96,15 +111,18 @@ def episode_engine(worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: i
 
 
 def drive(
-    worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None, *, watched_by: Sequence[Watch] = ()
-) -> Episodes:
+    worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None, *,
+    watched_by: Sequence[Watch] = (), summed: Sequence[str] = (),
+) -> Episodes:  # fmt: skip
     """Let ``agent`` drive ``vehicle``, or a team its vehicles, in every world from t = 0 to the end of its episode.
 
-    ``watched_by`` sees every step. Raises ``PhysicsError`` with all worlds that could not be advanced; the others are
-    valid without them.
+    ``watched_by`` sees every step. ``summed`` names reward terms to sum over the episodes, with the default settings of
+    ``RewardParams``. Raises ``PhysicsError`` with all worlds that could not be advanced; the others are valid without
+    them.
     """
-    engine = episode_engine(worlds, agent, scenario, vehicle)
-    return Episodes.of(engine, scenario.play_pieces(worlds, engine.deciders), watched_by)
+    reward: Reward = {"harm": 1.0} | dict.fromkeys(summed, 1.0) if summed else "harm"
+    engine = episode_engine(worlds, agent, scenario, vehicle, reward)
+    return Episodes.of(engine, scenario.play_pieces(worlds, engine.deciders), watched_by, summed)
 
 
 def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_mps2: Floats) -> Worlds:

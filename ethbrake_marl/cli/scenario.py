@@ -262,22 +262,21 @@ def scenario_new(
 def scenario_parts(as_json: JsonOption = False) -> None:
     """List the names that scenarios and recipes may use.
 
-    Reward terms, features of observations, V2X presets, objectives, training algorithms, recipes and measures.
+    Features of observations, V2X presets, objectives, training algorithms, recipes and measures, which rewards weigh.
     """
     from ethbrake_marl.game.features import FEATURES
+    from ethbrake_marl.game.measures import MEASURES
     from ethbrake_marl.game.objectives import OBJECTIVES
-    from ethbrake_marl.game.rewards import TERMS
 
     features = FEATURES.usable().items()
     own = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in features]
     parts = {
-        "Reward terms": [*TERMS],
         "Observation": ["own", "front_K", "rear_K", "role", "obstacle", *own],
         "V2X presets": [*scenarios.CHANNELS],
         "Objectives": [kind.form for kind in OBJECTIVES.usable().values()],
         "Algorithms": [*training.algorithm_names()],
         "Recipes": [*training.TrainingRecipe.shipped()],
-        "Measures": [*evaluation.MEASURES],
+        "Measures": [*MEASURES],
     }
     with Out(as_json=as_json) as out:
         out.result(

@@ -60,7 +60,7 @@ class Step(NamedTuple):
     reward: Floats  # [n, N] reward of each vehicle
     outcome: Floats  # [OUTCOME_ROWS, n] raw results of the kernel; use the properties to read them
     params: RewardParams
-    further: dict[str, Floats]  # unweighted reward terms that differ between vehicles or need the motion, each [n, N]
+    further: dict[str, Floats]  # unweighted reward terms that need more than the step's facts, each [n] or [n, N]
 
     @property
     def terminated(self) -> Bools:
@@ -101,6 +101,11 @@ class Step(NamedTuple):
     def shared(self) -> dict[str, Floats]:
         """Unweighted reward terms that are the same for all vehicles of a world, each [n]."""
         return self.params.shared(self.counted_harm, self.outcome[SAFE_END])
+
+    @property
+    def terms(self) -> dict[str, Floats]:
+        """Every unweighted reward term, each [n], the same for all vehicles, or [n, N]."""
+        return self.shared | self.further
 
     @property
     def counted_harm(self) -> Floats:

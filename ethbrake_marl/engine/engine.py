@@ -31,6 +31,7 @@ from ethbrake_marl.errors import InvalidInput, UncertifiedStep, renumbered
 from ethbrake_marl.game.actions import checked_action
 from ethbrake_marl.game.definition import Game
 from ethbrake_marl.game.harm import Ledger, empty_ledger
+from ethbrake_marl.game.impacts import EpisodeImpacts
 from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec, Plan
 from ethbrake_marl.game.observed import common_observation, observations_of
 from ethbrake_marl.game.rewards import Reward
@@ -168,7 +169,7 @@ class Engine:
         self.deciders = self.learners if deciders is None else tuple(deciders)
         if not set(self.deciders) <= set(range(scenario.vehicles)):
             raise InvalidInput(f"engine: deciders {self.deciders} must be from 0 to {scenario.vehicles - 1}")
-        self._terms = Terms(reward, scenario, self.learners)
+        self._terms = Terms(reward, scenario, self.deciders)
         self.reward = self._terms.params
         self.observations = observations_of(scenario, observation)  # of each vehicle
         self._plans = tuple(each.plan for each in self.observations)
@@ -359,7 +360,7 @@ class Engine:
     @property
     def _nobody_refuses_episodes(self) -> bool:
         """Whether nothing can fail when episodes begin: then they begin in the arrays that are there."""
-        return not (self._now.watched or self._remembering or self.guard)
+        return not (self._now.watched or self._remembering or self.guard or self._terms.count_impacts)
 
     def cut(self, step: Step, most_steps: int) -> None:
         """Truncate the episodes that have taken ``most_steps`` with the last ``step``, here and in what that tells."""
@@ -405,6 +406,8 @@ class Engine:
         """Advance every running episode by one time step, in the arrays that are there."""
         asked = self._ask_scripts()
         harm_before = self._terms.objective_harm(self.state) if self._terms.by_objective else None
+        impacts = self.state.impacts
+        start = None if impacts is None else self.worlds
         step, some_failed = self._move(columns)
         if asked:
             self._change(memories=self.memories | asked)
@@ -412,8 +415,12 @@ class Engine:
             times = self.state.motion[:, 0]
             self.roster.mark(step.failed, times, np.minimum(times + self.scenario.time_step_s, self.scenario.horizon_s))
         if self._terms.add_something:
+            if impacts is not None and start is not None:
+                moved = start.time_s < self.state.time_s
+                self._change(impacts=impacts.and_then(self.segments(start, self.wanted_mps2), moved))
             worlds = self.worlds if self.reward.shaping > 0.0 else None
-            self._now = self._now._replace(state=self._terms.add(step, self.state, self.scenario, harm_before, worlds))
+            state = self._terms.add(step, self.state, self.scenario, harm_before, impacts, worlds)
+            self._now = self._now._replace(state=state)
         return step
 
     def _change(self, **fields: Any) -> None:
@@ -511,6 +518,11 @@ class Engine:
             start_s = self.state.time_s[rows]
             hear_rows(at_alert, heard, wanted[rows], start_s, start_s, self.scenario.time_step_s, rules.pieces)
             params[rows] = heard
+        if self._terms.count_impacts:
+            alert, now, before = start.alert, self.worlds, self.state.impacts
+            impacts = EpisodeImpacts.of(alert) if before is None else before.renewed(rows, alert)
+            since_alert = self.segments(now.assign(rows, alert), now.command_mps2)
+            self._change(impacts=impacts.and_then(since_alert, np.isin(np.arange(self.n), rows)))
         if self.reward.shaping > 0.0:
             potential[rows] = self._terms.potentials(rules.unpack(Packed(motion[rows], params[rows])), self.scenario)
 
@@ -533,6 +545,8 @@ class Engine:
         arrays: Arrays = {name: array.copy() for name, array in zip(SNAPSHOT, self.state, strict=False)}
         arrays["stream"] = np.array([self.seed, self._now.stream.position], np.uint64)
         arrays["numbers"] = self.roster.numbers.copy()
+        if self.state.impacts is not None:
+            arrays |= self.state.impacts.arrays()
         return arrays | {f"script.{name}": array for name, array in flat(self.memories).items()}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -551,9 +565,10 @@ class Engine:
             if have is None or have.shape != needed:
                 shape = "nothing" if have is None else have.shape
                 raise InvalidInput(f"engine snapshot: {name} is {shape}; {needed} is needed")
+        impacts = self.state.impacts and self.state.impacts.read(arrays)
         memories = {vehicle: checked_memory(unflat(arrays, f"script.{vehicle}"), self.n) for vehicle in self.memories}
         motion, params, clock, moving, potential = (np.array(arrays[name], np.float64) for name in SNAPSHOT)
-        state = State(motion, params, clock, moving, potential, memories, self.guarded)
+        state = State(motion, params, clock, moving, potential, memories, self.guarded, impacts)
         seed, taken = (int(number) for number in arrays["stream"])
         stream, roster = copy.copy(self._now.stream), Roster(self.n, seed, None)
         stream.restart(seed, taken)
@@ -573,6 +588,9 @@ class Engine:
         ``InvalidInput`` for another number of worlds or vehicles.
         """
         state = self.state
+        if state.impacts is not None:
+            names = ", ".join(self.reward.terms)
+            raise InvalidInput(f"place: reward: {names} needs every impact, which is not known of worlds placed here")
         if worlds.speeds_mps.shape != state.wanted.shape:
             n, N = state.wanted.shape
             raise InvalidInput(f"place: {worlds.n} worlds of {worlds.N} vehicles; {n} of {N} needed")

@@ -10,6 +10,7 @@ from ethbrake_marl.engine.compiled_step import ENDED, STEP
 from ethbrake_marl.engine.memory import Memory, map_memory, take_memory
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.harm import Ledger
+from ethbrake_marl.game.impacts import EpisodeImpacts
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.state import Bools, Floats, Ints
 
@@ -24,6 +25,7 @@ class State(NamedTuple):
     potential: Floats  # [n, N] of a shaped reward; else 0
     memories: dict[int, Memory]  # by vehicle, of the scripts that remember; never changed in place
     guarded: Any = None  # memory of the engine's guard; None without one
+    impacts: EpisodeImpacts | None = None  # so far, where a measure of them is rewarded; never changed in place
 
     @property
     def packed(self) -> Packed:
@@ -55,17 +57,20 @@ class State(NamedTuple):
     def copy(self) -> State:
         """The same state in arrays of its own; memories are never changed in place."""
         motion, params, clock, wanted, potential = (array.copy() for array in self[:5])
-        return State(motion, params, clock, wanted, potential, self.memories, self.guarded)
+        return State(motion, params, clock, wanted, potential, self.memories, self.guarded, self.impacts)
 
     def take(self, rows: Ints) -> State:
         """Some of the rows, or one of them several times."""
         guarded = None if self.guarded is None else self.guarded.take(rows)
         motion, params, clock, wanted, potential, memories = take_memory(self[:6], rows)
-        return State(motion, params, clock, wanted, potential, memories, guarded)
+        impacts = None if self.impacts is None else self.impacts.take(rows)
+        return State(motion, params, clock, wanted, potential, memories, guarded, impacts)
 
     @staticmethod
     def join(states: list[State]) -> State:
         """The rows of all of them, one after the other; all are of one engine without a guard."""
         if states[0].guarded is not None:
             raise InvalidInput("moments: a shield stands in their engine; what it remembers is not joined")
-        return State(*map_memory(lambda *parts: np.concatenate(parts), *(state[:6] for state in states)))
+        joined = State(*map_memory(lambda *parts: np.concatenate(parts), *(state[:6] for state in states)))
+        impacts = [state.impacts for state in states if state.impacts is not None]
+        return joined._replace(impacts=EpisodeImpacts.join(impacts) if impacts else None)

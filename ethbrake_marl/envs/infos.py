@@ -93,7 +93,7 @@ class Report(NamedTuple):
         cost = np.zeros(len(world))
         terms = dict.fromkeys(engine.reward_terms, cost)
         if step is not None:
-            every = step.shared | step.further
+            every = step.terms
             terms = {name: every[name] for name in engine.reward_terms}
             cost = step.counted_harm
             if rows is not None:

@@ -39,12 +39,7 @@ if TYPE_CHECKING:
     )
     from ethbrake_marl.evaluation.motion import EpisodeMotion as EpisodeMotion, follow_episodes as follow_episodes
     from ethbrake_marl.evaluation.outcome import LeftOut as LeftOut, Outcome as Outcome
-    from ethbrake_marl.evaluation.own_measures import (
-        MEASURES as MEASURES,
-        REGISTERED as REGISTERED,
-        load_measures as load_measures,
-        register_measure as register_measure,
-    )
+    from ethbrake_marl.evaluation.own_measures import load_measures as load_measures
     from ethbrake_marl.evaluation.per_world import (
         read_result as read_result,
         results_to_json as results_to_json,

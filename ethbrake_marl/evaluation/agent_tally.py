@@ -14,9 +14,10 @@ import numpy as np
 
 from ethbrake_marl.evaluation.measures import BASELINE, Measure, MeasureSet, every_set
 from ethbrake_marl.evaluation.outcome import COLUMN, Outcome, Values
-from ethbrake_marl.evaluation.own_measures import REGISTERED, registered_measure
+from ethbrake_marl.evaluation.own_measures import registered_measure
 from ethbrake_marl.evaluation.statistics import Moments, exact_sum, rate
 from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.game.measures import REPORTED
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +105,7 @@ def estimate_all(
     """Return the estimate of every measure of one agent; None for a measure that some ``worlds`` lack."""
     own = tallies[agent]
     columns = [name.removeprefix(COLUMN) for name in (*own.counts, *own.moments) if name.startswith(COLUMN)]
-    registered = list(REGISTERED.values())
+    registered = list(REPORTED.values())
     columns.sort(key=lambda column: registered.index(each) if (each := registered_measure(column)) else len(registered))
     return {
         measure.name: _estimate(measure, own, tallies.get(each.baseline or baseline), worlds, each.whole)

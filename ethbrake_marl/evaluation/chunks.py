@@ -23,12 +23,13 @@ from ethbrake_marl.evaluation.identity import CHUNK, own_versions, policies_of, 
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.measures import MEASURE_SETS, silent_in_long_lists
 from ethbrake_marl.evaluation.outcome import Outcome
-from ethbrake_marl.evaluation.own_measures import LOADED, REGISTERED, load_measures
+from ethbrake_marl.evaluation.own_measures import LOADED, load_measures
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise_sums
 from ethbrake_marl.evaluation.tally import Tally
 from ethbrake_marl.files.python_file import file_sha256
 from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.game.measures import REPORTED
 from ethbrake_marl.parallel import Call, run_each
 from ethbrake_marl.registry import versions_used
 from ethbrake_marl.scenario.sample import Sample
@@ -78,7 +79,7 @@ class Lineup:
         """
         load_measures(how.pop("measures", ()))
         sets = tuple(name for name, _ in MEASURE_SETS.items())  # loads them, so that their versions are known
-        lineup = cls(tuple(agents), scenario, measures=tuple(LOADED), told=tuple(REGISTERED), sets=sets, **how)
+        lineup = cls(tuple(agents), scenario, measures=tuple(LOADED), told=tuple(REPORTED), sets=sets, **how)
         made = lineup._make_anew()
         same = lineup._same(made)
         _MADE.clear()
@@ -90,9 +91,7 @@ class Lineup:
         if self.same not in _MADE:
             load_measures(self.measures)
             made = self._make_anew()
-            same = (
-                self._same(made) == self.same and {*self.told} <= REGISTERED.keys() and {*self.sets} <= {*MEASURE_SETS}
-            )
+            same = self._same(made) == self.same and {*self.told} <= REPORTED.keys() and {*self.sets} <= {*MEASURE_SETS}
             if not same or any(_installed(name) != used for name, used in self.packages.items()):
                 raise InvalidInput(
                     "evaluate: a worker has other policies, measures or versions than the process that asks it;"

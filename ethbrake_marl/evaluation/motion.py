@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ethbrake_marl.agents.driving import Episodes, episode_engine
 from ethbrake_marl.agents.protocol import Driver, Team
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.evaluation.impacts import Tape
+from ethbrake_marl.evaluation.tape import Tape
 from ethbrake_marl.game.harm import HARM_COUNTS, Ledger
 from ethbrake_marl.physics.left_out import ImpactRows
 from ethbrake_marl.physics.state import Floats, Worlds
@@ -84,12 +84,9 @@ class _Follower(Tape):
     def motions(self, episodes: Episodes) -> list[EpisodeMotion]:
         """Return the recorded motion of each world."""
         n, N = self.worlds.n, self.worlds.N
-        impacts, pieces = self.impacts(), self._pieces()
-        ends = np.searchsorted(impacts.world, np.arange(n + 1))
+        impacts, pieces = self.episodes(), self._pieces()
         found = []
         for k in range(n):
-            mine = slice(*ends[k : k + 2])
-            rows = ImpactRows(*(getattr(impacts, f.name)[mine] for f in fields(ImpactRows)))
             ledger = episodes.ledger.take([k])
             final, taken_over = episodes.final.take([k]), list(self._stepped_in[k])
             chosen = [memory["chosen_policy"][k] for i, memory in episodes.memories.items() if i in self._hybrids]
@@ -100,7 +97,7 @@ class _Follower(Tape):
                     self.worlds.take([k]),
                     join_pieces(pieces[k], N),
                     float(final.time_s[0]),
-                    replace(rows, world=np.zeros_like(rows.world)),
+                    impacts.take(np.array([k])).rows,
                     np.array(sorted(taken_over)),
                     ledger,
                     final,

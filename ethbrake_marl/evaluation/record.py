@@ -15,8 +15,8 @@ import numpy as np
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import InvalidInput, count_of
-from ethbrake_marl.evaluation.impacts import Tape
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
+from ethbrake_marl.evaluation.tape import Tape
 from ethbrake_marl.game.harm import HARM_COUNTS, Ledger
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.left_out import ImpactRows
@@ -89,8 +89,8 @@ def record_episode(
     samples = list(_samples(tape.steps, sample_s))
     time, gaps, speeds, positions, command = (np.concatenate(column) for column in zip(*samples, strict=True))
     return EpisodeRecord(
-        agent.name, scenario, driven, world, time, gaps, speeds, positions, command, tape.impacts(), episodes.ledger,
-        bool(episodes.at_rest[0]),
+        agent.name, scenario, driven, world, time, gaps, speeds, positions, command, tape.episodes().rows,
+        episodes.ledger, bool(episodes.at_rest[0]),
     )  # fmt: skip
 
 

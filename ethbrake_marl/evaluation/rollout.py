@@ -29,10 +29,11 @@ from ethbrake_marl.evaluation.aftermath import SampledHarm, ShovedFront
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.familiar import warn_unfamiliar
 from ethbrake_marl.evaluation.identity import CHUNK, EPISODES, LIST_SEED, policies_of
-from ethbrake_marl.evaluation.impacts import Tape
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.outcome import LeftOut, Outcome
-from ethbrake_marl.evaluation.own_measures import REGISTERED, measure_impacts
+from ethbrake_marl.evaluation.own_measures import measure_columns
+from ethbrake_marl.evaluation.tape import Tape
+from ethbrake_marl.game.measures import REPORTED
 from ethbrake_marl.physics.left_out import leaving_out_failed
 from ethbrake_marl.physics.state import Ints, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
@@ -204,14 +205,16 @@ def _roll_out(
     task = Task(scenario, tuple(team.drivers))
     shoved = ShovedFront.of(worlds, task) if aftermath else None
     sampled = SampledHarm.of(worlds, task) if aftermath else None
-    impacts = Tape(worlds, steps=False) if aftermath and REGISTERED else None
-    episodes = drive(worlds, team, scenario, watched_by=[w for w in (shoved, sampled, impacts) if w is not None])
+    by_step = [measure.name for measure in REPORTED.values() if measure.by == "step" and aftermath]
+    impacts = Tape(worlds, steps=False) if aftermath and len(REPORTED) > len(by_step) else None
+    watches = [w for w in (shoved, sampled, impacts) if w is not None]
+    episodes = drive(worlds, team, scenario, watched_by=watches, summed=by_step)
     outcome = outcome_of(team, episodes)
     return replace(
         outcome,
         shoved_m=None if shoved is None else shoved.metres,
         sampled_harm=None if sampled is None else sampled.finish(),
-        metrics={} if impacts is None else measure_impacts(impacts.episodes()),
+        metrics=measure_columns(episodes.terms, None if impacts is None else impacts.episodes()) if aftermath else {},
     )
 
 

@@ -81,7 +81,7 @@ class SummaryTable(list[SummaryRow]):
         """Return the explanation of each column, by the beginning of its heading; registered measures come last."""
         about = {each.heading.partition(",")[0]: each.about for each in measures() if each.about and each.heading}
         own = [registered_measure(column) for column in self[0].metrics] if self else []
-        return _HEAD | about | {metric.name: metric.about for metric in own if metric is not None}
+        return _HEAD | about | {metric.name: metric.meaning for metric in own if metric is not None}
 
     def sheet(self) -> Sheet:
         """Return the table: agent, its knowledge, and every measure that has a heading; registered measures come last.

@@ -18,6 +18,7 @@ from ethbrake_marl.files.json_schema import FileSchema, schema_lines
 from ethbrake_marl.files.model import NAME_PATTERN, FileModel, Wording, read_model, refuse
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 from ethbrake_marl.game.features import ListedFeatures, listed_features
+from ethbrake_marl.game.measures import MEASURES
 from ethbrake_marl.game.rewards import RewardParams, setting_names
 from ethbrake_marl.policies.network_spec import Activation, NetworkSpec
 from ethbrake_marl.registry import Registry
@@ -269,7 +270,7 @@ class TrainingRecipe(FileModel):
     def json_schema() -> dict[str, Any]:
         """Return the JSON Schema of a recipe file, for editors that complete and check YAML.
 
-        The allowed keys depend on ``algorithm``. Registered algorithms and reward terms are included.
+        The allowed keys depend on ``algorithm``. Registered algorithms and measures are included.
         """
         classes = {name: recipe for name, (recipe, _) in ALGORITHMS.usable().items()}
         places, whole = models_json_schema(
@@ -279,9 +280,9 @@ class TrainingRecipe(FileModel):
         for name, recipe in classes.items():
             keys = parts[str(places[recipe, "validation"]["$ref"]).rpartition("/")[2]]["properties"]
             keys["algorithm"] |= {"description": key_meanings(recipe)["algorithm"], "const": name}
-        weight = {"type": "number", "minimum": 0, "description": "weight of a registered term"}
+        weight = {"type": "number", "description": "weight of a registered measure"}
         properties = parts["RewardParams"]["properties"]
-        properties |= {name: weight for name in setting_names() if name not in properties}
+        properties |= {name: weight for name in MEASURES.usable() if name not in properties}
         ways = [
             {
                 "if": {"properties": {"algorithm": {"const": name}}, "required": ["algorithm"]},
@@ -375,5 +376,5 @@ def _checked(source: Path | Document) -> TrainingRecipe:
 
 class _RecipeWording(Wording):
     def known(self, path: YamlPath) -> list[str]:
-        """Return the known keys at a path; below ``reward``, include the weights of registered terms."""
+        """Return the known keys at a path; below ``reward``, include the weights of registered measures."""
         return setting_names() if path[:-1] == ("reward",) else super().known(path)

@@ -29,7 +29,6 @@ from ethbrake_marl.evaluation.identity import scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.lineup import make_agents, make_lineup
 from ethbrake_marl.evaluation.measures import measures
 from ethbrake_marl.evaluation.outcome import Outcome
-from ethbrake_marl.evaluation.own_measures import MEASURES, REGISTERED
 from ethbrake_marl.evaluation.per_world import write_per_world
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk, evaluate
@@ -40,6 +39,7 @@ from ethbrake_marl.extensions.search.limit_measures import LIMITS
 from ethbrake_marl.extensions.search.limits import Unproven
 from ethbrake_marl.extensions.search.regret import limits_of
 from ethbrake_marl.files import python_file
+from ethbrake_marl.game.measures import REPORTED
 from ethbrake_marl.physics.paper_map import advance_sampled
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
@@ -417,7 +417,7 @@ def test_figures__are_the_same_bits_from_two_processes(paper_random: Scenario) -
 
 @pytest.mark.slow
 def test_worker__of_other_measures_is_refused(paper_random: Scenario, monkeypatch) -> None:
-    monkeypatch.setitem(REGISTERED, "here_alone", REGISTERED.get("here_alone"))
+    monkeypatch.setitem(REPORTED, "here_alone", REPORTED.get("here_alone"))
     lineup = Lineup.of(("full_brake",), paper_random)
     with pytest.raises(InvalidInput, match="a worker has other policies, measures or versions than the process"):
         tally_list(lineup, 6_000, 5, jobs=2)
@@ -432,7 +432,7 @@ def test_lineup__tells_the_measures_of_its_time_in_every_process(paper_random: S
 
     found = [told(each) for each in (before, *after)]
     assert found[0] == set() and found[1] == found[2] and "injury_lr4s" in found[1]
-    MEASURES.loaded.clear()  # as in a worker, which makes them in whatever order
+    REPORTED.clear()  # as in a worker, which makes them in whatever order
     for lineup, expected in zip((before, *after, before), (*found, found[0]), strict=True):
         monkeypatch.setattr(chunks, "_MADE", {})
         assert told(lineup) == expected

@@ -38,9 +38,7 @@ softer = "hills:softer"
 
 [project.entry-points."ethbrake_marl.measures"]
 worst = "hills:WORST"
-
-[project.entry-points."ethbrake_marl.rewards"]
-calm = "hills:calm"
+calm = "hills:CALM"
 
 [project.entry-points."ethbrake_marl.features"]
 urgency = "hills:URGENCY"
@@ -105,6 +103,7 @@ class PatientRecipe(PpoRecipe):
 
 
 WORST = eb.Part(worst, unit="m/s")
+CALM = eb.Part(calm, unit="m/s2", by="step")
 URGENCY = eb.Part(urgency, unit="m/s", scale=10.0, low=0.0, high=4.0)
 PATIENT = eb.Part(PatientRecipe, "ethbrake_marl.training.ppo:Ppo")
 
@@ -176,7 +175,7 @@ def test_entry_point__is_loaded_when_its_name_is_used(install: Install, capsys: 
 def test_entry_point__that_fails_is_named_and_breaks_nothing_else(
     install: Install, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    groups = ("agents", "measures", "rewards", "features", "objectives", "algorithms", "commands", "shields")
+    groups = ("agents", "measures", "features", "objectives", "algorithms", "commands", "shields")
     install("broken", "import nothing_of_this_name\n", **{group: {"hills": "broken:part"} for group in groups})
     told = "broken:part of the installed package broken: cannot be imported: ModuleNotFoundError: No module named"
     for use in (
