@@ -47,21 +47,21 @@ Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]
 
 
 class Watcher(Protocol):
-    """Looks on while an engine's episodes run, as the trace of a picture does; it changes nothing.
+    """Follow an engine's episodes without changing them, as the trace of a picture does.
 
-    What it remembers is kept by the engine beside the worlds (``Engine.memory``): both change in one piece, or, where
-    anything fails or is interrupted, neither does. A memory is therefore never changed in place.
+    The engine keeps the watcher's memory beside its state. Both change in one assignment, or, after an error or an
+    interrupt, neither does. So a watcher never changes its memory in place.
     """
 
     def begun(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
-        """The memory once episodes start in these rows; ``alert`` holds those worlds only, at t = 0."""
+        """Return the memory after episodes have started in ``rows``; ``alert`` holds only those worlds, at t = 0."""
 
     def stepped(self, memory: Any, before: Engine, after: Engine) -> Any:
-        """The memory once the engine, as it was ``before`` this step, is as ``after``."""
+        """Return the memory after a step that led the engine from ``before`` to ``after``."""
 
 
 class Ruling(NamedTuple):
-    """What a guard lets happen in one step, of n worlds and L learners."""
+    """Answer of a guard in one step, for n worlds and L learners."""
 
     proposed: Floats  # [n, L] actions; NaN: none, or no number
     applied: Floats  # [n, L] actions
@@ -72,28 +72,31 @@ class Ruling(NamedTuple):
 
 
 class Guard(Protocol):
-    """Stands between what is proposed to an engine and what is applied: a shield.
+    """A shield inside an engine: it replaces proposed actions by the actions that are applied.
 
-    It is asked inside ``Engine.step``, so nothing that reaches the engine passes it by. What it remembers is kept by
-    the engine: worlds, memory and ruling change in one piece, or, where anything fails or is interrupted, none does. A
-    memory is therefore never changed in place.
+    The engine calls it inside ``Engine.step``, so no action bypasses it. The engine keeps the guard's memory beside its
+    state. State, memory and ruling change in one assignment, or, after an error or an interrupt, none of them does. So a
+    guard never changes its memory in place.
     """
 
     def begin(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
-        """The memory once episodes start in these rows, None before; ``alert`` holds those worlds only, at t = 0."""
+        """Return the memory after episodes have started in ``rows``; ``alert`` holds only those worlds, at t = 0.
+
+        ``memory`` is None before the first episode.
+        """
 
     def decide(self, running: Engine, memory: Any, proposed: Floats) -> Ruling:
-        """What is applied instead of the actions [n, L]. A column of NaN: nothing was proposed for that learner."""
+        """Return the actions to apply instead of ``proposed`` [n, L]. A column of NaN: that learner proposed nothing."""
 
     def check(self, ruling: Ruling, after: Engine) -> Any:
-        """The memory now that the step led to ``after``. Raises ``UncertifiedStep``: then it was not made."""
+        """Return the memory to keep after the step. Raise ``UncertifiedStep`` to roll the step back."""
 
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
-        """What infos say of each vehicle, by name, each [n, N]: of its last step, or of the alert before the first."""
+        """Return the infos of every vehicle by name, each [n, N]: of the last step, or of the alert before the first."""
 
 
 class Now(NamedTuple):
-    """Everything of an engine that a reset or a step changes; replaced in one assignment."""
+    """Everything that a reset or a step of an engine changes; replaced in one assignment."""
 
     state: State
     roster: Roster  # who runs in which row, and which worlds failed
@@ -106,33 +109,33 @@ class Now(NamedTuple):
     stops: tuple[Stop, ...] = ()  # of scripts on their own grid within the last step
 
     def apart(self) -> Now:
-        """The same, in arrays of its own."""
+        """Return a copy whose arrays can be changed independently."""
         return self._replace(state=self.state.copy(), roster=self.roster.apart(), stream=copy.copy(self.stream))
 
     def kept(self, packed: Packed) -> Packed:
-        """Rows as wide as they are kept: with columns of an obstacle, and of news by link, if the first had such."""
+        """Return rows widened to the columns of this batch: those for an obstacle and for messages over links."""
         return packed.widened(self.obstacle, self.by_link)
 
 
 class Engine:
     """A batch of ``n`` running episodes of one scenario.
 
-    Steps start when the first of the ``deciders`` may act; with none, at t = 0. A ``guard`` (a shield) may stand
-    between what is proposed and what is applied. A world that the physics cannot advance takes no other with it: its
-    episode is cut off (truncated), and the ``roster`` names it.
+    A step goes from one decision of the ``deciders`` to the next; the first begins when the first decider may act. With a
+    ``guard`` (a shield), the applied actions may differ from the proposed ones. If the physics cannot advance a world, its
+    episode is truncated and the ``roster`` names it; the other worlds go on.
 
     Args:
-        scenario: of every episode.
-        n: worlds that are advanced together, at least 1.
+        scenario: the scenario of all episodes, or another ``Game``.
+        n: number of worlds that are advanced together, at least 1.
         learners: indices of the vehicles (0 = front) that need an action in every step.
-        scripts: vehicle index -> what drives it, for every vehicle that does not learn.
+        scripts: the script of every vehicle that does not learn, by index.
         reward: a name, a mapping of settings, or ``RewardParams``.
-        observation: what vehicles observe, or by name what each does; None: as the scenario says.
-        seed: of the scenario's training stream, from which worlds come unless they are given.
-        deciders: indices of the vehicles that set the grid of decisions; None: the learners. An evaluated agent drives
-            its vehicle as a script, on a learner's grid.
-        worlds: of the first episodes, at t = 0; None: from the stream.
-        guard: makes what stands between proposed and applied actions; None: what is proposed is applied.
+        observation: what the vehicles observe, the same for all or by name; None: as the scenario says.
+        seed: seed of the training stream, which provides the worlds unless ``worlds`` does.
+        deciders: indices of the vehicles whose decisions delimit the steps; None: the learners. An evaluation has no
+            learner: there a script is the decider.
+        worlds: worlds of the first episodes, at t = 0; None: the first ones of the training stream.
+        guard: function that makes the guard of this engine; None: proposed actions are applied.
 
     >>> import ethbrake_marl as eb
     >>> engine = eb.make_engine("paper-random", 4, seed=7)
@@ -187,7 +190,7 @@ class Engine:
         self._now = self._started(stream, None, worlds, {})
 
     def check_time_step(self, drivers: Mapping[int, Script]) -> None:
-        """Raise ``InvalidInput`` for one that was made for decisions at another distance in time (``time_step_s``)."""
+        """Raise ``InvalidInput`` if a driver was made for another time between decisions (``time_step_s``)."""
         for script in drivers.values():
             step, here = getattr(script, "time_step_s", None), self.scenario.time_step_s
             if step not in (None, here):
@@ -198,7 +201,7 @@ class Engine:
 
     @property
     def observation(self) -> ObservationSpec:
-        """What all learners observe; raises ``InvalidInput`` where they observe different features."""
+        """The observation of all learners. Raises ``InvalidInput`` if learners observe different features."""
         return common_observation(self.observations, self.scenario)
 
     @property
@@ -208,27 +211,27 @@ class Engine:
 
     @property
     def state(self) -> State:
-        """The running episodes as they are now: to be read, not to be changed."""
+        """The running episodes, not a copy: read them, do not change them."""
         return self._now.state
 
     @property
     def roster(self) -> Roster:
-        """Who runs in which row, and which worlds failed."""
+        """Number of the world in each row, and the worlds that the physics could not advance."""
         return self._now.roster
 
     @property
     def memories(self) -> dict[int, Memory]:
-        """What the scripts remember, by vehicle."""
+        """Memories of the scripts, by vehicle."""
         return self._now.state.memories
 
     @property
     def guarded(self) -> Any:
-        """What the guard remembers; None without one, or before its first episode."""
+        """Memory of the guard; None without a guard, or before its first episode."""
         return self._now.state.guarded
 
     @property
     def ruling(self) -> Ruling | None:
-        """What the guard ruled in the last step."""
+        """The guard's ruling in the last step; None without one."""
         return self._now.ruling
 
     @property
@@ -238,44 +241,44 @@ class Engine:
 
     @property
     def wanted_mps2(self) -> Floats:
-        """What each vehicle wanted in the last step, [n, N]: for kernels to read, not to be changed."""
+        """Acceleration that each vehicle asked for in the last step, [n, N] m/s2; not a copy."""
         return self._now.state.wanted
 
     @property
     def worlds(self) -> Worlds:
-        """The worlds as they are now, in their own memory."""
+        """The running worlds, as a copy."""
         return self._now.rules.unpack(self.packed)
 
     @property
     def in_pieces(self) -> bool:
-        """Whether some script brakes in pieces."""
+        """Whether a script follows a braking profile of several pieces."""
         return bool(self._now.rules.pieces.shape[1] > 0)
 
     @property
     def ledger(self) -> Ledger:
-        """Harm of the running episodes so far, in its own memory."""
+        """Harm of the running episodes so far, as a copy."""
         return self._now.state.ledger
 
     @property
     def ended(self) -> Bools:
-        """Episodes that have ended, [n]."""
+        """Whether each episode has ended, [n]."""
         return self._now.state.ended
 
     @property
     def steps(self) -> Ints:
-        """Steps that the running episodes have taken, [n]."""
+        """Number of steps that each running episode has taken, [n]."""
         return self._now.state.steps
 
     def observe(self, vehicle: int) -> Observations:
-        """Current observation of one vehicle, [n, F]."""
+        """Return the current observation of one vehicle, [n, F]."""
         if not isinstance(vehicle, int | np.integer) or not 0 <= vehicle < self.scenario.vehicles:
             raise InvalidInput(f"observe: vehicle index {vehicle!r}; must be in 0..{self.scenario.vehicles - 1}")
         return self.observe_all(np.array([vehicle]))[:, 0]
 
     def observe_all(self, vehicles: Ints | None = None, rows: Ints | None = None) -> Observations:
-        """Current observations of several vehicles, of all learners if none are given, [n, len(vehicles), F].
+        """Return the current observations of several vehicles, [n, len(vehicles), F]; None: of all learners.
 
-        Only of the worlds ``rows`` if given. Raises ``InvalidInput`` where these vehicles observe different features.
+        ``rows`` selects worlds. Raises ``InvalidInput`` if these vehicles observe different features.
         """
         vehicles = self._learner_index if vehicles is None else vehicles
         if not self._alike and len({self.observations[i] for i in vehicles.tolist()}) > 1:
@@ -291,26 +294,26 @@ class Engine:
         return plan.observe(motion, params, vehicles, clock[:, STEP] if rows is None else clock[rows, STEP])
 
     def memory(self, watcher: Watcher) -> Any:
-        """What a watcher remembers of the running episodes."""
+        """Return the memory of a watcher."""
         return self._now.watched[watcher]
 
     def watch(self, watcher: Watcher, memory: Any) -> None:
-        """Let a watcher follow, from ``memory`` on."""
+        """Add a watcher, with its first memory."""
         self._now = self._now._replace(watched={**self._now.watched, watcher: memory})
 
     def protect(self, guard: Guard | None) -> None:
-        """Let a guard stand between what is proposed and what is applied, from the next reset on; None: nobody does."""
+        """Set the guard, from the next reset on; None removes it."""
         self.guard = guard
         self._now = self._now._replace(state=self._now.state._replace(guarded=None), ruling=None)
 
     def remember(self, guarded: Any) -> None:
-        """Replace what the guard remembers, for who decides in the place of a step (``place``)."""
+        """Replace the guard's memory, for a caller that decides itself and uses ``place`` instead of ``step``."""
         self._now = self._now._replace(state=self._now.state._replace(guarded=guarded))
 
     def reset(self, *, seed: int | None = None, worlds: Worlds | None = None) -> None:
-        """Start new episodes in all rows: the given worlds (at t = 0), or the next ones of the training stream.
+        """Start new episodes in all rows, with these worlds (at t = 0) or with the next ones of the training stream.
 
-        With ``seed`` the stream starts again from its beginning. Whatever fails, the running episodes go on.
+        With ``seed``, the stream restarts from its first world. If anything fails, the running episodes go on.
         """
         stream = copy.copy(self._now.stream)
         if seed is not None:
@@ -318,7 +321,7 @@ class Engine:
         self._now = self._started(stream, self._now.state.guarded, worlds, self._now.watched)
 
     def _started(self, stream: Stream, guarded: Any, worlds: Worlds | None, watched: dict[Watcher, Any]) -> Now:
-        """New episodes in all rows: the given worlds, or the next ones of the ``stream``."""
+        """Return new episodes in all rows, with these worlds or with the next ones of the ``stream``."""
         if worlds is not None:
             check_alert(worlds, self.n, self.scenario.vehicles)
         first = None if worlds is not None else stream.position
@@ -336,13 +339,13 @@ class Engine:
         return new._now
 
     def _at(self, now: Now) -> Engine:
-        """The same engine at another moment."""
+        """Return this engine with another state of affairs."""
         new = copy.copy(self)
         new._now = now
         return new
 
     def renew(self, rows: Ints) -> None:
-        """Start new episodes of the training stream in these rows (autoreset). Whatever fails, nothing is changed."""
+        """Start new episodes of the training stream in these rows (autoreset). If anything fails, nothing changes."""
         if len(rows) == 0:
             return
         if not 0 <= np.min(rows) <= np.max(rows) < self.n or np.bincount(rows).max() > 1:
@@ -359,20 +362,20 @@ class Engine:
 
     @property
     def _nobody_refuses_episodes(self) -> bool:
-        """Whether nothing can fail when episodes begin: then they begin in the arrays that are there."""
+        """Whether the start of an episode cannot fail. Then the arrays are changed in place, which is faster."""
         return not (self._now.watched or self._remembering or self.guard or self._terms.count_impacts)
 
     def cut(self, step: Step, most_steps: int) -> None:
-        """Truncate the episodes that have taken ``most_steps`` with the last ``step``, here and in what that tells."""
+        """Truncate the episodes that have taken ``most_steps`` steps, in this engine and in the last ``step``."""
         cut = (self.steps >= most_steps) & (step.ended | ~self.ended)
         step.outcome[TRUNCATED, cut] = self._now.state.clock[cut, ENDED] = 1.0
 
     def step(self, actions: Actions) -> Step:
         """Advance every running episode by one time step.
 
-        ``actions``: for each learner (by vehicle index, or as columns [n, L] in the order of ``learners``) a number in
-        [-1, 1] per world; by index a guarded one may be left out. Rows whose episode has ended stay as they are until
-        ``renew`` or ``reset``. What the guard refuses does not happen: the worlds stay as they are.
+        ``actions`` are numbers in [-1, 1] for each learner: an array [n, L] with columns in the order of ``learners``, or a
+        mapping from vehicle index to [n]. With a guard, the mapping may leave learners out. Rows whose episode has ended do not
+        move until ``renew`` or ``reset``. If the guard refuses the step, nothing changes.
         """
         columns = self._columns(actions)
         if self._nobody_refuses_steps:
@@ -392,18 +395,18 @@ class Engine:
 
     @property
     def _nobody_refuses_steps(self) -> bool:
-        """Whether nothing can fail within a step: then it is made in the arrays that are there."""
+        """Whether a step cannot fail. Then the arrays are changed in place, which is faster."""
         return not (self.guard or self._now.watched or self._terms.are_foreign or self._own_grid.scripts)
 
     def _ruled(self, before: Engine, columns: Floats, *, checked: bool) -> Ruling:
-        """What the guard makes of the actions [n, L]; they are in range if they are ``checked``."""
+        """Return the guard's ruling on these actions [n, L]; ``checked`` says that they are in range."""
         assert self.guard is not None
         if before.guarded is None:
             raise UncertifiedStep("shield: this episode began before the shield was put around it; reset first")
         return self.guard.decide(before, before.guarded, columns if checked else self._in_range(columns))
 
     def _advance(self, columns: Floats) -> Step:
-        """Advance every running episode by one time step, in the arrays that are there."""
+        """Advance every running episode by one time step, in place: scripts, motion, failed worlds, reward."""
         asked = self._ask_scripts()
         harm_before = self._terms.objective_harm(self.state) if self._terms.by_objective else None
         impacts = self.state.impacts
@@ -428,7 +431,7 @@ class Engine:
         self._now = self._now._replace(state=self._now.state._replace(**fields))
 
     def _ask_scripts(self) -> dict[int, Memory]:
-        """What the scripts that decide in every step want now; and what they remember once the step is made."""
+        """Let the scripts with a memory decide that are deciders; return their new memories, by vehicle."""
         asked: dict[int, Memory] = {}
         own_grid = self._own_grid.scripts
         if len(self._remembering) > len(own_grid):
@@ -440,7 +443,7 @@ class Engine:
         return asked
 
     def _move(self, columns: Floats) -> tuple[Step, bool]:
-        """Move the worlds under the actions [n, L], and hear what messages bring. Also: whether a world failed."""
+        """Move the worlds under these actions [n, L], and deliver messages. Also return whether a world failed."""
         if self._now.stops:
             self._now = self._now._replace(stops=())
         way = self._drive_own_grid(columns) if self._own_grid.scripts else None
@@ -467,7 +470,7 @@ class Engine:
         return way
 
     def _columns(self, actions: Actions) -> Floats:
-        """The learners' actions as [n, L]; their range is checked where they are used."""
+        """Return the learners' actions as [n, L]. Their range is checked where they are used."""
         shape = (self.n, len(self.learners))
         if type(actions) is np.ndarray and actions.shape == shape and actions.dtype.kind in "fiu":
             return np.ascontiguousarray(actions, np.float64)
@@ -489,12 +492,12 @@ class Engine:
         return columns
 
     def _in_range(self, columns: Floats) -> Floats:
-        """The actions [n, L] without the last rounding of a float32; ``InvalidInput`` for one out of range."""
+        """Return the actions [n, L] clipped by a rounding error of float32 at most; else raise ``InvalidInput``."""
         each = [checked_action(columns[:, c], (self.n,), f"vehicle_{i + 1}") for c, i in enumerate(self.learners)]
         return np.stack(each, axis=1) if each else columns
 
     def _begin(self, rows: Ints, start: Start) -> None:
-        """Tell those who must know that episodes start in ``rows``, and move what depends on them."""
+        """Start episodes in ``rows``: memories, decisions and messages before the first step, potentials."""
         if not self._nobody_refuses_episodes:
             alert, memories = start.alert, self.memories
             with renumbered(rows):
@@ -527,9 +530,10 @@ class Engine:
             potential[rows] = self._terms.potentials(rules.unpack(Packed(motion[rows], params[rows])), self.scenario)
 
     def segments(self, before: Worlds, last_mps2: Floats) -> Iterator[tuple[Worlds, Floats, Floats]]:
-        """The last step, made from ``before`` (after a reset: the alert), in parts within which nobody decides.
+        """Yield the parts of the last step between which a script decided; after a reset, from the alert on.
 
-        Each is worlds, the commands [n, N] that they followed, ``last_mps2`` in the last part, and until when [n].
+        Each part is the worlds at its start, the commands [n, N] that they followed, and its end [n]. ``before`` are the worlds
+        at the start of the step, ``last_mps2`` the commands of the last part.
         """
         for motion, wanted in self._now.stops:
             then = Packed(motion, self.state.params).worlds(before.vehicles)
@@ -538,9 +542,9 @@ class Engine:
         yield before, last_mps2, self.state.time_s.copy()
 
     def snapshot(self) -> Arrays:
-        """Copies of everything that changes while it runs: its rows, its place in the stream, the scripts' memories.
+        """Return copies of everything that changes while the engine runs: rows, place in the stream, memories.
 
-        The stream is one number: worlds are pure functions of the seed and of where they stand in it.
+        Worlds are pure functions of the seed and their number, so the stream is one number.
         """
         arrays: Arrays = {name: array.copy() for name, array in zip(SNAPSHOT, self.state, strict=False)}
         arrays["stream"] = np.array([self.seed, self._now.stream.position], np.uint64)
@@ -550,10 +554,10 @@ class Engine:
         return arrays | {f"script.{name}": array for name, array in flat(self.memories).items()}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Go on from the ``snapshot`` of an engine of the same scenario, size and scripts, as if nothing had happened.
+        """Continue exactly from a ``snapshot`` of an engine of the same scenario, size and scripts.
 
-        Raises ``InvalidInput``, before anything is changed, naming the array that is missing or has another shape, and
-        where a shield stands in the engine, which would know nothing of these worlds.
+        Raises ``InvalidInput`` before anything changes: for a missing array, an array of another shape, or an engine with a
+        guard, whose memory the snapshot does not hold.
         """
         if self.guard is not None:
             raise InvalidInput(
@@ -576,15 +580,15 @@ class Engine:
         self._now = self._now._replace(state=state, stream=stream, roster=roster, rules=self._rules_for(state))
 
     def _rules_for(self, state: State) -> Rules:
-        """The rules for other rows: their brakes may build up where those of the rows before did not."""
+        """Return the rules for other rows, whose brakes may build up where those of the rows before did not."""
         builds_up = self.scenario.builds_up or state.packed.builds_up or self.in_pieces
         return self._now.rules._replace(builds_up=builds_up)
 
     def place(self, worlds: Worlds, ledger: Ledger | None = None, *, ended: Bools | None = None) -> None:
-        """Put the running worlds in all rows as somebody else has moved them, with their ``ledger`` so far.
+        """Set the running worlds in all rows, as another simulator has moved them, with their ``ledger`` so far.
 
-        Vehicles, memories and the grid of decisions stay those of the last reset: the next step goes to the next
-        decision after the worlds' time. ``ended`` [n]: those that no step moves; None: those at the horizon. Raises
+        Vehicles, memories and times of decisions stay those of the last reset; the next step goes to the next decision after
+        the worlds' time. ``ended`` [n]: worlds that no step moves any more; None: the worlds at the horizon. Raises
         ``InvalidInput`` for another number of worlds or vehicles.
         """
         state = self.state
@@ -602,11 +606,11 @@ class Engine:
         self._now = self._now._replace(state=state._replace(motion=motion, clock=clock), ruling=None)
 
     def moment(self) -> State:
-        """The present state of all rows, in arrays of its own."""
+        """Return a copy of the state."""
         return self.state.copy()
 
     def first_moments(self, count: int) -> tuple[Worlds, State]:
-        """The first ``count`` worlds of the training stream, at the alert, and at their first decision."""
+        """Return the first ``count`` worlds of the training stream: at the alert, and their state at the first decision."""
         stream = copy.copy(self._now.stream)
         stream.restart(self.seed)
         alert, new = stream.take(count).alert, self._unwatched(count, self._now)
@@ -615,9 +619,9 @@ class Engine:
         return alert, new.moment()
 
     def branch(self, state: State) -> Engine:
-        """An engine of the same scenario whose rows go on from ``state``, under the same guard; this one stays.
+        """Return an engine whose rows continue from ``state``, under the same guard; this engine does not change.
 
-        Raises ``InvalidInput`` for an engine with a reward that is shaped, which tells of more than what happens.
+        Raises ``InvalidInput`` for a shaped reward: potentials depend on more than the state.
         """
         if self.reward.shaping > 0.0:
             raise InvalidInput(f"branches: reward: shaping = {self.reward.shaping:g}: must be 0; a branch has an end")
@@ -628,7 +632,7 @@ class Engine:
         return self._unwatched(n, self._now._replace(state=state.copy(), roster=roster, ruling=None, rules=rules))
 
     def _unwatched(self, n: int, now: Now) -> Engine:
-        """An engine of the same scenario for ``n`` worlds, at that moment, which nobody watches."""
+        """Return an engine of the same scenario for ``n`` worlds, without watchers."""
         new = self._at(now._replace(watched={}))
         new.n = n
         return new
