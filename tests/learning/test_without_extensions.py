@@ -1,36 +1,20 @@
 """Training where no extension is installed: PPO and SAC, and a clear word for every other algorithm."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl import registry
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.training.experiment import RUN_REPORTS, run_experiment
-from ethbrake_marl.training.recipe import ALGORITHMS, algorithm_names, load_recipe
+from ethbrake_marl.training.experiment import run_experiment
+from ethbrake_marl.training.recipe import algorithm_names, load_recipe
 from tests.learning.tiny import TINY_PPO
 
 TINY = TINY_PPO.replace(total_steps=256)
 
 
-@pytest.fixture(autouse=True)
-def core_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hide the entry points of the extensions, and what was loaded from them."""
-    every: Callable[[str], dict[str, list[registry.EntryPoint]]] = registry.points
-
-    def points(group: str) -> dict[str, list[registry.EntryPoint]]:
-        core = {
-            name: [each for each in found if ".extensions." not in each.value] for name, found in every(group).items()
-        }
-        return {name: found for name, found in core.items() if found}
-
-    monkeypatch.setattr(registry, "points", points)
-    for parts in (ALGORITHMS, RUN_REPORTS):
-        core = {name: part for name, part in parts.loaded.items() if name in points(parts.group)}
-        monkeypatch.setattr(parts, "loaded", core)
+pytestmark = pytest.mark.usefixtures("core_alone")
 
 
 def test_algorithm__of_an_absent_extension_is_refused_by_name() -> None:
