@@ -21,7 +21,7 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM
 
 # `installed` comes first: what it finds is what the others, and all processes that they start, find.
 pytest_plugins = [
-    f"tests.fixtures.{name}" for name in ("installed", "evaluation", "pictures", "policies", "registered")
+    f"tests.fixtures.{name}" for name in ("installed", "pictures", "commands", "evaluation", "policies", "registered")
 ]
 TESTS = Path(__file__).parent
 if (TESTS / "extensions").exists():

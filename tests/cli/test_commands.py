@@ -27,7 +27,7 @@ from ethbrake_marl.cli.command import Out
 from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.evaluation.identity import EPISODES, LIST_SEED
 from ethbrake_marl.physics.jit import compiled
-from tests.cli.conftest import Command, check_refused, told_json
+from tests.fixtures.commands import Command, check_refused, told_json
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = [""]  # every one, groups too

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.scenario.catalogue import new_scenario_text
-from tests.cli.conftest import Command, check_refused
 from tests.cli.test_printed import STORIES
+from tests.fixtures.commands import Command, check_refused
 
 Refuse = Callable[..., None]
 

@@ -6,39 +6,22 @@ import re
 import runpy
 from pathlib import Path
 from textwrap import indent
-from unittest.mock import Mock
 
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.cli import scenario as module
 from ethbrake_marl.evaluation.trial import load_runnable
-from ethbrake_marl.extensions.search import best_harm, planner
-from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.files.yaml import flow_text, parse_yaml
 from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.tables import read_worlds
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
-from tests.cli.conftest import Answer, Command, check_refused, rows_of, told_json
+from tests.fixtures.commands import Answer, Command, check_refused, rows_of, told_json
 
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIAL = (ROOT / "docs" / "tutorials" / "first-ten-minutes.md").read_text("utf-8")
 ADD, OWN_DATA = ((ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in ("add-a-scenario", "own-vehicle-data"))
-
-
-@pytest.mark.parametrize("script", ["planner", "planner:1000000", "best_harm", "best_harm:1000000"])
-def test_validate__trying_a_search_has_a_budget(ethbrake: Command, scenario_file, monkeypatch, script: str) -> None:
-    searched = Mock(side_effect=search_profiles)
-    for searching in (planner, best_harm):
-        monkeypatch.setattr(searching, "search_profiles", searched)
-    monkeypatch.setattr(module, "TRIED_WORLDS", 5)
-    path = scenario_file("\n  vehicle_3: full_brake\n", f"\n  vehicle_3: {script}\n")
-    path.write_text(path.read_text().replace("early_impacts: reject", "early_impacts: keep"))
-    assert ethbrake("scenario", "validate", path).out.startswith("OK  mine: 3 vehicles, learners: vehicle_2;")
-    budgets = [call.kwargs["budget"] for call in searched.call_args_list]
-    assert budgets and max(budgets) <= 16
 
 
 SCRIPTS = """
@@ -107,14 +90,6 @@ def test_explain__tells_every_quantity_that_is_declared(ethbrake: Command) -> No
     assert "Time gaps (s): 0.19 to 1.75 (normal, mean 0.97, sd 0.26), drawn for each pair" in " ".join(
         ethbrake("scenario", "explain", "realistic-motorway").out.split()
     )
-
-
-@pytest.mark.parametrize("name", ["realistic-mixed", "paper-scenario-1"])
-def test_sample__draws_a_picture(ethbrake: Command, tmp_path: Path, name: str) -> None:
-    for picture in (tmp_path / "a.png", tmp_path / "b.png"):
-        told = ethbrake("scenario", "sample", name, "--episodes", "40", "--output", picture)
-        assert (told.status, told.out, told.err) == (0, "", f"picture: {picture}\n")
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
 def test_show_and_new__are_the_files_and_force_replaces_one(ethbrake: Command, tmp_path: Path) -> None:

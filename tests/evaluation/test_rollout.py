@@ -1,7 +1,6 @@
 """Rollouts and whole lists, by hand and chunk by chunk: the same bits for any chunks and processes."""
 
 import csv
-import hashlib
 import json
 import warnings
 from collections.abc import Callable
@@ -32,13 +31,11 @@ from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.own_measures import MEASURES, REGISTERED
 from ethbrake_marl.evaluation.per_world import write_per_world
 from ethbrake_marl.evaluation.record import record_episode
-from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk, evaluate
+from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.evaluation.tally import Tally
 from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.extensions.search.limit_measures import LIMITS
-from ethbrake_marl.extensions.search.limits import Unproven
-from ethbrake_marl.extensions.search.regret import limits_of
 from ethbrake_marl.files import python_file
 from ethbrake_marl.physics.paper_map import advance_sampled
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
@@ -507,77 +504,6 @@ def test_a_list_of_which_every_world_fails__is_refused(failing, paper_random: Sc
 
 
 # ---------------------------------------------------------------- recorded before search and loop were made faster
-
-RECORDED_AGENTS = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")
-
-# SHA-256 of the tally of 1,200 worlds of seed 11, its first 16 digits, by the code of 20 November 2026 (6d87c15);
-# `stress-wide` and `realistic-mixed` on worlds that are the same on every processor.
-RECORDED = {
-    ("paper-random", "first"): "5ae559be31df8505",
-    ("paper-random", "total"): "29b0ca9c08a04ae9",
-    ("stress-wide", "first"): "22b5e762e6c951d0",
-    ("stress-wide", "total"): "4664512f66236619",
-    ("cooperation-2-five", "first"): "1922c828a6f1ea16",
-    ("cooperation-2-five", "total"): "e9edef37a4098d2f",
-    ("paper-random-obstacle", "first"): "e7a03a0982bc18ea",
-    ("paper-random-obstacle", "total"): "10f6acd3dcfedde5",
-    ("realistic-mixed", "first"): "1ae5e4977847725f",
-    ("realistic-mixed", "total"): "616b5cb07da1c8d6",
-}
-# Of the first 250 of them, by code that gives the digests above.
-FIRST_250 = {
-    ("paper-random", "first"): "f306298691aca961",
-    ("stress-wide", "total"): "6f54af14b777f89e",
-    ("cooperation-2-five", "first"): "26c835879bdcb2a3",
-    ("paper-random-obstacle", "total"): "8a39f7348bd5252a",
-    ("realistic-mixed", "first"): "21ef20f79df3a8cf",
-}
-
-
-# Measures by the names that sums had then.
-NAMES = {
-    "collision_rate": "collisions", "vehicle_1_shoved_far_rate": "shoved_far", "unavoidable_rate": "unavoidable",
-    "avoidable_collision_rate": "avoidable_collisions", "impact_proven_rate": "impact_proven",
-    "vehicle_1_shoved_m": "shoved_m", "mean_regret_first": "regret_first", "mean_regret_total": "regret_total",
-    "best_known_first_impact_harm": "best_known_first", "best_known_total_harm": "best_known_total",
-    "best_known_minus_proven_first": "gap_first", "best_known_minus_proven_total": "gap_total",
-}  # fmt: skip
-
-
-def digest_of(tally: Tally) -> str:
-    """Sums are written as they were kept then: multiples of 2^-1074, products of 2^-2148."""
-    agents = {}
-    for name, agent in tally.agents.items():
-        assert all(of == tally.worlds for _, of in agent.counts.values())
-        counts = {NAMES.get(of, of): so for of, (so, _) in agent.counts.items()}
-        moments = {
-            NAMES.get(of, of): [each.count, hex(int(each.total * 2**1074)), hex(int(each.squares * 2**2148))]
-            for of, each in agent.moments.items()
-        }
-        products = {NAMES.get(of, of): hex(int(value * 2**2148)) for of, value in agent.products.items()}
-        agents[name] = {"counts": counts, "moments": moments, "products": products}
-    told = {
-        "worlds": tally.worlds, "hidden": tally.hidden, "worlds_hash": hex(tally.worlds_hash), "agents": agents,
-        "ranges": {name: [list(each) for each in entries] for name, entries in tally.ranges.items()},
-        "left_out": [list(left) for left in tally.left_out],
-    }  # fmt: skip
-    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
-
-
-@pytest.mark.parametrize(
-    ("worlds", "scenario", "harm_count", "digest"),
-    [
-        *(pytest.param(1_200, *key, digest, marks=pytest.mark.slow) for key, digest in RECORDED.items()),
-        *((250, *key, digest) for key, digest in FIRST_250.items()),
-    ],
-)
-def test_tally__is_the_one_that_was_recorded(worlds: int, scenario: str, harm_count: str, digest: str) -> None:
-    lineup, parts = Lineup.of(RECORDED_AGENTS, load_scenario(scenario), harm_count=harm_count), []
-    for first, part in chunks_of(lineup.scenario.sample(worlds, 11), 1_000):
-        driven = drive_chunk(part, lineup.make(), lineup.scenario, 11, lineup.scenario.learners, first)
-        limits = limits_of(driven)
-        parts.append(Tally.of(driven, (), long_list=isinstance(limits, Unproven) or not limits.known.all()))
-    assert digest_of(sum(parts[1:], parts[0])) == digest
 
 
 def test_aftermath__has_no_meaning_where_vehicle_1_reacts_or_another_than_vehicle_2_is_driven() -> None:

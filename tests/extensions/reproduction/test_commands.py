@@ -1,0 +1,20 @@
+"""`ethbrake reproduce`: what it leaves."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.fixtures.commands import Command, told_json
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+
+def test_reproduce__says_what_it_takes_makes_one_item_and_keeps_it(ethbrake: Command) -> None:
+    words = ("reproduce", "accelerations", "--episodes", "20", "--output", "out")
+    answer = ethbrake(*words, "--json")
+    assert "to do: 1 item," in answer.err and "page: out/index.html" in answer.err
+    (result,) = told_json(answer)
+    assert result["name"] == "accelerations" and result["verdict"]["outcome"] in ("agrees", "differs")
+    file = Path("out/accelerations/result.json")
+    made = file.stat().st_mtime_ns
+    assert ethbrake(*words).status == 0 and file.stat().st_mtime_ns == made

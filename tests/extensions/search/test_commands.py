@@ -1,0 +1,48 @@
+"""Searches on the command line."""
+
+from unittest.mock import Mock
+
+import pytest
+
+from ethbrake_marl.cli import scenario as module
+from ethbrake_marl.extensions.search import best_harm, planner
+from ethbrake_marl.extensions.search.problem import search_profiles
+from tests.fixtures.commands import Command, told_json
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+
+@pytest.mark.parametrize("script", ["planner", "planner:1000000", "best_harm", "best_harm:1000000"])
+def test_validate__trying_a_search_has_a_budget(ethbrake: Command, scenario_file, monkeypatch, script: str) -> None:
+    searched = Mock(side_effect=search_profiles)
+    for searching in (planner, best_harm):
+        monkeypatch.setattr(searching, "search_profiles", searched)
+    monkeypatch.setattr(module, "TRIED_WORLDS", 5)
+    path = scenario_file("\n  vehicle_3: full_brake\n", f"\n  vehicle_3: {script}\n")
+    path.write_text(path.read_text().replace("early_impacts: reject", "early_impacts: keep"))
+    assert ethbrake("scenario", "validate", path).out.startswith("OK  mine: 3 vehicles, learners: vehicle_2;")
+    budgets = [call.kwargs["budget"] for call in searched.call_args_list]
+    assert budgets and max(budgets) <= 16
+
+
+def test_benchmark__shares_are_those_of_each_scenario_alone(ethbrake: Command) -> None:
+    words = ("--agents", "full_brake,coast", "--episodes", "10", "--set", "harm_count=total", "--json")
+    told = told_json(ethbrake("evaluate", "--scenario", "benchmark", *words))
+    assert len({row["scenario"] for row in told}) == 10 and len(told) == 20
+    shares = {(row["scenario"], row["agent"]): row["share_of_possible_reduction"] for row in told}
+    for name in ("paper-random", "cooperation-2-five"):
+        for row in told_json(ethbrake("evaluate", "--scenario", name, *words)):
+            alone = row["share_of_possible_reduction_total"]
+            assert shares[name, row["agent"]]["value"] == alone and (alone == 0.0) == (row["agent"] == "full_brake")
+
+
+def test_evaluate__a_list_that_is_not_held_tells_what_needs_no_proof(ethbrake: Command, monkeypatch) -> None:
+    line = ("evaluate", "--agents", "full_brake,coast", "--episodes", "600", "--json")
+    held = told_json(ethbrake(*line))
+    monkeypatch.setattr("ethbrake_marl.evaluation.identity.HELD", 500)
+    flat = told_json(ethbrake(*line))
+    for one, other in zip(flat, held, strict=True):
+        assert one["parameters"]["no_limits_because"]
+        for name in ("first_impact_harm", "total_harm_interval", "collision_rate_interval", "worlds_sha256"):
+            assert one[name] == other[name], name
+        assert one["mean_regret"] is None is not other["mean_regret"]

@@ -1,0 +1,25 @@
+"""What all extensions together give: every agent that is registered stands in a list of the tests."""
+
+from ethbrake_marl.agents.registry import agent_entries, agent_names
+from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.extensions.field.controllers import FIELD
+from tests.agents import test_knowledge as core
+from tests.extensions.certified import test_knowledge as certified
+from tests.extensions.field import test_knowledge as field
+from tests.extensions.learners import test_knowledge as learners
+from tests.extensions.search import test_knowledge as search
+
+
+def test_knowledge__every_agent_of_the_registry_stands_in_a_table():
+    stated = core.STATED | certified.STATED | field.STATED | learners.STATED | search.STATED
+    missing = core.missing_in(stated, core.USUAL | search.USUAL, core.APART | learners.APART)
+    assert not missing, "registered, and in no STATED, so nobody tests whether they are honest"
+
+
+def test_agent_names__are_those_that_ship_and_are_listed(capsys):
+    scripts = ("coast", "constant", "e_v2x_bm", "full_brake", "planner")
+    names = (*scripts, *FIELD, "best_harm", "ppo", "sac", "counterfactual", "options", "policy", "universal", "team")
+    assert agent_names() == tuple(sorted(names)) and run_command(["agent", "list"]) == 0
+    table = capsys.readouterr().out
+    assert [name for name in (*names, "+search", "+episode", "+step", "+robust") if name not in table] == []
+    assert all(callable(entry.make) and entry.about and entry.knows for entry in agent_entries())
