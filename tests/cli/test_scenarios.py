@@ -12,7 +12,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation.trial import load_runnable
 from ethbrake_marl.files.yaml import flow_text, parse_yaml
-from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
+from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario, shipped_folder
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.tables import read_worlds
@@ -112,11 +112,17 @@ def test_sample__draws_the_worlds_that_evaluate_draws(ethbrake: Command, tmp_pat
     assert all(one[name] == other[name] for name in ("first_impact_harm", "worlds_sha256"))
 
 
-@pytest.mark.parametrize("based_on", sorted(TrainingRecipe.shipped()))
-def test_new_recipe__has_every_key_with_a_comment_and_the_same_values(based_on: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "name", [name for name, file in TrainingRecipe.shipped().items() if file.parent == shipped_folder("train")]
+)
+def test_new_recipe__has_every_key_with_a_comment_and_the_same_values(name: str, tmp_path: Path) -> None:
+    check_new_recipe(name, tmp_path / "mine.yaml")
+
+
+def check_new_recipe(based_on: str, file: Path) -> None:
     text = load_recipe(based_on).new_text("mine")
-    (tmp_path / "mine.yaml").write_text(text)
-    made, base = load_recipe(tmp_path / "mine.yaml"), load_recipe(based_on)
+    file.write_text(text)
+    made, base = load_recipe(file), load_recipe(based_on)
     words = {"name", "title", "description", "source"}
     assert made.model_dump(exclude=words) == base.model_dump(exclude=words)
     lines = text.splitlines()

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk, evaluate
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
 from ethbrake_marl.evaluation.tally import Tally
-from ethbrake_marl.extensions.search import limits
+from ethbrake_marl.extensions.search import limits, regret
 from ethbrake_marl.extensions.search.limits import IncompleteTable, Unproven, known_limits, prove, unproven_because
 from ethbrake_marl.extensions.search.regret import Between, limits_of, regrets_of
 from ethbrake_marl.extensions.search.shipped import shipped_tables
@@ -32,6 +33,7 @@ from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
 from tests.docs.site import load
 from tests.evaluation.test_measures import per_world
+from tests.learning.test_runs import check_measured
 from tests.scenario.test_roads import final
 
 RECORDED_AGENTS = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")
@@ -419,3 +421,11 @@ def test_search_and_shield__execute_what_they_foresee(slow: Scenario) -> None:
     assert (harm["constant:2+step"] != harm["e_v2x_bm"]).any()
     proof = limits_of(result).proof  # of harm, not of contact
     assert proof.avoidable is None and (proof.harm <= harm["best_harm"] + 1e-9).all() and proof.harm.mean() > 5.0
+
+
+def test_train__proves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The evaluations of a training need no limits; the evaluation that they are compared with proves them once."""
+    prove = Mock(side_effect=limits.known_limits)
+    monkeypatch.setattr(regret, "known_limits", prove)
+    check_measured(tmp_path / "run")
+    prove.assert_called_once()
