@@ -1,4 +1,4 @@
-"""Summaries, tables and files of an evaluation, and regret: the distance from the best known and the proven harm."""
+"""Summaries, tables and files of an evaluation."""
 
 import csv
 import io
@@ -22,8 +22,6 @@ from ethbrake_marl.evaluation.own_measures import load_measures
 from ethbrake_marl.evaluation.per_world import read_harms, write_per_world
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
-from ethbrake_marl.extensions.report.report import Report
-from ethbrake_marl.extensions.search.regret import KNOWN_OF_WORLDS
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.game.harm import HARM_COUNTS, injury_probability
 from ethbrake_marl.game.objectives import STANDARD, declared_objectives, parse_objective, scored
@@ -33,7 +31,6 @@ from ethbrake_marl.scenario.tables import worlds_from_table
 from ethbrake_marl.training.experiment import results_csv
 from tests.contract.interfaces import CRASH
 
-SILENT = pytest.mark.filterwarnings("ignore::ethbrake_marl.extensions.search.limits.IncompleteTable")
 BRAKE = {"full_brake": eb.make_agent("full_brake")}
 
 # ---------------------------------------------------------------- the summary
@@ -41,16 +38,11 @@ BRAKE = {"full_brake": eb.make_agent("full_brake")}
 ESTIMATES = {
     "collision_rate", "first_impact_harm", "total_harm", "sampled_harm", "vehicle_1_shoved_m",
     "vehicle_1_shoved_far_rate", "first_impact_harm_difference", "total_harm_difference", "harm_decrease_first",
-    "harm_decrease_total", "unavoidable_rate", "impact_proven_rate", "proven_harm", "best_known_minus_proven_first",
-    "best_known_minus_proven_total", "avoidable_collision_rate", "best_known_first_impact_harm",
-    "best_known_total_harm", "mean_regret", "mean_regret_first", "mean_regret_total", "share_of_possible_reduction",
-    "share_of_possible_reduction_first", "share_of_possible_reduction_total",
+    "harm_decrease_total",
 }  # fmt: skip
 ALWAYS = {
     "kind", "agent", "knows", "sees_through_channel", "hidden_share", "episodes", "collisions", "horizon_ends",
-    "exploits",
-    "impact_unproven", "left_out", "worlds_sha256", "scenario_sha256", "policy_sha256", "versions",
-    "known_best_share", "best_known_warning", "below_best_known", "parameters",
+    "exploits", "left_out", "worlds_sha256", "scenario_sha256", "policy_sha256", "versions", "parameters",
     *ESTIMATES, *(f"{name}_interval" for name in ESTIMATES),
 }  # fmt: skip
 
@@ -64,6 +56,7 @@ def printed(table: SummaryTable, width: int = 80) -> str:
     return " ".join(text.split())
 
 
+@pytest.mark.usefixtures("core_alone")
 def test_summarise__keys_and_values_are_those_of_the_worlds(evaluation: Evaluation) -> None:
     full, constant, gap = (row.to_json() for row in summarise(evaluation))
     assert set(full) == set(constant) == ALWAYS
@@ -165,20 +158,17 @@ def pushing(shoved_m: float, moving: int, worlds: int = 20) -> Evaluation:
     return replace(found, outcomes={"full_brake": braking, "mine": mine})
 
 
-@pytest.mark.parametrize(
-    ("shoved_m", "moving", "names"),
-    [
-        (4.9, 1, ()), (5.1, 1, ("shoves",)), (4.9, 2, ("moving",)), (25.0, 12, ("shoves", "moving")),
-    ],
-)  # fmt: skip
+EXPLOITS = [(4.9, 1, ()), (5.1, 1, ("shoves",)), (4.9, 2, ("moving",)), (25.0, 12, ("shoves", "moving"))]
+
+
+@pytest.mark.parametrize(("shoved_m", "moving", "names"), EXPLOITS)
 def test_exploits__mark_the_row_and_are_one_sentence_below(shoved_m: float, moving: int, names: tuple[str]) -> None:
     found = pushing(shoved_m, moving)
     rows = summarise(found)
     assert [row.exploits.names for row in rows] == [(), names]
     assert [row.to_json()["exploits"] for row in rows] == [[], list(names)]
     assert Exploits.of_json(rows[1].to_json()) == rows[1].exploits
-    page = Report("t", rows, found).html
-    for text in (str(rows), rows.markdown(), rows._repr_html_() if names else "", page):
+    for text in (str(rows), rows.markdown(), rows._repr_html_() if names else ""):
         assert ("mine ‡" in text) == bool(names and text) and "full_brake ‡" not in text
     sentences = [text for kind, text in rows.notes() if text.startswith("‡") and kind == "note"]
     assert len(sentences) == bool(names)
@@ -219,6 +209,14 @@ SPECS = ("full_brake", "ppo@shipped/ppo", "ppo@shipped/ppo+episode", "e_v2x_bm:p
 KNOWN = ("own sensors", "messages", "messages + true model", "true state", "not stated")
 
 
+def check_marked(text: str, share: float) -> None:
+    assert all(words in text for words in (*SPECS, *KNOWN, "† messages + true model", "† true state"))
+    assert "† messages |" not in text and "† own sensors" not in text
+    assert f"In {100 * share:.1f} % of these worlds the channel hides something" in text
+    assert "† ppo@shipped/ppo+episode, e_v2x_bm:pairwise: drives by the line as it is" in text
+    assert "Not stated what it knows: mine." in text
+
+
 class Silent:
     name = "silent"
 
@@ -232,8 +230,7 @@ def knowing(v2x: Any) -> Evaluation:
     return evaluate(scenario.sample(12, 7), agents, scenario=scenario, seed=7)
 
 
-@SILENT  # some of the few worlds of `cooperation-2-blocked` are those of a shipped table
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("core_alone")
 def test_knowledge__a_hiding_channel_marks_who_sees_through_it_in_every_table(tmp_path: Path) -> None:
     hiding = knowing("blocked")
     rows, share = summarise(hiding), hiding.hidden.mean()
@@ -242,12 +239,8 @@ def test_knowledge__a_hiding_channel_marks_who_sees_through_it_in_every_table(tm
     assert [row["sees_through_channel"] for row in told] == [False, False, True, True, False]
     assert {row["hidden_share"] for row in told} == {share}
     markdown = rows.markdown()
-    for text in (printed(rows, 160), markdown, Report("Mine", rows, hiding).html):
-        assert all(words in text for words in (*SPECS, *KNOWN, "† messages + true model", "† true state"))
-        assert "† messages |" not in text and "† own sensors" not in text
-        assert f"In {100 * share:.1f} % of these worlds the channel hides something" in text
-        assert "† ppo@shipped/ppo+episode, e_v2x_bm:pairwise: drives by the line as it is" in text
-        assert "Not stated what it knows: mine." in text
+    for text in (printed(rows, 160), markdown):
+        check_marked(text, share)
     lines = markdown.splitlines()
     assert lines[0].startswith("| Agent | Knows | ") and len({line.count("|") for line in lines[:7]}) == 1
     assert [row["knows"] for row in csv.DictReader(io.StringIO(results_csv(rows)))] == list(KNOWN)
@@ -256,16 +249,20 @@ def test_knowledge__a_hiding_channel_marks_who_sees_through_it_in_every_table(tm
     assert [int(row["hidden"]) for row in lines] == 5 * hiding.hidden.astype(int).tolist()
 
 
-@SILENT
-@pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("v2x", ["paper", {"preset": "paper", "link_latency_s": 0.2, "senses": "both"}])
+CLEAR = ("paper", {"preset": "paper", "link_latency_s": 0.2, "senses": "both"})
+
+
+@pytest.mark.usefixtures("core_alone")
+@pytest.mark.parametrize("v2x", CLEAR)
 def test_knowledge__where_nothing_is_hidden_nobody_is_marked(v2x: Any) -> None:
     result = knowing(v2x)
     rows = summarise(result)
-    page = Report("Mine", rows, result).html.partition(">How to read the tables</h2>")[0]
-    text = printed(rows, 160) + rows.markdown() + page
-    assert [word for word in ("†", "hides", "Not stated") if word in text] == []
+    check_unmarked(printed(rows, 160) + rows.markdown())
     assert {row.to_json()["sees_through_channel"] for row in rows} == {False} and not result.hidden.any()
+
+
+def check_unmarked(text: str) -> None:
+    assert [word for word in ("†", "hides", "Not stated") if word in text] == []
 
 
 # ---------------------------------------------------------------- other objectives
@@ -310,6 +307,7 @@ def per_world(result: Evaluation, folder: Path, **options: Any) -> list[dict[str
     return list(csv.DictReader(io.StringIO(path.read_text("utf-8"), newline="")))
 
 
+@pytest.mark.usefixtures("core_alone")
 def test_per_world__every_number_reads_back_as_the_same_bits(tmp_path: Path, evaluation: Evaluation) -> None:
     rows = per_world(evaluation, tmp_path)
     assert [(row["agent"], row["world"]) for row in rows] == [
@@ -339,7 +337,7 @@ def test_per_world__every_number_reads_back_as_the_same_bits(tmp_path: Path, eva
     for name, values in expected.items():
         np.testing.assert_array_equal(columns[name].astype(float), values.astype(float), err_msg=name)
     assert set(columns["ended"]) == {"at_rest"}
-    assert set(rows[0]) == {"agent", "knows", "world", "hidden", "ended", *expected, *KNOWN_OF_WORLDS}
+    assert set(rows[0]) == {"agent", "knows", "world", "hidden", "ended", *expected}
     names = ("gap_1_m", "gap_2_m", "speed_1_mps", "speed_2_mps", "speed_3_mps")
     again = worlds_from_table(evaluation.scenario, {name: columns[name].astype(float) for name in names})
     assert (

@@ -3,11 +3,11 @@
 from ethbrake_marl.agents.registry import agent_entries, agent_names
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.extensions.field.controllers import FIELD
-from tests.agents import test_knowledge as core
-from tests.extensions.certified import test_knowledge as certified
-from tests.extensions.field import test_knowledge as field
-from tests.extensions.learners import test_knowledge as learners
-from tests.extensions.search import test_knowledge as search
+from tests.agents import test_knowledge as core, test_roles as roles
+from tests.extensions.certified import test_knowledge as certified, test_roles as certified_roles
+from tests.extensions.field import test_knowledge as field, test_roles as field_roles
+from tests.extensions.learners import test_knowledge as learners, test_roles as learners_roles
+from tests.extensions.search import test_knowledge as search, test_roles as search_roles
 
 
 def test_knowledge__every_agent_of_the_registry_stands_in_a_table():
@@ -23,3 +23,8 @@ def test_agent_names__are_those_that_ship_and_are_listed(capsys):
     table = capsys.readouterr().out
     assert [name for name in (*names, "+search", "+episode", "+step", "+robust") if name not in table] == []
     assert all(callable(entry.make) and entry.about and entry.knows for entry in agent_entries())
+
+
+def test_specs__are_of_every_kind_of_agent():
+    every = (roles, certified_roles, field_roles, learners_roles, search_roles)
+    assert {kind for each in every for kind in each.SPECS} - {"theirs"} == set(agent_names())

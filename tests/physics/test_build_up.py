@@ -259,6 +259,17 @@ def slow() -> Scenario:
     return load_scenario("paper-random").replace(brake_rate_mps3=12.65, release_rate_mps3=25)
 
 
+def test_shield__executes_what_it_foresees(slow: Scenario) -> None:
+    names = ("full_brake", "e_v2x_bm", "constant:2+step")
+    agents = {name: eb.make_agent(name, scenario=slow) for name in names}
+    result = eb.evaluate(slow.sample(40, seed=7), agents, scenario=slow)
+    harm = {name: result.outcome(name).first_impact_harm for name in names}
+    np.testing.assert_allclose(result.outcome("e_v2x_bm").predicted_harm, harm["e_v2x_bm"], rtol=1e-9, atol=1e-9)
+    assert harm["e_v2x_bm"].mean() < harm["full_brake"].mean()
+    assert (harm["constant:2+step"] <= harm["e_v2x_bm"] + 1e-9).all()  # its bound
+    assert (harm["constant:2+step"] != harm["e_v2x_bm"]).any()
+
+
 def test_shield__of_a_mixture_in_which_some_worlds_build_up(slow: Scenario, tmp_path: Path) -> None:
     keys = "\n".join(f"{key}: {flow_text(value)}" for key, value in slow.replace(name="slow").declared().items())
     (tmp_path / "slow.yaml").write_text(keys)

@@ -17,10 +17,7 @@ from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.ranges import ranges
 from ethbrake_marl.scenario.sampling import middle_world
 from ethbrake_marl.scenario.tables import worlds_from_state, worlds_from_table
-from tests.fixtures.extensions import of
 from tests.refused import refused
-
-parse_uncertainty = of("certified.uncertainty", "parse_uncertainty")
 
 PAPER = eb.load_scenario("paper-random")
 FIXED = PAPER.replace(gaps_m=40, speeds_mps=20, latency_s=0, early_impacts="keep", horizon_s=30)
@@ -234,15 +231,6 @@ ROADS: dict[str, Callable[[], object]] = {
     ),
     "scenario 'paper-random': friction = 0: must be finite and in (0, 2]": lambda: FIXED.replace(friction=0),
     "must be a number or a distribution; a key that is not used is left out": lambda: FIXED.replace(friction=None),
-    "uncertainty: friction is one number for the whole line; give it without a vehicle": lambda: parse_uncertainty(
-        "friction.vehicle_2=0.1"
-    ),
-    "uncertainty: friction=0.1: friction is not known in every world; declare it in the scenario": lambda: (
-        parse_uncertainty("friction=0.1").members(FIXED.sample(1, 7).worlds)
-    ),
-    "uncertainty: friction=1: 0.6 in world 0 may be as low as -0.4; it must stay above 0": lambda: parse_uncertainty(
-        "friction=1"
-    ).members(FIXED.replace(friction=0.6).sample(1, 7).worlds),
     "scenario 'paper-random': draws nothing: all its worlds are the same": lambda: ranges(
         eb.Scenario(**{**FIXED.declared(), "table": {"columns": ["gap_1_m", "mass_3_t"], "rows": [[12, 30]]}})
     ),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +21,9 @@ from ethbrake_marl.shield.certify import plan_harm
 from ethbrake_marl.shield.drivers import ShieldedDriver
 from ethbrake_marl.shield.reasons import ShieldReason
 from tests.fixtures.lines import line as one_line
+from tests.golden.test_golden import decisions_hash
 from tests.physics.random_worlds import Draws
+from tests.refused import refused
 from tests.shield.attacks import Hostile, begun, line
 
 EVERY = {
@@ -203,3 +206,27 @@ def test_robust_shield__trusts_a_longer_line_inside_its_box() -> None:
     driven = drive(replace(told, gaps_m=told.gaps_m + shift), shielded, five)
     assert driven.guarded.shield.distrusted.sum() == 0
     assert driven.ledger.world_harm("first").sum() > 0.0
+
+
+def test_robust_shield__decisions_have_the_committed_bits() -> None:
+    shield = RobustShield(PAPER, 1, uncertainty=parse_uncertainty("gaps_m=0.5"))
+    assert decisions_hash(shield, 10) == "8845d4c2238eac5c"
+
+
+FRICTION: dict[str, Callable[[], object]] = {
+    "uncertainty: friction is one number for the whole line; give it without a vehicle": lambda: parse_uncertainty(
+        "friction.vehicle_2=0.1"
+    ),
+    "uncertainty: friction=0.1: friction is not known in every world; declare it in the scenario": lambda: (
+        parse_uncertainty("friction=0.1").members(FIXED.sample(1, 7).worlds)
+    ),
+    "uncertainty: friction=1: 0.6 in world 0 may be as low as -0.4; it must stay above 0": lambda: parse_uncertainty(
+        "friction=1"
+    ).members(FIXED.replace(friction=0.6).sample(1, 7).worlds),
+}
+
+
+@pytest.mark.parametrize("message", FRICTION)
+def test_uncertainty_of_friction__is_refused(message: str) -> None:
+    with refused(message):
+        FRICTION[message]()

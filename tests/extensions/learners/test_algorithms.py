@@ -41,7 +41,9 @@ from ethbrake_marl.training.models import make_environment, make_model
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.training.session import train
 from ethbrake_marl.training.training import Training
+from tests.evaluation.test_rollout import check_beyond
 from tests.extensions.learners.tiny import MODES, TINY_COUNTERFACTUAL, TINY_MODES, TINY_OPTIONS
+from tests.policies.test_networks import check_mixture
 
 SCENARIO = eb.load_scenario("paper-random")
 
@@ -466,3 +468,12 @@ def test_widened_policy__keeps_the_weights_of_its_features_and_nothing_of_new_on
     assert not first[:, 0].any()
     assert (first[:, 1:] == shipped.tensors["policy.0.weight"][:, ::-1]).all()
     assert "value.0.weight" not in wide
+
+
+@pytest.mark.parametrize("around", ["+episode", "+step", "+search"])
+def test_mixture__drives_shielded_and_searched(around: str, mixture: eb.Policy, tmp_path: Path) -> None:
+    check_mixture("counterfactual", around, mixture, tmp_path)
+
+
+def test_policy__that_drives_beyond_what_it_was_trained_for_is_told_so_once() -> None:
+    check_beyond("options@shipped/options-paper-random-obstacle-total", SCENARIO, "no obstacle_gap_m")

@@ -5,7 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from ethbrake_marl.errors import _EXTRA_OF
+from ethbrake_marl.evaluation.identity import LIST_SEED
+from tests.files.test_files import check_target
 from tests.fixtures.commands import Command, check_refused, told_json
+from tests.test_imports import ended
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -55,3 +59,18 @@ def test_report__says_which_harm_the_shield_bounds(ethbrake: Command) -> None:
     assert answer.status == 0, answer.err
     text = Path("r/report.html").read_text()
     assert "minus episode mode" in text and "First-impact harm, which the shield bounds" in text
+
+
+def test_target__that_cannot_be_replaced_is_refused_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    check_target("watch --agents coast --output", tmp_path / "mine.svg", monkeypatch, capsys)
+
+
+def test_report__is_imported_where_no_package_of_an_extra_can_be() -> None:
+    absent = "".join(f"sys.modules[{name!r}] = None\n" for name in sorted(_EXTRA_OF))
+    assert ended(f"import sys\n{absent}from ethbrake_marl.extensions import report") == (0, "", "")
+
+
+def test_help__of_watch_says_the_list_that_the_package_has(ethbrake: Command) -> None:
+    assert f"[default: {LIST_SEED}]" in ethbrake("watch", "--help").out

@@ -1,6 +1,7 @@
 """The rows of the paper beside an evaluation, and what tables and pages mark."""
 
 from contextlib import nullcontext
+from typing import Any
 
 import pytest
 
@@ -10,9 +11,10 @@ from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS, is_papers_test, summarise_beside_paper
+from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 from ethbrake_marl.scenario.schema import Scenario
-from tests.evaluation.test_measures import printed
+from tests.evaluation.test_measures import CLEAR, EXPLOITS, check_marked, check_unmarked, knowing, printed, pushing
 
 SILENT = pytest.mark.filterwarnings("ignore::ethbrake_marl.extensions.search.limits.IncompleteTable")
 
@@ -66,3 +68,29 @@ def test_rows_of_the_paper__agree_with_themselves() -> None:
     random = {row.agent: row for row in PAPER_ROWS if row.table == "random test"}
     for row in random.values():
         assert row.harm_decrease == pytest.approx(1.0 - row.average_harm / random["Non-E"].average_harm, abs=1e-4)
+
+
+@SILENT  # some of the few worlds of `cooperation-2-blocked` are those of a shipped table
+@pytest.mark.usefixtures("undrawn")
+def test_knowledge__a_hiding_channel_marks_who_sees_through_it_in_the_report() -> None:
+    hiding = knowing("blocked")
+    rows = summarise(hiding)
+    for text in (printed(rows, 160), rows.markdown(), Report("Mine", rows, hiding).html):
+        check_marked(text, hiding.hidden.mean())
+
+
+@SILENT
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("v2x", CLEAR)
+def test_knowledge__where_nothing_is_hidden_nobody_is_marked_in_the_report(v2x: Any) -> None:
+    result = knowing(v2x)
+    rows = summarise(result)
+    page = Report("Mine", rows, result).html.partition(">How to read the tables</h2>")[0]
+    check_unmarked(printed(rows, 160) + rows.markdown() + page)
+
+
+@pytest.mark.parametrize(("shoved_m", "moving", "names"), EXPLOITS)
+def test_exploits__are_marked_in_the_report_too(shoved_m: float, moving: int, names: tuple[str]) -> None:
+    found = pushing(shoved_m, moving)
+    page = Report("t", summarise(found), found).html
+    assert ("mine ‡" in page) == bool(names) and "full_brake ‡" not in page

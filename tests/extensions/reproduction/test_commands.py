@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from tests.fixtures.commands import Command, told_json
+from tests.test_imports import ended
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -18,3 +19,8 @@ def test_reproduce__says_what_it_takes_makes_one_item_and_keeps_it(ethbrake: Com
     file = Path("out/accelerations/result.json")
     made = file.stat().st_mtime_ns
     assert ethbrake(*words).status == 0 and file.stat().st_mtime_ns == made
+
+
+def test_items__of_the_paper_need_no_torch() -> None:
+    program = "import sys, ethbrake_marl.extensions.reproduction.items; print({'torch'} & set(sys.modules))"
+    assert ended(program) == (0, "set()\n", "")

@@ -17,13 +17,15 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation.chunks import Lineup
 from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.measures import measures
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk, evaluate
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
 from ethbrake_marl.evaluation.tally import Tally
 from ethbrake_marl.extensions.search import limits, regret
+from ethbrake_marl.extensions.search.limit_measures import LIMITS
 from ethbrake_marl.extensions.search.limits import IncompleteTable, Unproven, known_limits, prove, unproven_because
-from ethbrake_marl.extensions.search.regret import Between, limits_of, regrets_of
+from ethbrake_marl.extensions.search.regret import KNOWN_OF_WORLDS, Between, limits_of, regrets_of
 from ethbrake_marl.extensions.search.shipped import shipped_tables
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.game.harm import Ledger
@@ -32,7 +34,8 @@ from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
 from tests.docs.site import load
-from tests.evaluation.test_measures import per_world
+from tests.evaluation.test_measures import ALWAYS, per_world
+from tests.evaluation.test_rollout import AGENTS, in_both_ways
 from tests.learning.test_runs import check_measured
 from tests.scenario.test_roads import final
 
@@ -429,3 +432,41 @@ def test_train__proves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(regret, "known_limits", prove)
     check_measured(tmp_path / "run")
     prove.assert_called_once()
+
+
+def test_figures__of_a_list_that_is_not_held_are_those_of_evaluate_that_need_no_proof(monkeypatch) -> None:
+    lineup = Lineup.of(AGENTS, load_scenario("paper-random"))
+    for one, other in in_both_ways(lineup, monkeypatch):
+        for measure in measures():
+            assert one[measure.name] == (None if measure in LIMITS.measures else other[measure.name]), measure.name
+        told, expected = ({**each.to_json(), "parameters": None} for each in (one, other))
+        proven = {name for name in told if told[name] is None}
+        assert [expected[name] for name in told if name not in proven] == [
+            told[name] for name in told if name not in proven
+        ]
+        assert {**one.parameters, "no_limits_because": None} == other.parameters
+        assert one.parameters["no_limits_because"] == "a list of more than 100,000 worlds is driven without proofs"
+
+
+# ---------------------------------------------------------------- what the limits add to summaries and files
+
+ESTIMATES = {
+    "unavoidable_rate", "impact_proven_rate", "proven_harm", "best_known_minus_proven_first",
+    "best_known_minus_proven_total", "avoidable_collision_rate", "best_known_first_impact_harm",
+    "best_known_total_harm", "mean_regret", "mean_regret_first", "mean_regret_total", "share_of_possible_reduction",
+    "share_of_possible_reduction_first", "share_of_possible_reduction_total",
+}  # fmt: skip
+MORE = {
+    "impact_unproven", "known_best_share", "best_known_warning", "below_best_known",
+    *ESTIMATES, *(f"{name}_interval" for name in ESTIMATES),
+}  # fmt: skip
+
+
+def test_summarise__has_the_keys_of_the_limits_beside_its_own(evaluation: Evaluation) -> None:
+    full, constant, gap = (row.to_json() for row in summarise(evaluation))
+    assert set(full) == set(constant) == ALWAYS | MORE
+    assert set(gap) == ALWAYS | MORE | {"predicted_harm", "predicted_harm_interval", "policy_share"}
+
+
+def test_per_world__has_the_columns_of_the_limits(evaluation: Evaluation, tmp_path: Path) -> None:
+    assert set(KNOWN_OF_WORLDS) < set(per_world(evaluation, tmp_path)[0])

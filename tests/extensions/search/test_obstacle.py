@@ -7,6 +7,7 @@ from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.extensions.search.best_harm import best_harm, task_problem
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.task import Task
+from tests.refused import refused
 
 ALL = load_scenario("cooperation-4-all")
 
@@ -30,3 +31,9 @@ def test_proofs__cover_an_obstacle_that_full_braking_never_meets() -> None:
                      ("cooperation-4-all", "cooperation-2-paper"))  # fmt: skip
     assert avoidability(worlds).reason.tolist() == avoidability(plain).reason.tolist()
     assert np.all(lower_bound(worlds).front_pair == lower_bound(plain).front_pair)
+
+
+def test_proof__of_an_obstacle_that_full_braking_meets_is_refused() -> None:
+    near = ALL.replace(obstacle_gap_m={"uniform": [10, 45]})
+    with refused("avoidability: obstacle_gap_m[0] = 33.6372: must be beyond full braking of vehicle_1"):
+        avoidability(near.sample(200, 7).worlds)

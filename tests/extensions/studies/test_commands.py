@@ -2,13 +2,17 @@
 
 from pathlib import Path
 
+import pytest
+
 from ethbrake_marl.extensions.studies.named_worlds import NamedWorlds
+from tests.files.test_files import check_target
 from tests.fixtures.commands import Command, check_refused, told_json
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
 
 EVIL = """from pathlib import Path
 import ethbrake_marl as eb
-
-pytestmark = pytest.mark.usefixtures("empty_folder")
 Path("ran").touch()
 def make():
     return eb.make_agent("coast")
@@ -32,3 +36,9 @@ def test_falsify__as_many_worlds_as_it_keeps_read_back(ethbrake: Command) -> Non
     told, kept = told_json(ethbrake("study", "falsify", *words)), NamedWorlds.read(Path("many.yaml")).worlds
     assert told["worlds"] == [world.model_dump(exclude_none=True) for world in kept] and len(kept) == 200
     assert Path("many.yaml").stat().st_size > 64 << 10
+
+
+def test_target__that_cannot_be_replaced_is_refused_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    check_target("study falsify --agent coast --output", tmp_path / "mine.yaml", monkeypatch, capsys)
