@@ -23,13 +23,8 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM
 pytest_plugins = [
     f"tests.fixtures.{name}" for name in ("installed", "pictures", "commands", "evaluation", "policies", "registered")
 ]
-TESTS = Path(__file__).parent
-if (TESTS / "extensions").exists():
+if (Path(__file__).parent / "extensions" / "proofs").exists():
     pytest_plugins.append("tests.extensions.proofs.remembered")
-else:  # the core alone: what imports an extension is not tested
-    collect_ignore = [
-        str(file) for file in TESTS.rglob("test_*.py") if "from ethbrake_marl.extensions" in file.read_text()
-    ]
 
 # Typer builds all commands for each command line, 100 ms; the suite has a thousand in one process.
 typer.main.get_command_from_info = functools.cache(typer.main.get_command_from_info)

@@ -110,7 +110,7 @@ def test_role__does_what_a_driver_does_in_an_evaluation(name):
 @pytest.mark.parametrize("around", ["+episode", "+step"])
 def test_role__has_nothing_around_it(around):
     """Two that roll themselves out would ask each other for ever, and a shield stands around who is driven."""
-    check_nothing_around("e_v2x_bm", around)
+    check_nothing_around("e_v2x_bm:pairwise", around)
 
 
 def check_nothing_around(spec, around):

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents import registry
+from ethbrake_marl.agents.protocol import Team
+from ethbrake_marl.agents.registry import Entry, make_agent
 from ethbrake_marl.envs.gymnasium import EthBrakeEnv
 from ethbrake_marl.envs.pettingzoo import parallel_env
 from ethbrake_marl.errors import UnknownName
@@ -20,6 +22,7 @@ from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.options import ShieldOptions
 from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv
+from tests.fixtures.commands import Refuse
 from tests.fixtures.lines import line as one_line
 from tests.refused import refused
 from tests.shield.attacks import begun, line
@@ -238,3 +241,16 @@ def evaluated(agent: Any, scenario: Scenario) -> object:
 def test_agent__is_refused(message: str) -> None:
     with refused(message):
         AGENTS[message]()
+
+
+def test_team__goes_behind_no_robust_shield(monkeypatch) -> None:
+    team = Team.of(make_agent("coast"), [1, 2])
+    entry = Entry("team", "team@RUN", "", (), lambda argument, settings: team)
+    monkeypatch.setitem(registry._AGENTS.loaded, "team", entry)
+    with refused("'team@run+robust': is a team, and +robust is for one driven vehicle"):
+        make_lineup(["team@run+robust"], PAIR)
+
+
+def test_evaluation__of_a_robust_shield_needs_an_uncertainty(refuse: Refuse) -> None:
+    told = "agent 'ppo@shipped+robust': mode robust needs an uncertainty"
+    refuse("evaluate --agents ppo@shipped+robust", told)

@@ -7,8 +7,9 @@ import pytest
 
 from ethbrake_marl.errors import _EXTRA_OF
 from ethbrake_marl.evaluation.identity import LIST_SEED
+from tests.cli.test_watch import check_extra
 from tests.files.test_files import check_target
-from tests.fixtures.commands import Command, check_refused, told_json
+from tests.fixtures.commands import Command, Refuse, check_refused, told_json
 from tests.test_imports import ended
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
@@ -74,3 +75,23 @@ def test_report__is_imported_where_no_package_of_an_extra_can_be() -> None:
 
 def test_help__of_watch_says_the_list_that_the_package_has(ethbrake: Command) -> None:
     assert f"[default: {LIST_SEED}]" in ethbrake("watch", "--help").out
+
+
+def test_film__of_an_extra_that_is_missing_says_the_line_that_installs_it(ethbrake: Command, monkeypatch) -> None:
+    check_extra(ethbrake, "imageio_ffmpeg", "render", "watch --agents coast --output film.mp4", monkeypatch)
+
+
+REFUSED = [
+    ("watch --agents nobody --output x.txt", "a film that ends in '.txt': films are written as .gif, .mp4, .svg")
+]
+
+
+@pytest.mark.parametrize(("line", "message"), REFUSED, ids=lambda value: value[:60])
+def test_film__is_refused(line: str, message: str, refuse: Refuse) -> None:
+    refuse(line, message)
+
+
+def test_film__that_is_there_is_not_replaced_unasked(refuse: Refuse) -> None:
+    Path("film.gif").write_text("precious")
+    told = "film.gif: is there already; give another name or use force (--force)"
+    refuse("watch --agents full_brake --output film.gif", told)
