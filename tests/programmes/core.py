@@ -1,7 +1,9 @@
 """The core alone: a copy without extensions passes the core's tests, trains, evaluates and shields.
 
 It deletes ``ethbrake_marl/extensions``, ``tests/extensions``, and the entry points in ``pyproject.toml`` that lead
-there. ``make core`` runs it. With ``--each`` it deletes one extension at a time, with those that use it, instead.
+there. ``make core`` runs it, in about 100 s of a processor: of each parametrised test the first case, in one process,
+and not those of the installation. With ``--whole`` every test of the core runs, all its cases. With ``--each`` it
+deletes one extension at a time, with those that use it, instead.
 """
 
 import os
@@ -20,16 +22,19 @@ from tests.docs.layout import arrows, layers
 from tests.fixtures.installed import write_metadata
 from tests.programmes import ROOT, Cases, Given, Told
 
-OPTIONS = {"--each": {"action": "store_true", "help": "delete one extension at a time, and those that use it"}}
+OPTIONS = {
+    "--each": {"action": "store_true", "help": "delete one extension at a time, and those that use it"},
+    "--whole": {"action": "store_true", "help": "every case of every test of the core, minutes"},
+}
 COPIED = (".ci", "docs", "ethbrake_marl", "scenarios", "tests", "train", "Makefile", "README.md", "pyproject.toml")
 APART = ("docs", "programmes")  # tests of the whole repository, which is more than its core
+INSTALLATION = ("test_imports.py", "test_install.py", "test_kernel_store.py")  # begin many processes of their own
 RUN = "runs/core"
 COMMANDS = {
     "trains PPO on paper-random": ("train", "--steps", "20000", "--output", RUN),
     "evaluates": ("evaluate", "--agents", f"full_brake,e_v2x_bm,ppo@{RUN}", "--episodes", "500"),
     "evaluates behind the shield": ("evaluate", "--agents", f"ppo@{RUN}+step,ppo@{RUN}+episode", "--episodes", "200"),
     "compares the modes of the shield": ("shield", "--agents", f"ppo@{RUN}", "--episodes", "100"),
-    "trains, shields and evaluates in one": ("run", "--steps", "20000", "--episodes", "100", "--output", "runs/all"),
     "says what there is": ("agent", "list"),
 }
 IMPORTED = "import ethbrake_marl as eb; [getattr(eb, name) for name in eb.__all__]"
@@ -56,8 +61,9 @@ def cases(given: Given) -> Cases:
             yield "no module names an extension", partial(names_none, copy)
             for name, words in COMMANDS.items():
                 yield name, partial(ended, copy, ["-m", "ethbrake_marl", *words])
-            ignored = [f"--ignore=tests/{each}" for each in APART]
-            tests = ["-m", "pytest", "-q", "-n", "2", "--dist", "worksteal", *ignored, "tests"]
+            apart = APART if given.whole else (*APART, *INSTALLATION)
+            how = ["-n", "2", "--dist", "worksteal"] if given.whole else ["--first-case"]
+            tests = ["-m", "pytest", "-q", *how, *(f"--ignore=tests/{each}" for each in apart), "tests"]
             yield "the core's tests", partial(ended, copy, tests)
         yield "processor time", used
 
