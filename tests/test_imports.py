@@ -127,7 +127,7 @@ def test_start__version_every_help_and_completion_import_nothing_heavy() -> None
     status, out, err = ended(STARTS)
     assert (status, err) == (0, "")
     assert out.endswith("\n--scenario\n")
-    assert "Train a policy, or those of several learners." in out
+    assert "Train a policy, or the policies of several learners." in out
 
 
 @pytest.mark.parametrize("use", ["ethbrake_marl.Scenario", "run_command(['scenario', 'show', 'paper-random'])"])

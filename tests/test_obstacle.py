@@ -10,7 +10,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.evaluation.per_world import write_per_world
 from ethbrake_marl.game.harm import empty_ledger
@@ -86,7 +86,7 @@ def test_shield__step_mode_bounds_the_harm_of_the_obstacle_too_to_the_last_bit(v
     agent = ShieldedDriver(make_agent("coast"), scenario, harm_count="total")
     episodes = drive(scenario.sample(40, 7).worlds, agent, scenario, vehicle)
     harm, shield = episodes.ledger.world_harm("total"), episodes.guarded.shield
-    assert not shield.distrusted.any()
+    assert not shield.memory.distrusted.any()
     assert (harm <= shield.predicted_harm).all() and np.array_equal(harm, shield.bound)
     assert (shield.interventions > 0).sum() > 5 and (episodes.ledger.obstacle_count > 0).any()
 

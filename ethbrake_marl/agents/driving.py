@@ -1,4 +1,4 @@
-"""Letting agents drive through whole episodes: the loop of every evaluation and of every prediction."""
+"""Run agents through whole episodes: the loop of every evaluation and every prediction."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from ethbrake_marl.agents.making import make_role
 from ethbrake_marl.agents.protocol import Agent, Driver, Team
-from ethbrake_marl.agents.registry import around_one_vehicle, make_role
+from ethbrake_marl.agents.registry import around_one_vehicle
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.memory import Memory
 from ethbrake_marl.errors import InvalidInput, PhysicsError
@@ -20,17 +21,17 @@ from ethbrake_marl.scenario.schema import Scenario
 
 @dataclass(frozen=True, slots=True)
 class Episodes:
-    """How the episodes of a batch went."""
+    """Result of a batch of episodes."""
 
     ledger: Ledger
-    final: Worlds  # each world as its episode left it
-    at_rest: Bools  # [n] the line came to rest; else the horizon cut the episode off
-    guarded: Any  # what the shield remembers at their end; None without one
-    memories: Mapping[int, Memory]  # by driven vehicle, what its agent remembers at their end
+    final: Worlds  # each world at the end of its episode
+    at_rest: Bools  # [n] whether the line came to rest; otherwise the episode ended at the horizon
+    guarded: Any  # memory of the shield at the end; None without a shield
+    memories: Mapping[int, Memory]  # controlled vehicle -> memory of its agent at the end
 
     @classmethod
     def of(cls, engine: Engine, worlds: Worlds, watched_by: Sequence[Watch] = ()) -> Episodes:
-        """Those of an ``episode_engine``, still at the first decision in ``worlds``; raises ``PhysicsError``."""
+        """Run an ``episode_engine`` from the first decision in ``worlds`` to the end; raise ``PhysicsError``."""
         at_rest = np.zeros(worlds.n, np.bool_)
         now = _show(watched_by, worlds, engine, engine.worlds.command_mps2)
         while not engine.ended.all():
@@ -43,30 +44,30 @@ class Episodes:
 
 
 class Watch(Protocol):
-    """Sees every step of a batch of episodes."""
+    """Observer of every step of a batch of episodes."""
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """``before`` moved to the times ``until_s`` [n] under ``command_mps2`` [n, N]; ended worlds stay at theirs.
+        """Called with a step: ``before`` moves to the times ``until_s`` [n] under ``command_mps2`` [n, N].
 
-        The first step is from the alert to the first decision; where a script decides on the way, a step is seen in
-        parts. Nothing of what is given may be changed.
+        Ended worlds stay at their times. The first step is from the alert to the first decision. If a script decides
+        within a step, the step is passed in parts. The arguments must not be changed.
         """
         ...
 
 
 def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | None = None) -> dict[int, Agent]:
-    """Agents for the scenario's scripts, by vehicle."""
+    """Return vehicle -> agent for the scenario's scripts, without the vehicles in ``except_for``."""
     left_out = (except_for,) if isinstance(except_for, int) else except_for or ()
     return {i: make_role(scenario, i) for i in scenario.scripts if i not in left_out}
 
 
 def episode_engine(worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None) -> Engine:
-    """An engine over ``worlds`` in which ``agent`` drives ``vehicle``, or a team its vehicles; the others are scripted.
+    """Return an engine over ``worlds`` in which ``agent`` drives ``vehicle``, or a team drives its vehicles.
 
-    They decide when their first vehicle's latency has elapsed and every time step from then on, as learners do; their
-    commands are applied unrounded. Behind a shield they propose, and learn as far as the engine knows. One that looks
-    ahead knows the scripts, and takes the other driven vehicles to
-    brake fully. Raises ``InvalidInput`` for a learner that nobody drives.
+    The other vehicles follow their scripts. The agents decide when their first vehicle's latency has elapsed and every
+    time step after that, like learners; their commands are applied without rounding. Behind a shield they propose
+    commands, and the engine treats their vehicles as learners. An agent that looks ahead knows the scripts, and assumes
+    that other controlled vehicles brake fully. Raises ``InvalidInput`` for a learner without an agent.
     """
     team = agent if isinstance(agent, Team) else Team.of(agent, () if vehicle is None else (vehicle,))
     drivers = team.drivers
@@ -90,26 +91,27 @@ def episode_engine(worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: i
             guard=lambda engine: shield.guard(engine, drivers),
         )  # fmt: skip
         engine.check_time_step(drivers)
-    engine.roster.warns = False  # who drives looks
+    engine.roster.warns = False  # the caller of the loop checks for failed worlds
     return engine
 
 
 def drive(
     worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None, *, watched_by: Sequence[Watch] = ()
 ) -> Episodes:
-    """Let ``agent`` drive ``vehicle``, or a team its vehicles, through every world (at t = 0) to its episode's end.
+    """Let ``agent`` drive ``vehicle``, or a team its vehicles, in every world from t = 0 to the end of its episode.
 
-    Raises ``PhysicsError`` naming all worlds that could not be advanced; the others are well without them.
+    ``watched_by`` sees every step. Raises ``PhysicsError`` with all worlds that could not be advanced; the others are
+    valid without them.
     """
     engine = episode_engine(worlds, agent, scenario, vehicle)
     return Episodes.of(engine, scenario.play_pieces(worlds, engine.deciders), watched_by)
 
 
 def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_mps2: Floats) -> Worlds:
-    """Show the step that the engine has just made; gives the worlds as they are now."""
+    """Show the step that the engine has just made to the observers; return the worlds after it."""
     if not watched_by:
         return before
-    now = engine.packed.worlds(before.vehicles)  # the episodes are the same, and so are their vehicles
+    now = engine.packed.worlds(before.vehicles)  # same episodes, same vehicles
     for part in engine.segments(before, command_mps2):
         for watch in watched_by:
             watch.see(*part)
@@ -117,10 +119,10 @@ def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_m
 
 
 def record_commands(agent: Driver, worlds: Worlds, scenario: Scenario, vehicle: int, steps: int) -> Floats:
-    """The commands that ``agent`` gives ``vehicle`` in the first ``steps`` decisions of its episodes, [n, steps] m/s2.
+    """Return the commands that ``agent`` gives ``vehicle`` in the first ``steps`` decisions, [n, steps] m/s2.
 
-    ``worlds`` are at the alert. After an episode's end its last command goes on. Raises ``PhysicsError`` naming the
-    worlds that it cannot drive to the end.
+    ``worlds`` are at the alert. After the end of an episode its last command is repeated. Raises ``PhysicsError`` with
+    the worlds that cannot be driven to the end.
     """
     engine = episode_engine(worlds, agent, scenario, vehicle)
     commands = write_down(engine, steps, lambda: engine.wanted_mps2[:, [vehicle]])[:, :, 0]
@@ -130,9 +132,9 @@ def record_commands(agent: Driver, worlds: Worlds, scenario: Scenario, vehicle: 
 
 
 def write_down(engine: Engine, steps: int, column: Callable[[], Floats]) -> Floats:
-    """Play such an engine to the end; the ``column`` [n, K] after each of the first steps, [n, steps, K].
+    """Run an episode engine to the end; return ``column()`` [n, K] after each of the first steps, [n, steps, K].
 
-    NaN after an episode's end. Raises ``PhysicsError``.
+    NaN after the end of an episode. Raises ``PhysicsError``.
     """
     columns = np.full((steps, *column().shape), np.nan)
     while not engine.ended.all():

@@ -1,4 +1,4 @@
-"""Options that commands share, and the output of a command."""
+"""Options that several commands share, and the output of a command."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from ethbrake_marl.envs.registration import register_environments
 from ethbrake_marl.errors import InvalidInput, one_line, plain_text
 from ethbrake_marl.progress import Progress as PartProgress
 
-_KEPT = "\n\t\N{NO-BREAK SPACE}"  # in lines of a result; the last stands between a number and its unit
+_KEPT = "\n\t\N{NO-BREAK SPACE}"  # special characters allowed in results; the last stands between number and unit
 
-EVERY_S = 10.0  # between two signs of life where stderr is no terminal
+EVERY_S = 10.0  # time between two lines of progress if stderr is not a terminal
 
 ScenarioOption = Annotated[
     str, typer.Option(metavar="NAME|PATH", help="A shipped or registered scenario, or a path to a YAML file.")
@@ -57,7 +57,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the results as J
 
 
 def schema_option(module: str, model: str, kind: str) -> Any:
-    """The option ``--schema`` of a command that reads files of one kind: print their JSON Schema and exit."""
+    """Return the option ``--schema`` of a command: print the JSON Schema of its files and exit."""
 
     def show_schema(asked: bool) -> None:
         if asked:
@@ -69,21 +69,21 @@ def schema_option(module: str, model: str, kind: str) -> Any:
 
 
 def example(*lines: str) -> str:
-    """The end of a help page: command lines behind ``ethbrake``."""
+    """Return the end of a help page: example command lines, each after ``ethbrake``."""
     return "\n\n".join(f"Example: ethbrake {line}" for line in lines)
 
 
 def say(text: str) -> None:
-    """One line to the person at the terminal, on stderr."""
+    """Print one line to the user, on stderr."""
     typer.echo(one_line(text), err=True)
 
 
 class Out:
-    """The output of one command, used as ``with Out() as out``.
+    """Output of one command, used as ``with Out() as out``.
 
-    ``as_json``: results are wanted as JSON. ``force``: files are replaced. ``kept``: what Ctrl-C leaves, in words.
-    Inside ``with``, stdout is turned to stderr, for what a user's agent prints: results alone go to stdout. Ctrl-C
-    ends the command with one line and status 130.
+    ``as_json``: print results as JSON. ``force``: replace existing files. ``kept``: what remains after Ctrl-C, in
+    words. Inside ``with``, only results go to stdout; everything else that is printed, for instance by a user's agent,
+    goes to stderr. Ctrl-C ends the command with one line and status 130.
     """
 
     def __init__(self, *, as_json: bool = False, force: bool = False, kept: str = "nothing was written") -> None:
@@ -92,12 +92,12 @@ class Out:
         self._stderr: Console = _PlainConsole(sys.stderr)
         self._bars: Progress | None = None
         self._tasks: dict[str, TaskID] = {}
-        self._said_s = -EVERY_S  # when a line was said last, where stderr is no terminal
-        self._begun: dict[str, tuple[float, int]] = {}  # when each part was first heard of, and how far it was
+        self._said_s = -EVERY_S  # time of the last line of progress, if stderr is not a terminal
+        self._begun: dict[str, tuple[float, int]] = {}  # time and progress at the first report of each part
         self._turned = redirect_stdout(sys.stderr)
 
     def __enter__(self) -> Self:
-        """Turn stdout to stderr; code of the user's finds the environments registered."""
+        """Redirect stdout to stderr, and register the environments for the user's code."""
         self._turned.__enter__()
         register_environments()
         return self
@@ -105,26 +105,26 @@ class Out:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Leave the bars as they are, and say what Ctrl-C left."""
+        """Leave the progress bars as they are, and print what remains after Ctrl-C."""
         self._turned.__exit__(kind, error, trace)
         self.end_progress()
         if isinstance(error, KeyboardInterrupt):
             self.interrupted(f"interrupted; {self.kept}")
 
     def result(self, content: Any, *shown: RenderableType, end: str = "\n") -> None:
-        """The result: ``content`` as JSON where that is asked for, else what is ``shown``."""
+        """Print the result: ``content`` if JSON is requested, else ``shown``."""
         if self.as_json:
             self.print_json(content)
         else:
             self.show(*shown, end=end)
 
     def print_json(self, content: Any) -> None:
-        """JSON on stdout, asked for or not."""
+        """Print JSON on stdout, whether or not ``--json`` was passed."""
         self.end_progress()
         typer.echo(json.dumps(content, indent=2, allow_nan=False), self._stdout)
 
     def show(self, *shown: RenderableType, end: str = "\n") -> None:
-        """Texts and tables of a result; nothing in a text but line ends and tabs moves the cursor."""
+        """Print texts and tables on stdout. In texts, only line ends and tabs can move the cursor."""
         self.end_progress()
         for each in shown:
             if isinstance(each, str):
@@ -133,12 +133,12 @@ class Out:
                 _PlainConsole(self._stdout, width=None if self._stdout.isatty() else 100).print(each)
 
     def note(self, text: str) -> None:
-        """One line to the person at the terminal, below the progress."""
+        """Print one line to the user on stderr, below the progress."""
         self.end_progress()
         say(text)
 
     def check(self, path: Path | None, *endings: str, what: str = "the file") -> None:
-        """Refuse, before any work, a file that cannot be written; None: none is wanted."""
+        """Raise ``InvalidInput``, before any work, if a file cannot be written; None: no file is requested."""
         if path is None:
             return
         if endings and path.suffix.lower() not in endings:
@@ -148,7 +148,7 @@ class Out:
         check_target(path, force=self.force)
 
     def write(self, path: Path, content: bytes | str, what: str | None = None) -> None:
-        """Write a file in one step, and say ``what`` it is."""
+        """Write a file atomically, and print ``what`` it is."""
         from ethbrake_marl.files.store import write_output
 
         write_output(path, content.encode() if isinstance(content, str) else content, force=self.force)
@@ -161,10 +161,10 @@ class Out:
         raise typer.Exit(130)  # 128 + SIGINT, as shells expect
 
     def progress(self, name: str, done: int, total: int, harm: str = "", note: str = "") -> None:
-        """The part ``name`` has come to ``done`` of ``total``; ``note`` is said once, above the bars.
+        """Show that the part ``name`` has reached ``done`` of ``total``; ``note`` is printed once, above the bars.
 
-        On a terminal one bar per part, else a line at the beginning and every ten seconds. What stands behind ": " in
-        a name is a stage of the part before it, and shares its bar.
+        On a terminal there is one bar per part; otherwise one line at the beginning and every ten seconds. Text after
+        ": " in a name is a stage of the part before it, and shares its bar.
         """
         label = one_line(f"{name}, {harm}" if harm else name)
         if not self._stderr.is_terminal:
@@ -192,23 +192,23 @@ class Out:
             self._said_s = now
 
     def show_progress(self, progress: PartProgress) -> None:
-        """``progress`` of a ``Progress``, as the package tells it."""
+        """Show a ``Progress`` object of the package."""
         self.progress(progress.name, progress.done, progress.total, progress.harm, progress.note)
 
     def end_progress(self) -> None:
-        """Leave the bars as they are; what comes next stands below them."""
+        """Leave the bars as they are; later output stands below them."""
         if self._bars is not None:
             self._bars.stop()
             self._bars, self._tasks = None, {}
 
 
 class _PlainConsole(Console):
-    """Shows text as it is: no markup in the names of agents and paths, and nothing that commands the terminal."""
+    """Console that prints text literally: no markup in names of agents and paths, and no control characters."""
 
     def __init__(self, file: TextIO, *, width: int | None = None) -> None:
         super().__init__(file=file, width=width, markup=False, emoji=False, highlight=False)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
-        """The pieces of a line or table; those that rich made to style and move keep what they hold."""
+        """Yield the segments of a line or table, with control characters of texts replaced."""
         for piece in super().render(renderable, options):
             yield piece if piece.control else Segment(plain_text(piece.text, keep=_KEPT), piece.style)

@@ -1,4 +1,4 @@
-"""Pages and pictures that commands write, by what they show. The core draws none: an extension registers each."""
+"""Registry of the pages and pictures that commands write. The core draws none; extensions register them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ethbrake_marl.registry import Registry
 
 
 def register_page(shows: str, write: Callable[..., None]) -> None:
-    """Make ``write`` draw what a command shows, ``"evaluation"`` or ``"worlds"``, from the arguments that it gives.
+    """Register a function that writes a page about ``"evaluation"`` or ``"worlds"``; a command calls it.
 
     An installed package does the same with an entry point of the group ``ethbrake_marl.pages``.
     """
@@ -21,7 +21,7 @@ PAGES: Registry[Callable[..., Any]] = Registry("page", "pages", register_page)
 
 
 def page_of(shows: str, option: str) -> Callable[..., None]:
-    """What draws this; raises ``InvalidInput`` where nothing that is installed does."""
+    """Return the function that writes this page. Raise ``InvalidInput``, naming ``option``, if none is installed."""
     if shows not in PAGES:
         raise InvalidInput(f"{option}: nothing draws {shows}: the extension that does is not installed")
     return PAGES[shows]

@@ -37,7 +37,7 @@ OutputOption = Annotated[
 
 
 def run_folder(scenario: scenarios.Scenario, recipe: training.TrainingRecipe, seed: int | None) -> Path:
-    """Where a run goes if nothing else is said; the scheme stands behind the recipe where the recipe names one."""
+    """Return the default folder of a run. If the recipe names a scheme, the scheme follows the recipe's name."""
     plan = recipe.name if recipe.scheme is None else f"{recipe.name}-{recipe.scheme}"
     return RUNS / f"{scenario.name}-{plan}-seed{recipe.seed if seed is None else seed}"
 
@@ -63,9 +63,9 @@ def run_command(
 ) -> None:
     """Train a policy, shield it, compare with the baselines, report.
 
-    Writes the run's folder: the policy, results as CSV and JSON, every world, and what installed reports add: three
-    figures and report.html; after one of the three tests (paper-random, -brake-only, -obstacle) also the other two.
-    Ctrl-C ends the training early, and what it has is evaluated; a second Ctrl-C stops at once.
+    Writes the run's folder: the policy, results as CSV and JSON, every world, and the installed reports: three
+    figures and report.html; for one of the three tests (paper-random, -brake-only, -obstacle) also the other two.
+    Ctrl-C ends the training early, and the policy so far is evaluated; a second Ctrl-C stops at once.
     """
     with Out(as_json=as_json, force=force, kept=KEPT) as out:
         # torch takes seconds to load, here and in the other commands that learn
@@ -101,7 +101,7 @@ def run_command(
 
 
 def quickest() -> str:
-    """The recipe of `ethbrake run` where none is named."""
+    """Return the recipe that `ethbrake run` trains by default."""
     usable = training.TrainingRecipe.usable()
     return next(name for name in QUICKEST if name in usable)
 
@@ -136,12 +136,11 @@ def train_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Train a policy, or those of several learners.
+    """Train a policy, or the policies of several learners.
 
     Writes a run's folder. Afterwards: `ethbrake evaluate --agents full_brake,ppo@FOLDER,ppo@FOLDER+episode`;
-    of several: `team@FOLDER`. Ctrl-C ends the training after the update in progress and keeps the policy; `ethbrake
-    train --resume FOLDER` goes on: the policy is the one that the training would have come to without the stop, bit
-    for bit.
+    for several learners: `team@FOLDER`. Ctrl-C ends the training after the current update and keeps the policy;
+    `ethbrake train --resume FOLDER` continues: the final policy is the same, bit for bit, as without the stop.
     """
     with Out(as_json=as_json, force=force, kept=KEPT) as out:
         if resume is not None:
@@ -167,7 +166,7 @@ def train_command(
         begun = [training.Training.of(plan, chosen).who_drives()]
 
         def tell(progress: Progress) -> None:
-            if begun:  # all input is known to be good
+            if begun:  # all input has been checked by now
                 out.note(begun.pop())
             out.show_progress(progress)
 
@@ -179,7 +178,7 @@ def train_command(
 
 
 def _tell(out: Out, result: training.TrainResult) -> None:
-    """What a training came to."""
+    """Print the result of a training."""
     out.result({
         "directory": str(result.directory),
         "status": result.status,
@@ -194,7 +193,7 @@ def _tell(out: Out, result: training.TrainResult) -> None:
 
 
 def _end(out: Out, result: training.TrainResult) -> None:
-    """Say what a training left; an interrupted one ends with that status."""
+    """Print how a training ended and where it is; an interrupted training ends the command with that status."""
     if result.status == "interrupted":
         left = f"go on with: ethbrake train --resume {result.directory} (its policy is there)"
         out.interrupted(f"interrupted after {result.steps:,} training steps; {left}")

@@ -1,69 +1,70 @@
-"""The compiled step of the engine: actions to commands, motion, episode ends, the terms of reward that all share.
+"""The engine's compiled step: actions to commands, motion, ends of episodes, and the reward that vehicles share.
 
-Worlds are rows of ``physics.batch``; ``clock`` [n, 4] holds what an episode needs beside them.
+Worlds are rows as in ``physics.columns``; ``clock`` [n, 4] holds the additional state of each episode.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from ethbrake_marl.game.actions import command_of
 from ethbrake_marl.game.rewards import RewardParams
-from ethbrake_marl.physics.columns import columns
+from ethbrake_marl.physics.columns import Packed, columns
 from ethbrake_marl.physics.episode import onset_s, stands, step_end_s
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.motion import BOUND, command_acts
 from ethbrake_marl.physics.pieces import force_at
-from ethbrake_marl.physics.rows import FLAG, ROW, place_forces, place_obstacle, rows_for
+from ethbrake_marl.physics.rows import FLAG, LISTED, ROW, place_forces, place_obstacle, rows_for
 from ethbrake_marl.physics.segment import advance_table
-from ethbrake_marl.physics.state import Bools, Floats, Ints
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
-# columns of clock
+# columns of ``clock``
 START = 0  # time of the first decision (s)
 
-STEP = 1  # steps taken
+STEP = 1  # number of steps taken
 
-LAST_STEP = 2  # the step that ends at the horizon
+LAST_STEP = 2  # number of the step that ends at the horizon
 
-ENDED = 3  # 1 once the episode has ended
+ENDED = 3  # 1 after the episode has ended, else 0
 
 CLOCK_WIDTH = 4
 
-# rows of outcome: what the step brought to each world
-STEP_FIRST_HARM = 0
+# rows of ``outcome``: results of the step in each world
+STEP_FIRST_HARM = 0  # first-impact harm of the step (m2/s2)
 
-STEP_TOTAL_HARM = 1
+STEP_TOTAL_HARM = 1  # total harm of the step (m2/s2)
 
-TERMINATED = 2  # 1 if the step ended the episode in this way, else 0
+TERMINATED = 2  # 1 if the step ended the episode at rest, else 0
 
-TRUNCATED = 3
+TRUNCATED = 3  # 1 if the step ended the episode at the horizon, else 0
 
-SAFE_END = 4  # without any collision
+SAFE_END = 4  # 1 if the episode ended without any impact, else 0
 
-FAILED = 5  # what went wrong (a status of the kernel) where the world could not be advanced, else 0
+FAILED = 5  # status code of the kernel if the world could not be advanced, else 0
 
 OUTCOME_ROWS = 6
 
-# places in settings
+# indices of ``settings``
 TIME_STEP, HORIZON, HARM_WEIGHT, HARM_IS_TOTAL, TERMINAL_WEIGHT = range(5)
 
 BAD_ACTION = -1
 
 
 class Step(NamedTuple):
-    """What one step brought, for every world of the batch."""
+    """Results of one step in every world of the batch."""
 
-    reward: Floats  # [n, N]
-    outcome: Floats  # [OUTCOME_ROWS, n] as the kernel tells it; read it through the properties
+    reward: Floats  # [n, N] reward of each vehicle
+    outcome: Floats  # [OUTCOME_ROWS, n] raw results of the kernel; use the properties to read them
     params: RewardParams
     further: dict[str, Floats]  # unweighted reward terms that differ between vehicles or need the motion, each [n, N]
 
     @property
     def terminated(self) -> Bools:
-        """Episodes that ended with this step with everything at rest and no command that would move it, [n]."""
+        """Episodes that this step ended at rest, with no command that would move a vehicle, [n]."""
         return self._is(TERMINATED)
 
     @property
@@ -78,22 +79,22 @@ class Step(NamedTuple):
 
     @property
     def failed(self) -> Ints:
-        """What went wrong in the worlds that could not be advanced (a status of the kernel), 0 elsewhere, [n]."""
+        """Status code of the kernel in the worlds that could not be advanced, 0 elsewhere, [n]."""
         return np.asarray(self.outcome[FAILED], np.int64)
 
     @property
     def safe_end(self) -> Bools:
-        """Episodes that ended with this step without any collision, [n]."""
+        """Episodes that ended with this step without any impact, [n]."""
         return self._is(SAFE_END)
 
     @property
     def first_impact_harm(self) -> Floats:
-        """Of the whole line in this step, [n]."""
+        """First-impact harm of the whole line in this step, [n] m2/s2."""
         return np.asarray(self.outcome[STEP_FIRST_HARM], np.float64)
 
     @property
     def total_harm(self) -> Floats:
-        """Likewise, every impact counted, [n]."""
+        """Total harm of the whole line in this step, every impact counted, [n] m2/s2."""
         return np.asarray(self.outcome[STEP_TOTAL_HARM], np.float64)
 
     @property
@@ -103,7 +104,7 @@ class Step(NamedTuple):
 
     @property
     def counted_harm(self) -> Floats:
-        """Harm of the whole line in this step, as the reward counts impacts, [n]."""
+        """Harm of the whole line in this step, under the reward's harm count, [n] m2/s2."""
         return self.first_impact_harm if self.params.harm_count == "first" else self.total_harm
 
     def _is(self, row: int) -> Bools:
@@ -112,7 +113,10 @@ class Step(NamedTuple):
 
 @compiled(apart=True, bare=True)
 def place_row(table: Floats, state: Floats, params: Floats, k: int, pieces: Floats) -> None:
-    """``place_forces`` of a row; a function of its own, as worlds without rates would pay for it in their loop."""
+    """Put forces, rates of build-up and braking pieces of world ``k`` into the table, by ``place_forces``.
+
+    This is a separate function because it would slow down the loop for worlds without build-up.
+    """
     column, N = columns(state), pieces.shape[0]
     command, brake_rate, release_rate = column.command, column.brake_rate, column.release_rate
     place_forces(
@@ -126,13 +130,13 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     state: Floats, params: Floats, clock: Floats, actions: Floats, learners: Ints, settings: Floats, no_rows: Floats,
     builds_up: bool, pieces: Floats, wanted: Floats, reward: Floats, outcome: Floats,
 ) -> tuple[int, int]:  # fmt: skip
-    """Advance every running world by one step, in place (state, clock, wanted); fills the last two arrays.
+    """Advance every running world by one step, in place (state, clock, wanted); fill ``reward`` and ``outcome``.
 
-    ``actions`` [n, L] become the learners' commands in ``wanted`` [n, N]; nothing is moved if one of them is not in
-    [-1, 1]. A world that cannot be advanced stays where it was; its episode is cut off there, without a reward, and
-    marked in ``outcome``. Without ``builds_up`` no world's brakes do, nor come in ``pieces`` [N, 2 K], those of all
-    worlds. Returns a world and what went wrong there (BAD_ACTION, or the status of one that could not be advanced), or
-    (-1, DONE).
+    ``actions`` [n, L] become the learners' commands in ``wanted`` [n, N]. If an action is not in [-1, 1], nothing is
+    moved. A world that cannot be advanced keeps its state; its episode is cut off there, without a reward, and marked
+    in ``outcome``. ``builds_up`` must be True if brakes build up in any world; ``pieces`` [N, 2 K], the same in all
+    worlds, are used only then. Returns the row of a world and its error (BAD_ACTION, or the status of a world that
+    could not be advanced), or (-1, DONE).
     """
     n, N = wanted.shape
     for k in range(n):
@@ -144,7 +148,7 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     braking, driving, latency, mass, limit = column.braking, column.driving, column.latency, column.mass, column.limit
     P, obstacle = N - 1, column.obstacle
     worst, worst_status = -1, FLAG.DONE
-    at = 1 if state.shape[1] > obstacle else 0  # vehicle i stands in column at + i, behind an obstacle
+    at = 1 if state.shape[1] > obstacle else 0  # vehicle i is in column at + i; an obstacle is in column 0
     table = np.zeros((rows_for(pieces.shape[1]) if builds_up else ROW.OF_SEGMENT, N + at))
     for k in range(n):
         if clock[k, ENDED] == 1.0:
@@ -229,3 +233,33 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         for i in range(N):
             reward[k, i] = shared
     return worst, worst_status
+
+
+NO_ROWS = np.empty((0, LISTED.WIDTH))  # an empty list of impacts, so that none are recorded
+
+
+class Rules(NamedTuple):
+    """What all steps of an engine have in common, and the compiled step under it."""
+
+    learners: Ints  # [L] indices of the learners
+    settings: Floats  # [5] TIME_STEP, HORIZON, HARM_WEIGHT, HARM_IS_TOTAL, TERMINAL_WEIGHT
+    builds_up: bool  # whether the brakes of some world may build up, or follow ``pieces``
+    pieces: Floats  # [N, 2 K] braking profile of each scripted vehicle, as in ``Vehicles``; K may be 0
+
+    def step(
+        self, worlds: Packed, clock: Floats, actions: Floats, wanted: Floats, reward: Floats, outcome: Floats
+    ) -> int:
+        """Advance every running world by one step, in place; return a status. See ``step_worlds``."""
+        _, status = step_worlds(
+            *worlds, clock, actions, self.learners, self.settings, NO_ROWS, self.builds_up, self.pieces, wanted,
+            reward, outcome,
+        )  # fmt: skip
+        return status
+
+    def unpack(self, packed: Packed) -> Worlds:
+        """The worlds of these rows, in their own memory, with the pieces in which their scripts brake."""
+        worlds = packed.worlds()
+        if self.pieces.shape[1] == 0:
+            return worlds
+        pieces = np.repeat(self.pieces[np.newaxis], worlds.n, axis=0)
+        return replace(worlds, vehicles=replace(worlds.vehicles, pieces=pieces))

@@ -4,25 +4,12 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.engine.compiled_step import (
-    BAD_ACTION,
-    ENDED,
-    FAILED,
-    LAST_STEP,
-    OUTCOME_ROWS,
-    START,
-    STEP,
-    TERMINAL_WEIGHT,
-    TRUNCATED,
-    Step,
-    step_worlds,
-)
+from ethbrake_marl.engine.compiled_step import BAD_ACTION, ENDED, OUTCOME_ROWS, START, STEP, TRUNCATED, Rules, Step
 from ethbrake_marl.engine.memory import (
     Arrays,
     Memory,
@@ -32,13 +19,13 @@ from ethbrake_marl.engine.memory import (
     flat,
     is_state_free,
     renew_memory,
-    take_memory,
     unflat,
     within_capacity,
 )
+from ethbrake_marl.engine.own_grid import OwnGrid, Stop, Way
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.engine.state import State
-from ethbrake_marl.engine.stream import NO_ROWS, Roster, Start, Stream, check_alert, packed_with
+from ethbrake_marl.engine.stream import Roster, Start, Stream, check_alert, packed_with
 from ethbrake_marl.engine.terms import Terms
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep, renumbered
 from ethbrake_marl.game.actions import checked_action
@@ -55,19 +42,7 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
 SNAPSHOT = ("state", "params", "clock", "wanted", "potential")  # names of the arrays of a state in a snapshot
 
-ROUNDING = 1e-9  # of a time step: moments that are so close are one
-
 Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]
-
-
-class Way(NamedTuple):
-    """What a step brought before the last stop on its way, where a script on a grid of its own decided."""
-
-    reward: Floats  # [n, N] of what all vehicles share
-    harm: Floats  # [2, n] of the line, by both counts
-    stopped: Bools  # [n]
-    failed: Ints  # [n] status of the kernel where the world could not be moved, else 0
-    in_force: Floats  # [n, N] commands when the step began
 
 
 class Watcher(Protocol):
@@ -124,11 +99,10 @@ class Now(NamedTuple):
     stream: Stream
     obstacle: bool  # the rows have columns of an obstacle
     by_link: bool  # ... of news by link
-    builds_up: bool  # brakes of some world may build up, or come in pieces
-    pieces: Floats  # [N, 2 K] of all worlds, as in ``Vehicles``
+    rules: Rules
     watched: dict[Watcher, Any]  # what each watcher remembers
     ruling: Ruling | None = None  # of the last step
-    stops: tuple[tuple[Floats, Floats], ...] = ()  # within the last step: the motion there, and the commands up to it
+    stops: tuple[Stop, ...] = ()  # of scripts on their own grid within the last step
 
     def apart(self) -> Now:
         """The same, in arrays of its own."""
@@ -200,10 +174,10 @@ class Engine:
         self._plans = tuple(each.plan for each in self.observations)
         self._alike = len(set(self.observations)) == 1
         self._remembering = {i: s for i, s in self.scripts.items() if not is_state_free(s)}
-        self._on_own_grid = {i: s for i, s in self._remembering.items() if i not in self.deciders}
+        times = scenario.time_step_s, scenario.horizon_s
+        self._own_grid = OwnGrid({i: s for i, s in self._remembering.items() if i not in self.deciders}, *times)
         self._learner_index = np.array(self.learners, np.int64)
         total = float(self.reward.harm_count == "total")
-        times = scenario.time_step_s, scenario.horizon_s
         self._settings = np.array([*times, self._terms.shared_harm, total, self.reward.terminal])
         self.reward_terms = self.reward.counted  # names of those whose values each step tells
         self.check_time_step(self.scripts)
@@ -258,7 +232,7 @@ class Engine:
 
     @property
     def packed(self) -> Packed:
-        """The running worlds themselves, as rows of ``physics.batch``: for kernels to read, not to be changed."""
+        """The running worlds as rows (``physics.columns``), not a copy: kernels read them, nobody changes them."""
         return self._now.state.packed
 
     @property
@@ -269,19 +243,12 @@ class Engine:
     @property
     def worlds(self) -> Worlds:
         """The worlds as they are now, in their own memory."""
-        return self._unpacked(self.packed)
+        return self._now.rules.unpack(self.packed)
 
     @property
     def in_pieces(self) -> bool:
         """Whether some script brakes in pieces."""
-        return bool(self._now.pieces.shape[1] > 0)
-
-    def _unpacked(self, packed: Packed) -> Worlds:
-        worlds = packed.worlds()
-        if not self.in_pieces:
-            return worlds
-        pieces = np.repeat(self._now.pieces[np.newaxis], worlds.n, axis=0)
-        return replace(worlds, vehicles=replace(worlds.vehicles, pieces=pieces))
+        return bool(self._now.rules.pieces.shape[1] > 0)
 
     @property
     def ledger(self) -> Ledger:
@@ -362,7 +329,8 @@ class Engine:
         motion, params = (array.copy() for array in packed.widened(obstacle, by_link))
         clock, wanted = start.clock.copy(), start.wanted.copy()
         state = State(motion, params, clock, wanted, np.zeros(wanted.shape), {}, guarded)
-        new = self._at(Now(state, roster, stream, obstacle, by_link, builds_up, pieces, watched))
+        rules = Rules(self._learner_index, self._settings, builds_up, pieces)
+        new = self._at(Now(state, roster, stream, obstacle, by_link, rules, watched))
         new._begin(np.arange(self.n), start)
         return new._now
 
@@ -424,7 +392,7 @@ class Engine:
     @property
     def _nobody_refuses_steps(self) -> bool:
         """Whether nothing can fail within a step: then it is made in the arrays that are there."""
-        return not (self.guard or self._now.watched or self._terms.are_foreign or self._on_own_grid)
+        return not (self.guard or self._now.watched or self._terms.are_foreign or self._own_grid.scripts)
 
     def _ruled(self, before: Engine, columns: Floats, *, checked: bool) -> Ruling:
         """What the guard makes of the actions [n, L]; they are in range if they are ``checked``."""
@@ -455,9 +423,10 @@ class Engine:
     def _ask_scripts(self) -> dict[int, Memory]:
         """What the scripts that decide in every step want now; and what they remember once the step is made."""
         asked: dict[int, Memory] = {}
-        if len(self._remembering) > len(self._on_own_grid):
+        own_grid = self._own_grid.scripts
+        if len(self._remembering) > len(own_grid):
             worlds, wanted = self.worlds, self.state.wanted
-            for vehicle in self._remembering.keys() - self._on_own_grid.keys():
+            for vehicle in self._remembering.keys() - own_grid.keys():
                 script = self._remembering[vehicle]
                 command, asked[vehicle] = ask_script(script, worlds, self.memories[vehicle], vehicle)
                 wanted[:, vehicle] = within_capacity(command, worlds, vehicle, script)
@@ -467,21 +436,28 @@ class Engine:
         """Move the worlds under the actions [n, L], and hear what messages bring. Also: whether a world failed."""
         if self._now.stops:
             self._now = self._now._replace(stops=())
-        way = self._start_on_own_grid(columns) if self._on_own_grid else None
-        state = self.state
+        way = self._drive_own_grid(columns) if self._own_grid.scripts else None
+        state, rules = self._now.state, self._now.rules
         was = state.motion.copy() if state.packed.has_messages else None
         reward, outcome = np.empty(state.wanted.shape), np.empty((OUTCOME_ROWS, self.n))
-        status = self._step_worlds(columns, reward, outcome)
+        status = rules.step(state.packed, state.clock, columns, state.wanted, reward, outcome)
         if status == BAD_ACTION:  # nothing was moved
-            status = self._step_worlds(self._in_range(columns), reward, outcome)
+            actions = self._in_range(columns)
+            status = rules.step(state.packed, state.clock, actions, state.wanted, reward, outcome)
         if was is not None:
-            hear_rows(
-                was, state.params, state.wanted, state.time_s, state.time_s, self.scenario.time_step_s, self._now.pieces
-            )
+            times = state.time_s, state.time_s, self.scenario.time_step_s
+            hear_rows(was, state.params, state.wanted, *times, rules.pieces)
         if way is not None:
-            self._add_way(way, reward, outcome)
+            way.add_to(state.motion, state.packed.column, reward, outcome)
         some_failed = status != FLAG.DONE or (way is not None and bool(way.failed.any()))
         return Step(reward, outcome, self.reward, {}), some_failed
+
+    def _drive_own_grid(self, columns: Floats) -> Way:
+        """Let the scripts on their own grids decide within the step that begins."""
+        way = self._own_grid.drive_step(self.state, self._now.rules, self._in_range(columns))
+        self._change(memories=way.memories)
+        self._now = self._now._replace(stops=way.stops)
+        return way
 
     def _columns(self, actions: Actions) -> Floats:
         """The learners' actions as [n, L]; their range is checked where they are used."""
@@ -505,15 +481,6 @@ class Engine:
             columns[:, c] = checked_action(actions[vehicle], (self.n,), f"vehicle_{vehicle + 1}")
         return columns
 
-    def _step_worlds(self, columns: Floats, reward: Floats, outcome: Floats) -> int:
-        """The compiled step, in place. Returns a status."""
-        now, state = self._now, self._now.state
-        _, status = step_worlds(
-            state.motion, state.params, state.clock, columns, self._learner_index, self._settings, NO_ROWS,
-            now.builds_up, now.pieces, state.wanted, reward, outcome,
-        )  # fmt: skip
-        return status
-
     def _in_range(self, columns: Floats) -> Floats:
         """The actions [n, L] without the last rounding of a float32; ``InvalidInput`` for one out of range."""
         each = [checked_action(columns[:, c], (self.n,), f"vehicle_{i + 1}") for c, i in enumerate(self.learners)]
@@ -530,128 +497,22 @@ class Engine:
                 self._now = self._now._replace(watched=watched)
                 begun = {i: begin_script(s, alert, i, self._now.stream.known) for i, s in self._remembering.items()}
             self._change(memories=renew_memory(memories, rows, begun) if memories else begun)
-        motion, params, _, wanted, potential, *_ = self.state
-        if self._on_own_grid:
-            self._begin_on_own_grid(rows, start.alert, start.clock[:, START])
+        (motion, params, _, wanted, potential, *_), rules = self.state, self._now.rules
+        if self._own_grid.scripts:
+            at_alert = self._now.kept(Packed.of(start.alert)).state
+            stops = tuple((there.copy(), last) for there, last in self._now.stops)  # of the episodes that go on
+            for there in (motion, *(there for there, _ in stops)):
+                there[rows] = at_alert
+            way = self._own_grid.drive_to_start(self.state, rules, rows, start.clock[:, START])
+            self._change(memories=way.memories)
+            self._now = self._now._replace(stops=(*stops, *way.stops))
         elif self.packed.has_messages:
             at_alert, heard = self._now.kept(Packed.of(start.alert)).state, params[rows]
             start_s = self.state.time_s[rows]
-            hear_rows(at_alert, heard, wanted[rows], start_s, start_s, self.scenario.time_step_s, self._now.pieces)
+            hear_rows(at_alert, heard, wanted[rows], start_s, start_s, self.scenario.time_step_s, rules.pieces)
             params[rows] = heard
         if self.reward.shaping > 0.0:
-            worlds = self._unpacked(Packed(motion[rows], params[rows]))
-            potential[rows] = self._terms.potentials(worlds, self.scenario)
-
-    def _start_on_own_grid(self, columns: Floats) -> Way:
-        """Let the scripts on their own grids decide within the step that begins; what comes of the way there."""
-        state, column = self.state, self.packed.column
-        in_force = state.motion[:, column.command : column.previous].copy()
-        steps, last, start_s = (state.clock[:, at] for at in (STEP, LAST_STEP, START))
-        until_s = Decisions(start_s, self.scenario.time_step_s).at(steps + 1.0)
-        until_s = np.where(steps + 1.0 >= last, self.scenario.horizon_s, until_s)
-        way = self._decide_on_the_way(~self.ended, until_s, self._in_range(columns))
-        state.clock[way.failed != 0, ENDED] = 1.0
-        return way._replace(in_force=in_force)
-
-    def _add_way(self, way: Way, reward: Floats, outcome: Floats) -> None:
-        """Add the way to the last stop to what came after it, in place."""
-        reward += way.reward
-        outcome[: len(way.harm)] += way.harm
-        column = self.packed.column
-        self.state.motion[way.stopped, column.previous : column.gap] = way.in_force[way.stopped]
-        lost = way.failed != 0
-        outcome[TRUNCATED, lost], outcome[FAILED, lost] = 1.0, way.failed[lost]
-
-    def _decide_on_the_way(self, running: Bools, until_s: Floats, columns: Floats) -> Way:
-        """Let the scripts on their own grids make all decisions before ``until_s`` [n] in the ``running`` worlds.
-
-        A world is moved to a decision only where that changes a command: the bits depend on where motion changes.
-        """
-        motion, params, _, wanted_so_far, *_ = self.state
-        (n, N), column = wanted_so_far.shape, self.packed.column
-        vehicles, step_s = list(self._on_own_grid), self.scenario.time_step_s
-        first_s = params[:, column.latency : column.mass][:, vehicles].T
-        made = np.maximum(Decisions(first_s, step_s).before(motion[:, column.time]), 0.0)
-        due = np.where(running, np.maximum(Decisions(first_s, step_s).before(until_s), 0.0), made)
-        way = Way(np.zeros((n, N)), np.zeros((2, n)), np.zeros(n, np.bool_), np.zeros(n, np.int64), np.empty(0))
-        while (made < due).any():
-            next_s = np.where(made < due, first_s + made * step_s, np.inf)
-            moment = next_s.min(axis=0)
-            asked = next_s <= moment + ROUNDING * step_s
-            asked &= made < due
-            now = motion[:, column.time]
-            moment = np.where((moment < np.inf) & (moment > now + ROUNDING * step_s), moment, now)
-            ahead, reward, outcome = self._look_ahead(moment, until_s, columns)
-            worlds, wanted = self._unpacked(ahead), wanted_so_far.copy()
-            for (vehicle, script), here in zip(self._on_own_grid.items(), asked, strict=True):
-                if here.any():
-                    before, idle = self.memories[vehicle], np.flatnonzero(~here)
-                    command, after = ask_script(script, worlds, before, vehicle)
-                    command = np.where(here, command, 0.0)
-                    wanted[here, vehicle] = within_capacity(command, worlds, vehicle, script, here)[here]
-                    renewed = renew_memory(after, idle, take_memory(before, idle))
-                    self._change(memories=self.memories | {vehicle: renewed})
-            changed = (wanted != wanted_so_far)[:, vehicles] & (
-                made > 0.0
-            ).T  # a first one waits for the latency anyway
-            stops = (moment > now) & changed.any(axis=1) & (outcome[FAILED] == 0.0)
-            way.failed[:] = np.where(outcome[FAILED] != 0.0, outcome[FAILED], way.failed)
-            if stops.any():
-                self._stop(stops, ahead)
-                way.reward[stops] += reward[stops]
-                way.harm[:, stops] += outcome[: len(way.harm), stops]
-                way.stopped[stops] = True
-            wanted_so_far[:] = wanted
-            made += asked
-            made = np.where(way.failed != 0, due, made)
-        return way
-
-    def _look_ahead(self, until_s: Floats, decision_s: Floats, columns: Floats) -> tuple[Packed, Floats, Floats]:
-        """The worlds at ``until_s`` [n], and reward [n, N] and outcome of the way there; ``decision_s``: the next one.
-
-        Only the learners' commands in ``state.wanted`` are changed, by ``columns`` [n, L]; none without any.
-        """
-        now, wanted = self.state, self.state.wanted
-        clock, settings = np.zeros(now.clock.shape), self._settings.copy()
-        clock[:, START], clock[:, STEP], clock[:, LAST_STEP] = until_s, -1.0, np.inf  # a step from -1 to 0 ends there
-        clock[:, ENDED] = ~(until_s > now.time_s)
-        settings[TERMINAL_WEIGHT] = 0.0
-        reward, outcome = np.empty(wanted.shape), np.empty((OUTCOME_ROWS, self.n))
-        ahead = Packed(now.motion.copy(), now.params.copy())
-        step_worlds(
-            *ahead, clock, columns, self._learner_index[: columns.shape[1]], settings, NO_ROWS,
-            self._now.builds_up, self._now.pieces, wanted, reward, outcome,
-        )  # fmt: skip
-        if self.packed.has_messages:
-            time_s, step_s = ahead.state[:, ahead.column.time], self.scenario.time_step_s
-            hear_rows(now.motion.copy(), ahead.params, wanted, time_s, decision_s, step_s, self._now.pieces)
-        return ahead, reward, outcome
-
-    def _stop(self, rows: Bools, ahead: Packed) -> None:
-        """Move these rows to where the look ahead found them."""
-        motion, params, _, wanted, *_ = self.state
-        motion[rows], params[rows] = ahead.state[rows], ahead.params[rows]
-        self._now = self._now._replace(stops=(*self._now.stops, (motion.copy(), wanted.copy())))
-
-    def _begin_on_own_grid(self, rows: Ints, alert: Worlds, start_s: Floats) -> None:
-        """From the alert on scripts with a memory decide on their own grids; then the first decision is near.
-
-        Deciders do not: like a learner they coast, and are seen to coast, until their first decision.
-        """
-        motion, params = self.packed
-        stops = tuple((there.copy(), wanted) for there, wanted in self._now.stops)  # of who goes on; the others did not
-        for there in (motion, *(there for there, _ in stops)):
-            there[rows] = self._now.kept(Packed.of(alert)).state
-        self._now = self._now._replace(stops=stops)
-        time_s = self.state.time_s
-        running, until_s, none = np.zeros(self.n, np.bool_), time_s.copy(), np.empty((self.n, 0))
-        running[rows], until_s[rows] = True, start_s
-        way = self._decide_on_the_way(running, until_s, none)
-        ahead, _, outcome = self._look_ahead(until_s, until_s, none)
-        failed = np.where(way.failed != 0, way.failed, outcome[FAILED].astype(np.int64))
-        if failed.any():
-            raise FLAG.failure(np.where(failed == 0, FLAG.DONE, failed), time_s, until_s)
-        motion[rows], params[rows] = ahead.state[rows], ahead.params[rows]
+            potential[rows] = self._terms.potentials(rules.unpack(Packed(motion[rows], params[rows])), self.scenario)
 
     def segments(self, before: Worlds, last_mps2: Floats) -> Iterator[tuple[Worlds, Floats, Floats]]:
         """The last step, made from ``before`` (after a reset: the alert), in parts within which nobody decides.
@@ -697,12 +558,12 @@ class Engine:
         stream, roster = copy.copy(self._now.stream), Roster(self.n, seed, None)
         stream.restart(seed, taken)
         roster.numbers = np.array(arrays["numbers"], np.int64)
-        self._now = self._now._replace(
-            state=state, stream=stream, roster=roster, builds_up=self._may_build_up(state.packed)
-        )
+        self._now = self._now._replace(state=state, stream=stream, roster=roster, rules=self._rules_for(state))
 
-    def _may_build_up(self, packed: Packed) -> bool:
-        return self.scenario.builds_up or packed.builds_up or self.in_pieces
+    def _rules_for(self, state: State) -> Rules:
+        """The rules for other rows: their brakes may build up where those of the rows before did not."""
+        builds_up = self.scenario.builds_up or state.packed.builds_up or self.in_pieces
+        return self._now.rules._replace(builds_up=builds_up)
 
     def place(self, worlds: Worlds, ledger: Ledger | None = None, *, ended: Bools | None = None) -> None:
         """Put the running worlds in all rows as somebody else has moved them, with their ``ledger`` so far.
@@ -745,10 +606,8 @@ class Engine:
         n = len(state.motion)
         roster = Roster(n, self.seed, None)
         roster.warns = False
-        builds_up = self._may_build_up(state.packed)
-        return self._unwatched(
-            n, self._now._replace(state=state.copy(), roster=roster, ruling=None, builds_up=builds_up)
-        )
+        rules = self._rules_for(state)
+        return self._unwatched(n, self._now._replace(state=state.copy(), roster=roster, ruling=None, rules=rules))
 
     def _unwatched(self, n: int, now: Now) -> Engine:
         """An engine of the same scenario for ``n`` worlds, at that moment, which nobody watches."""

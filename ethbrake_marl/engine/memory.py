@@ -1,4 +1,4 @@
-"""Memories: trees of arrays, row by row."""
+"""Memories of scripts: trees of arrays with one row per world, and checked calls of scripts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import AgentFailed, EthBrakeError, InvalidInput, count_of, describe_error
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
-Memory = Any  # None, an array [n, ...], or a tuple or mapping of memories
+Memory = Any  # None, an array [n, ...], or a tuple or mapping of memories, one row per world
 
 _SHAPES = (
     "one that remembers has begin(alert, vehicle, scripts) -> memory and act(worlds, memory, vehicle) -> (command,"
@@ -24,7 +24,7 @@ _SHAPES = (
 
 
 def map_memory(function: Callable[..., Any], memory: Memory, *others: Memory) -> Memory:
-    """The function of every array of a memory, together with those in its place in the others."""
+    """Apply ``function`` to every array of a memory, together with the corresponding arrays of ``others``."""
     if memory is None:
         return None
     if isinstance(memory, Mapping):
@@ -35,12 +35,15 @@ def map_memory(function: Callable[..., Any], memory: Memory, *others: Memory) ->
 
 
 def take_memory(memory: Memory, rows: Ints) -> Memory:
-    """The memory of some rows, in its own arrays."""
+    """Return the memory restricted to ``rows``, in new arrays."""
     return map_memory(lambda array: array[rows], memory)
 
 
 def renew_memory(memory: Memory, rows: Ints, part: Memory) -> Memory:
-    """The memory with that of ``rows`` from another; what that does not hold, or not yet, stays as it is."""
+    """Return ``memory`` with ``rows`` replaced by those of ``part``; what ``part`` lacks or has as None is kept.
+
+    Raises ``InvalidInput`` if ``part`` has keys that ``memory`` lacks.
+    """
     if part is None:
         return memory
     if memory is None or (isinstance(part, Mapping) and not part.keys() <= memory.keys()):
@@ -55,10 +58,10 @@ def renew_memory(memory: Memory, rows: Ints, part: Memory) -> Memory:
 
 
 def checked_memory(memory: Memory, n: int, what: str = "state") -> Memory:
-    """A memory of ``n`` worlds; raises ``InvalidInput``, with ``what`` it is, for an array of another number.
+    """Return ``memory``; raise ``InvalidInput``, naming ``what`` it is, unless every array has ``n`` rows.
 
-    Arrays of objects are refused, too: a copy of one still holds the same objects. So are keys that are no names:
-    a snapshot writes them down with a dot between those of one array.
+    Arrays of objects are also refused, because a copy still holds the same objects. Keys of mappings must be
+    identifiers, because a snapshot joins them with dots.
     """
 
     def check(array: Any) -> Any:
@@ -87,7 +90,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def flat(memory: Memory) -> Arrays:
-    """The arrays of a memory, by their place in it; an empty one stands for what is not remembered yet."""
+    """Return the arrays of a memory by their path in it; an empty array stands for None."""
     if isinstance(memory, Mapping | tuple):
         parts = memory.items() if isinstance(memory, Mapping) else enumerate(memory)
         return {f"{key}.{name}" if name else str(key): array for key, of in parts for name, array in flat(of).items()}
@@ -95,7 +98,7 @@ def flat(memory: Memory) -> Arrays:
 
 
 def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
-    """The memory whose arrays stand at a place, in its own arrays; numbers are places in a tuple."""
+    """Return a copy of the memory at path ``place`` of ``arrays``: the inverse of ``flat``. Numbers index tuples."""
     if place in arrays:
         return np.array(arrays[place]) if arrays[place].shape != (0,) else None
     inner = dict.fromkeys(name[len(place) + 1 :].partition(".")[0] for name in arrays if name.startswith(f"{place}."))
@@ -106,7 +109,7 @@ def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
 
 
 def _check_kept(before: Memory, after: Memory, who: str) -> None:
-    """Raise ``InvalidInput`` for a memory of another form than it began with: rows that begin anew would not fit."""
+    """Raise ``InvalidInput`` if a memory's keys, shapes or dtypes changed; restarted rows would not fit then."""
     began, told = (map_memory(lambda array: (array.dtype, *array.shape[1:]), each) for each in (before, after))
     if began != told:
         raise InvalidInput(
@@ -116,19 +119,19 @@ def _check_kept(before: Memory, after: Memory, who: str) -> None:
 
 
 def is_state_free(script: Script) -> bool:
-    """Whether the script's command never changes during an episode."""
+    """Return whether the script's command never changes during an episode."""
     return bool(getattr(script, "state_free", False))
 
 
 def is_ours(script: Script) -> bool:
-    """Whether this package made the script; any other gets worlds that it cannot write to, as they are everybody's."""
+    """Return whether the script belongs to this package. Other scripts get read-only worlds, because all share them."""
     return type(script).__module__.startswith("ethbrake_marl.")
 
 
 def begin_script(script: Script, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-    """What a script remembers once episodes start in these worlds; None of one that remembers nothing.
+    """Return the memory of a script after episodes start in these worlds; None for a script without memory.
 
-    Raises ``InvalidInput`` naming it for whatever a script that is not ours raises, and for a memory that is none.
+    Raises ``InvalidInput`` naming the script for whatever a user's script raises, and for an invalid memory.
     """
     begin = getattr(script, "begin", None)
     if begin is None:
@@ -147,10 +150,10 @@ def begin_script(script: Script, alert: Worlds, vehicle: int, scripts: Mapping[i
 
 
 def ask_script(script: Script, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-    """The command of a script, [n] m/s2, and what it remembers then.
+    """Return the command of a script, [n] m/s2, and its new memory.
 
-    Raises ``AgentFailed`` naming it, world, moment and shape for a command of another shape, or of no numbers, and
-    ``InvalidInput`` naming it for whatever a script that is not ours raises, or where it keeps something in itself.
+    Raises ``AgentFailed`` naming script, world, moment and shape for a command that is not one number per world, and
+    ``InvalidInput`` naming the script for whatever a user's script raises, or if it changes its own attributes.
     """
     remembers = hasattr(script, "begin")
     try:
@@ -183,7 +186,7 @@ def ask_script(script: Script, worlds: Worlds, memory: Memory, vehicle: int) -> 
 
 @contextmanager
 def _as_it_was(script: Script, vehicle: int) -> Iterator[None]:
-    """Refuse, with ``InvalidInput``, a script that changes its own attributes: they would be those of all episodes."""
+    """Raise ``InvalidInput`` if a script changes its own attributes in the block, since all episodes share them."""
     before = dict(getattr(script, "__dict__", {}))
     yield
     for name in {**before, **getattr(script, "__dict__", {})}:
@@ -197,7 +200,7 @@ def _who(script: Script, vehicle: int) -> str:
 
 
 def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle: int) -> Exception:
-    """The error to raise for what a script raised: its own, where it speaks for itself."""
+    """Return the error to raise for a script's error: one that names the script, unless it is the package's own."""
     if isinstance(error, EthBrakeError) or is_ours(script):
         return error
     who = _who(script, vehicle)
@@ -208,7 +211,7 @@ def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle:
 def within_capacity(
     command_mps2: Floats, worlds: Worlds, vehicle: int, script: Script, due: Bools | None = None
 ) -> Floats:
-    """A script's command [n], refused with ``AgentFailed`` where it is ``due`` and not within the capacities."""
+    """Return a script's command [n]; raise ``AgentFailed`` where it is ``due`` and beyond the vehicle's capacities."""
     low, high = -worlds.vehicles.braking_capacity_mps2[:, vehicle], worlds.vehicles.driving_capacity_mps2[:, vehicle]
     good = (command_mps2 >= low) & (command_mps2 <= high)
     if due is not None:

@@ -1,4 +1,7 @@
-"""Whole command profiles of some vehicles, and the harm they lead to: the problem that search and shield solve."""
+"""Command profiles of whole episodes, and the harm that they lead to: the problem that search and shield solve.
+
+A *profile* holds the commands of the controlled vehicles from the first decision to the horizon, in at most K phases.
+"""
 
 from __future__ import annotations
 
@@ -22,39 +25,45 @@ MOST_PHASES = 12
 
 
 class SearchWorld(NamedTuple):
-    """One world as candidates run in it."""
+    """One world of a ``ProfileProblem``, prepared for running candidate profiles."""
 
     episode: Episode
     bounds: Floats  # [C, 2] smallest and largest command (m/s2)
-    random: UInt64s  # [1] state of the world's random numbers
+    random: UInt64s  # [1] state of the world's random generator
 
 
 @compiled
 def copy_rows(rows: Floats, to_rows: Floats, n: int) -> None:
-    """Copy the first ``n`` rows. (An assignment of slices compiles ten times longer, for its message of an error.)"""
+    """Copy the first ``n`` rows, element by element.
+
+    An assignment of slices would take ten times longer to compile, because of its error message.
+    """
     for k in range(n):
         for c in range(rows.shape[1]):
             to_rows[k, c] = rows[k, c]
 
 
-TIME_STEP_S = 0.1  # between two decisions, where nobody says otherwise
+TIME_STEP_S = 0.1  # default time between two decisions
 
 
 class ProfileProblem(NamedTuple):
-    """Whose commands are chosen, in which worlds, on which grid of decisions. Build it with ``profile_problem``."""
+    """The controlled vehicles, the worlds and the times of the decisions for command profiles. Use ``profile_problem``.
 
-    vehicles: Ints  # [C] controlled, index from 0; in lines with an obstacle from 1, it being vehicle 0 of every column
-    start: Floats  # [n, S] at the first decision
-    clock: Floats  # [n, CLOCK_WIDTH]
-    bounds: Floats  # [n, C, 2] m/s2
-    command: Floats  # [n, N] of the others
-    latency: Floats  # [n, N]
-    mass: Floats  # [n, N]
-    limit: Floats  # [n, N]
-    brake_rate: Floats  # [n, N] m/s3
-    release_rate: Floats  # [n, N]
-    pieces: Floats  # [n, N, 2 K]
-    identity: UInt64s  # [n]
+    Lines with an obstacle have it as vehicle 0 of every column, so that the vehicles' indices start from 1.
+    """
+
+    vehicles: Ints  # [C] indices of the controlled vehicles
+    start: Floats  # [n, S] state at the first decision, as ``physics.episode.save`` stores it
+    clock: Floats  # [n, CLOCK.WIDTH] clock of each episode, see ``physics.episode``
+    bounds: Floats  # [n, C, 2] smallest and largest command of the controlled vehicles (m/s2)
+    command: Floats  # [n, N] commands of the other vehicles (m/s2)
+    latency: Floats  # [n, N] latencies (s)
+    mass: Floats  # [n, N] masses (t)
+    limit: Floats  # [n, N] speed limits (m/s)
+    brake_rate: Floats  # [n, N] rates at which brakes build up (m/s3)
+    release_rate: Floats  # [n, N] rates at which brakes are released (m/s3)
+    pieces: Floats  # [n, N, 2 K] braking profiles of the vehicles that brake in pieces
+    identity: UInt64s  # [n] hash of each world's problem, see ``identities``
 
     @property
     def n(self) -> int:
@@ -62,12 +71,12 @@ class ProfileProblem(NamedTuple):
         return len(self.start)
 
     def take(self, rows: Ints) -> ProfileProblem:
-        """That of some of the worlds."""
+        """Return the problem restricted to these worlds."""
         arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._fields[1:]}
         return self._replace(**arrays)
 
     def put(self, rows: Ints, new: ProfileProblem) -> ProfileProblem:
-        """A copy with the worlds of a ``new`` one in these rows."""
+        """Return a copy in which these rows are replaced by the worlds of ``new``."""
         arrays: dict[str, Any] = {name: getattr(self, name).copy() for name in self._fields[1:]}
         for name, array in arrays.items():
             array[rows] = getattr(new, name)
@@ -79,7 +88,7 @@ class ProfileProblem(NamedTuple):
         return self.clock[:, CLOCK.LAST_STEP].astype(np.int64)
 
     def constant(self, commands_mps2: Floats) -> Profiles:
-        """Profiles [n * Q] that hold the given commands [n, Q, C], divided into phases for a search to change."""
+        """Return profiles [n * Q] that hold the commands [n, Q, C], divided into phases that a search can change."""
         n, Q, C = commands_mps2.shape
         borders = np.array([2, 5, 9, 14, 20] + (MOST_PHASES - 5) * [np.iinfo(np.int64).max])
         ends = np.minimum(borders, self.last_step[:, np.newaxis])
@@ -91,16 +100,17 @@ class ProfileProblem(NamedTuple):
         )
 
     def even_grid(self, number: int) -> Floats:
-        """``number`` commands from each vehicle's least to its greatest, evenly spaced, both included.
+        """Return ``number`` evenly spaced commands from each vehicle's smallest to its largest, [n, number, C] m/s2.
 
-        [n, number, C] m/s2. ``low + (high - low)`` may lie an ulp beyond ``high``, so the greatest is taken as it is.
+        Both ends are included. ``low + (high - low)`` may be an ulp above ``high``, so the result is limited to
+        ``high``.
         """
         low, high = self.bounds[:, np.newaxis, :, 0], self.bounds[:, np.newaxis, :, 1]
         share = np.linspace(0.0, 1.0, number)[:, np.newaxis]
         return np.asarray(np.minimum(low + share * (high - low), high), np.float64)
 
     def follow(self, profiles: Profiles) -> tuple[Floats, Floats]:
-        """First-impact and total harm [n] of one profile per world, as the engine counts it, to the same bits.
+        """Return first-impact and total harm [n] of one profile per world, equal to the engine's to the bit.
 
         Raises ``InvalidInput`` for profiles that do not fit the problem or exceed a capacity, ``PhysicsError`` naming
         the worlds in which a check of the kernel failed.
@@ -115,7 +125,7 @@ class ProfileProblem(NamedTuple):
         return first, total
 
     def check(self, profiles: Profiles) -> None:
-        """Raise ``InvalidInput`` unless there is one profile per world, within the capacities, its phases in order."""
+        """Raise ``InvalidInput`` unless there is one profile per world, within the capacities, with ordered phases."""
         n, C = self.n, len(self.vehicles)
         K = profiles.ends.shape[-1]
         if profiles.ends.shape != (n, K) or profiles.commands_mps2.shape != (n, K, C):
@@ -147,14 +157,16 @@ def profile_problem(
     deciders: Sequence[int] | None = None,
     written_out: bool = False,
 ) -> ProfileProblem:
-    """The problem of choosing the whole profiles of ``vehicles`` (indices from 0) so as to do the least harm.
+    """Return the problem of choosing whole command profiles of ``vehicles`` (indices from 0) with the least harm.
 
-    The first decision falls on the smallest latency of the ``deciders`` (default: ``vehicles``) or on the worlds' time,
-    whichever is later; one follows every ``time_step_s``. Where any world has an obstacle ahead, it is written out as a
-    vehicle in front (``Worlds.with_obstacle``; in the others one that nobody reaches): all columns of the problem are
-    those of that line. The other vehicles follow ``others_mps2`` [n, N] (default: full braking; the columns of
-    ``vehicles`` are ignored). Raises ``InvalidInput`` for no vehicle, one given twice or not there, an unknown count, a
-    command beyond capacity, or a horizon before the first decision.
+    The first decision is at the smallest latency of the ``deciders`` (default: ``vehicles``), or at the worlds' time if
+    that is later; decisions follow every ``time_step_s``. The other vehicles follow ``others_mps2`` [n, N] (default:
+    full braking; the columns of ``vehicles`` are ignored).
+
+    If any world has an obstacle ahead, or with ``written_out``, the obstacle becomes a vehicle in front
+    (``Worlds.with_obstacle``; worlds without one get one out of reach), and all columns of the problem describe that
+    longer line. Raises ``InvalidInput`` for no vehicle, a repeated or unknown one, an unknown harm count, a command
+    beyond capacity, or a horizon before the first decision.
     """
     chosen = _checked_vehicles(vehicles, worlds.N)
     check_harm_count(harm_count)
@@ -176,7 +188,7 @@ def profile_problem(
             others_mps2=np.concatenate([np.zeros((len(command), 1)), command], axis=1),
             deciders=None if deciders is None else [i + 1 for i in deciders],
         )
-        if not obstacle.all():  # a world is searched as it is beside any others
+        if not obstacle.all():  # the identity of a world must not depend on the other worlds
             free = np.flatnonzero(~obstacle)
             found.identity[free] = profile_problem(
                 worlds.take(free), vehicles, harm_count=harm_count, horizon_s=horizon_s, time_step_s=time_step_s,
@@ -207,10 +219,10 @@ def profile_problem(
 
 
 def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -> UInt64s:
-    """What tells one world's problem from another's, [n]: 8 bytes of BLAKE2b over all that the harm depends on.
+    """Return a hash of each world's problem, [n]: 8 bytes of BLAKE2b over everything that the harm depends on.
 
-    State and parameters of the world, the other vehicles' commands, the decisions (first, step, number), the horizon
-    and the controlled vehicles; not the count.
+    The input is the state and parameters of the world, the other vehicles' commands, the decisions (first, step,
+    number), the horizon and the controlled vehicles, but not the harm count.
     """
     packed = Packed.of(worlds)
     (state, params), column = packed, packed.column
@@ -220,20 +232,20 @@ def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -
         state[:, [column.time]],
         state[:, column.speed : column.command],
         state[:, column.gap : column.harm],
-        params[:, : column.brake_rate],  # the news of others changes no harm
+        params[:, : column.brake_rate],  # without messages, which do not affect the harm
         command,
         clock[:, [CLOCK.START, CLOCK.TIME_STEP, CLOCK.LAST_STEP, CLOCK.HORIZON]],
         who,
     ]
-    rows = np.ascontiguousarray(np.concatenate(parts, axis=1) + 0.0, "<f8")  # + 0.0: one zero, not two
-    slow = worlds.vehicles.build_up  # others have the names that they had before there were rates
+    rows = np.ascontiguousarray(np.concatenate(parts, axis=1) + 0.0, "<f8")  # + 0.0 turns -0.0 into 0.0
+    slow = worlds.vehicles.build_up  # other worlds keep the hashes of versions without build-up rates
     forces = np.concatenate(
         [state[:, column.command : column.previous], params[:, column.brake_rate : column.own_latency]], 1
     )
     further = [forces[k].tobytes() if slow[k] else b"" for k in range(worlds.n)]
     for k in np.flatnonzero(worlds.vehicles.in_pieces):
         pieces = worlds.vehicles.pieces[k]
-        there = np.isfinite(pieces)  # not how many others of the batch have
+        there = np.isfinite(pieces)  # without the padding, which depends on the other worlds
         further[k] += there.sum(axis=1).astype("<i8").tobytes() + pieces[there].astype("<f8").tobytes()
     digests = [hashlib.blake2b(row.tobytes() + further[k], digest_size=8).digest() for k, row in enumerate(rows)]
     return np.frombuffer(b"".join(digests), "<u8").astype(np.uint64)
@@ -247,28 +259,28 @@ def _checked_vehicles(vehicles: Sequence[int], N: int) -> Ints:
 
 
 class Profiles(NamedTuple):
-    """One profile per world: ``commands_mps2[k, j]`` from step ``ends[k, j - 1]`` to ``ends[k, j]`` of the decisions.
+    """One profile per world: ``commands_mps2[k, j]`` is in force from decision ``ends[k, j - 1]`` to ``ends[k, j]``.
 
-    Phases beyond a world's last one are empty: they too end at the last step.
+    Phases after a world's last one are empty: they also end at the last step.
     """
 
-    ends: Ints  # [n, K]
-    commands_mps2: Floats  # [n, K, C]
+    ends: Ints  # [n, K] number of the decision at which each phase ends
+    commands_mps2: Floats  # [n, K, C] commands in each phase
 
     def at(self, step: Ints) -> Floats:
-        """The commands in force in these steps [n]: [n, C] m/s2; beyond the last step its command goes on."""
+        """Return the commands in force in these steps [n], [n, C] m/s2. The last command continues afterwards."""
         phase = np.minimum((self.ends <= step[:, np.newaxis]).sum(axis=1), self.ends.shape[1] - 1)
         return np.asarray(self.commands_mps2[np.arange(len(phase)), phase], np.float64)
 
     def take(self, rows: Ints | slice) -> Profiles:
-        """Those of some worlds."""
+        """Return the profiles of these worlds."""
         return Profiles(self.ends[rows], self.commands_mps2[rows])
 
     @staticmethod
     def padded(parts: Sequence[Profiles], least: int) -> list[Profiles]:
-        """The same profiles, all with as many phases (at least ``least``): empty ones are added.
+        """Return copies in which all profiles have the same number of phases, at least ``least``.
 
-        In their own memory.
+        The added phases are empty.
         """
         width = max([least, *(part.ends.shape[1] for part in parts)])
         return [
@@ -280,14 +292,14 @@ class Profiles(NamedTuple):
         ]
 
     def grown(self, n: int) -> Profiles:
-        """These and as many meaningless ones as make ``n`` in all; in their own memory."""
+        """Return a copy with ``n`` rows, in which the added rows are meaningless."""
         more = n - len(self.ends)
         return Profiles(np.pad(self.ends, ((0, more), (0, 0))), np.pad(self.commands_mps2, ((0, more), (0, 0), (0, 0))))
 
 
 @compiled
 def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> SearchWorld:
-    """The surroundings of world k, with room to work in; ``random`` [n]: the states of all worlds' random numbers."""
+    """Return world ``k`` of a problem with working memory; ``random`` [n] holds the random states of all worlds."""
     N = problem.mass.shape[1]
     table = np.zeros((rows_for(problem.pieces.shape[2]), N))
     for i in range(N):
@@ -301,7 +313,10 @@ def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> Searc
 def follow_worlds(
     problem: ProfileProblem, ends: Ints, commands: Floats, first: Floats, total: Floats, failed: Bools
 ) -> None:
-    """Fill ``first`` and ``total`` [n] with the harm of one profile per world, and ``failed`` [n] where it ended."""
+    """Fill ``first`` and ``total`` [n] with the harm of one profile per world.
+
+    Sets ``failed`` [n] where the physics fails.
+    """
     start, no_random = problem.start, np.zeros(problem.start.shape[0], np.uint64)
     for k in range(start.shape[0]):
         episode = make_search_world(problem, k, no_random).episode

@@ -1,1 +1,1 @@
-"""The interfaces: PettingZoo (parallel, AEC), Gymnasium, Gymnasium vector, SB3 ``VecEnv``; ``render()``."""
+"""Environments: PettingZoo (parallel, AEC), Gymnasium, Gymnasium vector and SB3 ``VecEnv``; and ``render()``."""

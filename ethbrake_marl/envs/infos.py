@@ -1,14 +1,14 @@
-"""Infos of every interface, computed once for all vehicles of all worlds: the same keys after a reset and a step.
+"""Infos of every interface, computed once for all vehicles of all worlds. A reset and a step give the same keys.
 
-``time_s``, ``command_in_force_mps2`` (in force up to now; 0 up to the latency), ``chosen_command_mps2`` and
-``chosen_action`` (what the vehicle asked for, whoever chose it; 0 before a learner's first step), the vehicle's share
-of the harm so far under both counts, the same for the whole world, and whether anything has collided. Of the last
-step: ``cost`` (the harm it added to the line, as the reward counts impacts; for safe-RL libraries) and
-``reward_NAME``, each term of the reward before its weight; after a reset they are 0. ``world_seed`` and ``world``
-name the world, so that it can be played again (-1: it was given). Where the scenario has a ``v2x`` channel also
-``known_from_s`` [N]: from when on this vehicle acts on news of each one (infinite: never; of itself: its latency);
-and where its messages are periodic ``age_s`` [N]: how old the newest sample is that it was told of each (infinite:
-none). Behind a shield also what that reports, as ``shield_NAME``.
+``time_s``; ``command_in_force_mps2``, the command in force up to now (0 up to the latency); ``chosen_command_mps2`` and
+``chosen_action``, the command that the vehicle asked for, whoever chose it (0 before a learner's first step); the harm
+so far that the vehicle bears, under both counts; the harm of the whole world; and whether there has been an impact.
+About the last step: ``cost``, the harm that it added to the line, as the reward counts impacts (for safe-RL libraries),
+and ``reward_NAME``, each term of the reward before its weight; all are 0 after a reset. ``world_seed`` and ``world``
+identify the world, so that it can be played again (-1: passed by the caller). With a ``v2x`` channel,
+``known_from_s`` [N]: the time from which this vehicle acts on news of each vehicle (infinite: never; for itself: its
+latency). With periodic messages, ``age_s`` [N]: age of the newest received sample of each vehicle (infinite: none).
+Behind a shield, also the shield's infos, as ``shield_NAME``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ethbrake_marl.engine.compiled_step import Step
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.draws import Columns, describe_worlds
 from ethbrake_marl.envs.making import INITIAL_STATE, LISTED_WORLD, chosen_seed, wanted_worlds, warn_of_unknown
-from ethbrake_marl.envs.motion import Viewer
+from ethbrake_marl.envs.viewer import Viewer
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.actions import action_of
 from ethbrake_marl.game.harm import front_share
@@ -49,7 +49,7 @@ _FLOAT32 = np.dtype(np.float32)
 
 
 def shield_columns(engine: Engine, rows: Ints | None = None) -> Columns:
-    """What the shield in an engine reports, ``shield_NAME`` -> [n, N]; only of the worlds ``rows`` if given."""
+    """Return the infos of the engine's shield as ``shield_NAME`` -> [n, N], of all worlds or of ``rows`` only."""
     if engine.guard is None or engine.guarded is None:
         return {}
     every = slice(None) if rows is None else rows
@@ -57,26 +57,29 @@ def shield_columns(engine: Engine, rows: Ints | None = None) -> Columns:
 
 
 def plain_rows(columns: Columns, vehicles: Ints, count: int) -> list[dict[str, Any]]:
-    """Columns [n, N] as plain values by name, for each of these vehicles, world by world: ``count`` in all."""
+    """Return columns [n, N] as one dictionary of plain values for each of these vehicles, world by world.
+
+    ``count`` is the number of dictionaries, which are empty without columns.
+    """
     values = [column.take(vehicles, axis=1).reshape(-1).tolist() for column in columns.values()]
     return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)] or [{} for _ in range(count)]
 
 
 class Report(NamedTuple):
-    """What there is to tell about n worlds of N vehicles."""
+    """Everything that the infos contain, for n worlds of N vehicles."""
 
-    values: Floats  # [n, N, len(COLUMNS)]
-    cost: Floats  # [n] harm of the step (m2/s2); 0 without one
-    terms: dict[str, Floats]  # reward terms of the step, each [n], shared by all vehicles, or [n, N]; 0 without one
-    world_seed: int
-    world: Ints  # [n] numbers in the stream of that seed
-    known_from_s: Floats | None  # [n, N, N] where there is a channel
-    age_s: Floats | None  # [n, N, N] where its messages are periodic
-    shield: Columns  # each [n, N]; none without a shield
+    values: Floats  # [n, N, len(COLUMNS)] values of COLUMNS
+    cost: Floats  # [n] harm of the step (m2/s2); 0 without a step
+    terms: dict[str, Floats]  # reward terms of the step, each [n] (same for all vehicles) or [n, N]; 0 without a step
+    world_seed: int  # seed of the stream of worlds
+    world: Ints  # [n] number of each world in the stream of that seed
+    known_from_s: Floats | None  # [n, N, N] with a channel, else None
+    age_s: Floats | None  # [n, N, N] with periodic messages, else None
+    shield: Columns  # infos of the shield, each [n, N]; empty without a shield
 
     @classmethod
     def of(cls, engine: Engine, step: Step | None = None, rows: Ints | None = None) -> Report:
-        """The engine's worlds as they are now, before any of them is renewed; only the worlds ``rows`` if given."""
+        """Return the report of an engine's current worlds, or of ``rows`` only, before any of them is renewed."""
         now, world = engine.state, engine.roster.numbers
         motion, params, wanted = now.motion, now.params, now.wanted
         if rows is not None:
@@ -100,11 +103,11 @@ class Report(NamedTuple):
         return cls(values, cost, terms, engine.roster.seed, world, known, age, shield_columns(engine, rows))
 
     def columns(self) -> dict[str, Floats]:
-        """What is told of every vehicle, by name, each [n, N]."""
+        """Return the values of all vehicles by name, each [n, N]."""
         return {name: self.values[:, :, c] for c, name in enumerate(COLUMNS)}
 
     def plain_infos(self, vehicles: Ints) -> list[dict[str, Any]]:
-        """Infos of these vehicles, world by world, as plain numbers; ``chosen_action`` is an array [1]."""
+        """Return the infos of these vehicles, world by world, as plain numbers; ``chosen_action`` is an array [1]."""
         worlds: list[list[list[Any]]] = self.values.take(vehicles, axis=1).tolist()
         numbers, costs = self.world.tolist(), self.cost.tolist()
         terms = {
@@ -143,9 +146,10 @@ class Report(NamedTuple):
         return infos
 
     def batch_info(self, vehicle: int, rows: Bools, stepped: Bools) -> dict[str, Any]:
-        """One vehicle in many worlds as Gymnasium's vector infos: ``name`` [n] and its mask ``_name`` [n].
+        """Return one vehicle's infos in all worlds in Gymnasium's vector format: ``name`` [n] and its mask ``_name``.
 
-        The worlds marked by ``rows`` are told of. What a step brought is 0 but in the worlds marked by ``stepped``.
+        Only the worlds marked by ``rows`` have infos. Values about the last step are 0 except in the worlds marked by
+        ``stepped``.
         """
         columns: dict[str, NDArray[Any]] = {name: told[:, vehicle] for name, told in self.columns().items()}
         columns["collided"] = columns["collided"] == 1.0
@@ -169,7 +173,7 @@ class Report(NamedTuple):
 
 @compiled
 def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> None:
-    """Fill ``out`` [n, N, ...] with the columns of AFTER_A_STEP."""
+    """Fill ``out`` [n, N, ...] with the values of COLUMNS."""
     n, N = wanted.shape
     column = columns(state)
     P, harm, mass, obstacle = N - 1, column.harm, column.mass, column.obstacle
@@ -189,7 +193,7 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
             first += state[k, harm + p]
             total += state[k, harm + P + p]
             impacts += state[k, harm + 2 * P + p]
-        if state.shape[1] > obstacle:  # after the pairs, as in the ledger
+        if state.shape[1] > obstacle:  # added after the pairs, in the same order as in the ledger
             out[k, 0, 2] += state[k, obstacle + 2]
             out[k, 0, 3] += state[k, obstacle + 3]
         for i in range(N):
@@ -204,24 +208,24 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
 
 
 class Begun:
-    """What the interfaces share: an engine in which episodes have begun, or not yet, and the seed of its worlds.
+    """Base class of all interfaces: an engine, whether episodes have begun in it, and the seed of its worlds.
 
-    ``np_random`` and ``np_random_seed`` mean what they mean in ``gymnasium.Env``.
+    ``np_random`` and ``np_random_seed`` have the same meaning as in ``gymnasium.Env``.
     """
 
     engine: Engine
     _known_options: Sequence[str] = (INITIAL_STATE, LISTED_WORLD)
     _started = False
-    _goes_on = False  # a reset without a seed goes on in the running stream
+    _goes_on = False  # whether a reset without a seed continues the running stream
     _np_random: np.random.Generator | None = None
-    _np_random_seed: int | None = None  # -1: nobody knows, since the user set the generator
+    _np_random_seed: int | None = None  # -1: unknown, because the user set the generator
 
     @property
     def np_random(self) -> np.random.Generator:
-        """A generator for wrappers to draw from; the worlds come from ``np_random_seed`` alone.
+        """Random generator for wrappers; the worlds depend on ``np_random_seed`` only.
 
-        Once you set another generator, each ``reset`` without a seed draws the seed of its worlds from it, until a
-        ``reset`` with one.
+        After you set another generator, each ``reset`` without a seed draws the seed of its worlds from it, until a
+        ``reset`` with a seed.
         """
         if self._np_random is None:
             self._set_seed(chosen_seed(None))
@@ -236,7 +240,7 @@ class Begun:
 
     @property
     def np_random_seed(self) -> int:
-        """Seed of the stream of worlds, from fresh entropy where nobody named one; -1 once ``np_random`` was set."""
+        """Seed of the stream of worlds, from fresh entropy unless a seed was passed; -1 after ``np_random`` was set."""
         if self._np_random_seed is None:
             self._set_seed(chosen_seed(None))
             assert self._np_random_seed is not None
@@ -246,13 +250,14 @@ class Begun:
         self._np_random, self._np_random_seed = np.random.default_rng(seed), seed
 
     def _restart(self, seed: int | None, options: Mapping[str, Any] | None) -> None:
-        """Start new episodes in all worlds: the stream of ``seed`` from its start, or where the stream stands.
+        """Start new episodes in all worlds, from the start of the stream of ``seed``, or from where the stream is.
 
-        ``options["initial_state"]`` (see ``scenario.tables.worlds_from_state``) is the start of every world instead;
-        ``options["listed_world"] = {"seed": 7, "number": 3}`` starts in that world of the list on which agents are
-        evaluated, a batch in that one and those after it. With autoreset, later episodes come from the stream. Other
-        options warn with ``UnknownResetOption`` and are ignored. Raises ``InvalidInput``, with nothing changed, for a
-        seed that is not a whole number >= 0, a bad initial state or listed world, or both of them.
+        With ``options["initial_state"]`` (see ``scenario.tables.worlds_from_state``) every world starts in that state.
+        With ``options["listed_world"] = {"seed": 7, "number": 3}`` the episode starts in that world of the evaluation
+        list; a batch starts in that world and those after it. With autoreset, later episodes come from the stream.
+        Other options cause the warning ``UnknownResetOption`` and are ignored. Raises ``InvalidInput``, without
+        changing anything, for a seed that is not a whole number >= 0, an invalid initial state or listed world, or both
+        of them.
         """
         named = None if seed is None else chosen_seed(seed)
         if not (options is None or isinstance(options, Mapping)):
@@ -263,10 +268,13 @@ class Begun:
         self._begin(named, wanted_worlds(self.engine, options or {}))
 
     def _begin(self, seed: int | None, worlds: Worlds | None) -> None:
-        """Start these worlds, or those of the stream: of ``seed``, of the user's generator, or where it stands."""
+        """Start episodes in these worlds or, without ``worlds``, in worlds of a stream.
+
+        The stream is that of ``seed``, of a seed drawn from the user's generator, or the current one.
+        """
         drawn, used = seed is None and self._np_random_seed == -1, seed
         if drawn:
-            used = int(copy.deepcopy(self.np_random).integers(2**63))  # a copy: the reset may still be refused
+            used = int(copy.deepcopy(self.np_random).integers(2**63))  # from a copy, because the reset may still fail
         elif seed is None and not self._goes_on:
             used = self.np_random_seed
         self.engine.reset(seed=used, worlds=worlds)
@@ -281,23 +289,23 @@ class Begun:
             raise InvalidInput(f"{what}: no episode was started; call reset first")
 
     def describe_worlds(self) -> Columns:
-        """What each running world was drawn as: columns by name, each [worlds]; see ``describe_worlds`` of the file."""
+        """Return the draw of each running world: columns by name, [worlds]; see ``envs.draws.describe_worlds``."""
         self._check_started("describe_worlds")
         return describe_worlds(self.engine)
 
 
 class OneWorld(Begun):
-    """... of one world, which is shown by a viewer."""
+    """Base class of the interfaces with a single world, which a viewer can show."""
 
     viewer: Viewer
 
     def describe_world(self) -> dict[str, Any]:
-        """What the running world was drawn as: flat numbers and texts by name; see ``describe_worlds``."""
+        """Return the draw of the running world: numbers and texts by name; see ``envs.draws.describe_worlds``."""
         self._check_started("describe_world")
         return {name: column[0].item() for name, column in describe_worlds(self.engine).items()}
 
     def render(self) -> Any:
-        """What the render mode says: a frame [H, W, 3] uint8, a list of new ones, a text, or None for ``human``."""
+        """Return a frame [H, W, 3] uint8, a list of new frames, a text, or None for ``human``, by render mode."""
         return self.viewer.render()
 
     def close(self) -> None:

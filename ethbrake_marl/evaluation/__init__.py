@@ -1,4 +1,4 @@
-"""Measuring agents on fixed lists of worlds: inputs, rollouts, measures, statistics, tables, results, episodes."""
+"""Evaluation of agents on fixed lists of worlds: rollouts, measures, statistics, tables, results files, episodes."""
 
 from typing import TYPE_CHECKING
 

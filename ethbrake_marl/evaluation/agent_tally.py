@@ -1,6 +1,6 @@
-"""Sums of one agent's measures over some worlds, and the estimates made of them.
+"""Sums of one agent's measures over some worlds, and the estimates computed from them.
 
-Sums are exact, so they can be added in any order to the same bits.
+The sums are exact, so the order of addition does not change a bit.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from ethbrake_marl.files.sheet import Estimate
 
 @dataclass(frozen=True, slots=True)
 class AgentTally:
-    """What one agent did in some worlds, by measure."""
+    """Sums of one agent's measures over some worlds, by measure."""
 
-    counts: Mapping[str, tuple[int, int]] = field(default_factory=dict)  # worlds in which it is so, of how many
-    moments: Mapping[str, Moments] = field(default_factory=dict)
-    products: Mapping[str, Fraction] = field(default_factory=dict)  # with the baseline's
+    counts: Mapping[str, tuple[int, int]] = field(default_factory=dict)  # true/false measures: true worlds, all worlds
+    moments: Mapping[str, Moments] = field(default_factory=dict)  # measures that are numbers
+    products: Mapping[str, Fraction] = field(default_factory=dict)  # sums of products with the baseline's values
 
     def __add__(self, other: AgentTally) -> AgentTally:
         counts = dict(self.counts)
@@ -38,16 +38,16 @@ class AgentTally:
         return AgentTally(counts, moments, products)
 
     def count(self, name: str) -> int:
-        """Worlds in which it is so."""
+        """Return the number of worlds in which a true/false measure is true."""
         return self.counts.get(name, (0, 0))[0]
 
     def share(self, name: str, worlds: int) -> float | None:
-        """Their share; None unless all of the worlds have it."""
+        """Return the share of worlds in which a true/false measure is true; None unless all ``worlds`` have a value."""
         so, of = self.counts.get(name, (0, 0))
         return so / worlds if of == worlds else None
 
     def sums(self, name: str, worlds: int) -> Moments | None:
-        """The moments of a number; None unless all of the worlds have it."""
+        """Return the moments of a measure that is a number; None unless all ``worlds`` have a value."""
         moments = self.moments.get(name)
         return moments if moments is not None and moments.count == worlds else None
 
@@ -59,13 +59,13 @@ def tally_agents(
     baseline: str = BASELINE,
     objectives: Sequence[str] | None = None,
 ) -> dict[str, AgentTally]:
-    """The tally of every agent in the same worlds.
+    """Return the tally of every agent in the same worlds.
 
     Args:
-        outcomes: by agent.
-        contexts: what each set of measures knows of these worlds; see ``contexts_of``.
-        baseline: the agent to compare with, for sets that have none of their own.
-        objectives: also sum up what each vehicle bears, and what these make of it; None: neither.
+        outcomes: outcome of each agent, by name.
+        contexts: context of each set of measures; see ``contexts_of``.
+        baseline: agent to compare with, for sets without a baseline of their own.
+        objectives: also sum the harm that each vehicle bears, and its value under these objectives; None: neither.
 
     """
     values: dict[str, dict[str, Values]] = {}
@@ -101,7 +101,7 @@ def tally_agents(
 def estimate_all(
     tallies: Mapping[str, AgentTally], agent: str, worlds: int, *, baseline: str
 ) -> dict[str, Estimate | None]:
-    """Estimate of every measure of one agent in so many worlds; None for what not all of them have."""
+    """Return the estimate of every measure of one agent; None for a measure that some ``worlds`` lack."""
     own = tallies[agent]
     columns = [name.removeprefix(COLUMN) for name in (*own.counts, *own.moments) if name.startswith(COLUMN)]
     registered = list(REGISTERED.values())
@@ -116,7 +116,7 @@ def estimate_all(
 def _estimate(
     measure: Measure, own: AgentTally, baseline: AgentTally | None, worlds: int, whole: str | None
 ) -> Estimate | None:
-    """Estimate of one measure; of one that compares, only where ``whole`` holds in every world."""
+    """Return the estimate of one measure; a comparison needs ``whole`` to hold in every world."""
     name = measure.name if callable(measure.of) else measure.of
     if own.share(name, worlds) is not None:
         return rate(own.count(name), worlds)
@@ -131,7 +131,10 @@ def _estimate(
 
 
 def lower_bounds(tally: AgentTally, worlds: int) -> frozenset[str]:
-    """Means that are only lower bounds, because what their set needs holds in some of the worlds alone."""
+    """Return the measures whose means are only lower bounds.
+
+    These are the measures of a set whose condition (``MeasureSet.whole``) holds in some worlds only.
+    """
 
     def is_partial(each: MeasureSet) -> bool:
         share = None if each.whole is None else tally.share(each.whole, worlds)

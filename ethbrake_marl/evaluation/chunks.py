@@ -1,7 +1,7 @@
-"""Lists of worlds, evaluated chunk by chunk: here, in several processes, or on a Ray.
+"""Evaluation of lists of worlds in chunks: in this process, in several processes, or on a Ray cluster.
 
-Chunks have a fixed size, and sums over worlds are exact. So no figure depends on how many processes there are, nor on
-whether the worlds are held in memory.
+Chunks have a fixed size, and sums over worlds are exact. So no result depends on the number of processes, or on whether
+the worlds are held in memory.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ethbrake_marl.agents.protocol import Driver, Knowledge, Team
-from ethbrake_marl.agents.registry import parse_spec
+from ethbrake_marl.agents.spec import parse_spec
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
@@ -39,23 +39,24 @@ MOST_EPISODES = 10**12
 
 OnDone = Callable[[int], None]  # worlds done so far
 
-_MADE: dict[str, Mapping[str, Driver]] = {}  # the last lineup of this process; an evaluation drives copies
+_MADE: dict[str, Mapping[str, Driver]] = {}  # agents of this process's last lineup; an evaluation drives copies
 
 
 @dataclass(frozen=True, slots=True)
 class Lineup:
-    """Who drives, by specs: plain data, of which every process makes the same agents.
+    """The agents of an evaluation as plain data, from which every process builds the same agents.
 
     Args:
         agents: specs, as on the command line.
-        scenario: whose learners they drive.
+        scenario: the scenario whose learners they drive.
         harm_count: harm that agents minimise.
-        uncertainty: what shields do not know that take one, as text.
-        measures: that evaluations tell, too, as ``load_measures`` takes them; with those that it was given before.
-        told: names of all measures that evaluations tell, whatever is registered later.
-        sets: names of the sets of measures in the process that asks.
-        same: what must be the same in every process; see ``Lineup.of``.
-        packages: name -> version of each that gave a part to the process that asks: no other may be installed.
+        uncertainty: the uncertainty, as text, for shields that take one.
+        measures: measures to load, as ``load_measures`` takes them, including those loaded before.
+        told: names of all measures that the evaluation reports, whatever is registered later.
+        sets: names of the sets of measures in the requesting process.
+        same: hash of everything that must be equal in every process; see ``Lineup.of``.
+        packages: name and version of each package that provided a part in the requesting process; workers must have the
+            same.
 
     """
 
@@ -71,7 +72,7 @@ class Lineup:
 
     @classmethod
     def of(cls, agents: Sequence[str], scenario: Scenario, **how: Any) -> Lineup:
-        """A lineup that other processes make only from the same policies, measures and versions.
+        """Return a lineup that other processes can build only with the same policies, measures and versions.
 
         Raises what ``make_lineup`` raises.
         """
@@ -85,7 +86,7 @@ class Lineup:
         return replace(lineup, same=same, packages=versions_used())
 
     def make(self) -> Mapping[str, Driver]:
-        """The agents in this process; raises ``InvalidInput`` where they are others than in the process that asks."""
+        """Return the agents in this process; raise ``InvalidInput`` if the requesting process has different ones."""
         if self.same not in _MADE:
             load_measures(self.measures)
             made = self._make_anew()
@@ -111,7 +112,7 @@ class Lineup:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _digests(self) -> list[str]:
-        """SHA-256 of every file that it names: code, and weights of an agent that is code."""
+        """Return the SHA-256 of every file that the specs name: code, and the weights of an agent that is code."""
         named = [part for spec in map(parse_spec, self.agents) if spec.file for part in (spec.file[0], spec.policy)]
         named += [name.rpartition(":")[0] for name in self.measures]
         return [file_sha256(Path(each)) for each in named if each is not None and Path(each).is_file()]
@@ -133,7 +134,7 @@ def evaluate_held(
     ray: str | None = None,
     on_done: OnDone | None = None,
 ) -> Evaluation:
-    """``evaluate`` all worlds of a sample; ``jobs`` and ``ray`` as in ``run_each``."""
+    """Evaluate all worlds of a sample that is held in memory; ``jobs`` and ``ray`` as in ``run_each``."""
     calls: Iterator[Call] = ((_drive, lineup, part, seed, first) for first, part in chunks_of(sample))
     parts: list[Evaluation] = []
     for part in run_each(calls, jobs, ray):
@@ -148,7 +149,7 @@ def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evalua
 
 
 def _only(outcome: Outcome, names: Sequence[str]) -> Outcome:
-    """The outcome with these registered measures alone."""
+    """Return the outcome with only these registered measures."""
     kept = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
     return replace(outcome, metrics=kept)
 
@@ -163,9 +164,10 @@ def tally_list(
     ray: str | None = None,
     on_done: OnDone | None = None,
 ) -> Tally:
-    """The statistics of the worlds 0 to ``episodes - 1`` of a list of any length; no world is kept.
+    """Return the statistics of worlds 0 to ``episodes - 1`` of a list of any length.
 
-    Sets of measures that take longer than driving are not in them. ``jobs`` and ``ray`` as in ``run_each``.
+    The worlds are not held in memory together. Sets of measures that take longer than driving are omitted. ``jobs`` and
+    ``ray`` as in ``run_each``.
     """
     check_whole_number("episodes", episodes, 1, MOST_EPISODES)
     check_whole_number("seed", seed, 0)
@@ -190,7 +192,7 @@ def _tell(on_done: OnDone | None, chunks: int, worlds: int) -> None:
 
 
 def summarise_tally(lineup: Lineup, tally: Tally, seed: int) -> SummaryTable:
-    """One row per agent, as ``summarise``. Raises ``PhysicsError`` if no world is left."""
+    """Return one row per agent, as ``summarise`` does. Raise ``PhysicsError`` if every world was left out."""
     if not tally.worlds:
         raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in tally.left_out})
     scenario = lineup.scenario

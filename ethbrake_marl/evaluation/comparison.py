@@ -1,4 +1,4 @@
-"""Two results compared: the same worlds of the same scenario, or no comparison."""
+"""Comparison of two results files on the same worlds of the same scenario."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from ethbrake_marl.physics.state import Floats
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """What one agent does more in the second result than in the first, mean per world (m2/s2)."""
+    """Difference of one agent's mean harm per world, second result minus first (m2/s2)."""
 
     agent: str
-    policy: Literal["same", "other", "none"]  # whether both drove by the same one
-    harms: Mapping[str, Estimate]  # by the name of the harm
-    exploits: tuple[Exploits, Exploits]  # in the first result and in the second: what harm does not count
+    policy: Literal["same", "other", "none"]  # whether the agent used the same policy in both results
+    harms: Mapping[str, Estimate]  # difference by the name of the harm
+    exploits: tuple[Exploits, Exploits]  # exploits of the agent in the first and in the second result
 
     @property
     def marked(self) -> str:
-        """Its agent, marked where it exploits what harm does not count, in either result."""
+        """Name of the agent, with a mark where it exploits what harm does not count in either result."""
         return f"{self.agent} {MARK}" if any(each.names for each in self.exploits) else self.agent
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data for JSON."""
+        """Return the difference as plain data for JSON."""
         harms = {f"{name}_difference": estimate for name, estimate in self.harms.items()}
         exploits = [list(each.names) for each in self.exploits]
         return {"agent": self.agent, "policy": self.policy, **Estimate.side_by_side(harms), "exploits": exploits}
@@ -40,19 +40,18 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Two results on the same worlds, the second minus the first, agent by agent."""
+    """Comparison of two results on the same worlds: second minus first, agent by agent."""
 
     differences: tuple[Difference, ...]
-    unpaired_because: str | None  # None: intervals are paired by world
-    left_over: tuple[tuple[str, ...], tuple[str, ...]]  # agents of the first alone, and of the second
-    other_settings: Mapping[
-        str, tuple[str | None, str | None]
-    ]  # of the agents of the first and of the second, likewise
-    other_versions: Mapping[str, tuple[str | None, str | None]]  # of the first and of the second, where they differ
+    unpaired_because: str | None  # why intervals are not paired by world; None: they are
+    left_over: tuple[tuple[str, ...], tuple[str, ...]]  # agents only in the first, and only in the second result
+    # values in the first and in the second result, where they differ
+    other_settings: Mapping[str, tuple[str | None, str | None]]  # settings of the agents
+    other_versions: Mapping[str, tuple[str | None, str | None]]  # versions of packages
 
     @property
     def exploits_line(self) -> str:
-        """Who exploits in which result what harm does not count, as a sentence; empty where nobody does."""
+        """Sentence about the agents that exploit what harm does not count, and in which result; empty without any."""
         found: dict[str, Exploits] = {}
         for each in self.differences:
             first, second = each.exploits
@@ -62,7 +61,7 @@ class Comparison:
         return Exploits.sentence(found)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data for JSON."""
+        """Return the comparison as plain data for JSON."""
         return {
             "intervals": "paired" if self.unpaired_because is None else "unpaired",
             "unpaired_because": self.unpaired_because,
@@ -75,10 +74,10 @@ class Comparison:
 
 
 def compare_results(first: Result, second: Result) -> Comparison:
-    """What agents of the same name did in both, the second minus the first.
+    """Compare agents of the same name in two results, second minus first.
 
-    Paired by world where both have every world beside them. Raises ``InvalidInput`` for results of different kinds, on
-    different worlds or scenarios, or without a common agent.
+    The comparison is paired by world if both results come with a file of every world. Raises ``InvalidInput`` for
+    results of different kinds, on different worlds or scenarios, or without a common agent.
     """
     for key, what in SAME.items():
         told, told_second = (told_of(result.about, key) for result in (first, second))
@@ -117,11 +116,11 @@ def compare_results(first: Result, second: Result) -> Comparison:
     return Comparison(tuple(differences), because, (left_over[0], left_over[1]), *changed)
 
 
-Worlds = dict[str, tuple[Floats, Floats]]  # agent -> harms [n, 2] of the first and of the second, world by world
+Worlds = dict[str, tuple[Floats, Floats]]  # agent -> harms [n, 2] of every world, in the first and second result
 
 
 def _worlds_of_both(first: Result, second: Result, common: Sequence[str]) -> tuple[Worlds | None, str | None]:
-    """The harms to pair, or why there are none."""
+    """Return the harms of every world for pairing, or the reason why there are none."""
     try:
         one, other = first.harms(), second.harms()
     except InvalidInput as error:

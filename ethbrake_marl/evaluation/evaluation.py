@@ -27,15 +27,15 @@ from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
 
-_SHOWN_AGENTS = 5  # by name, in ``repr``
+_SHOWN_AGENTS = 5  # number of agents named in ``repr``
 
-Columns = dict[str, list[Any]]  # of one row per world
+Columns = dict[str, list[Any]]  # columns of a table with one row per agent and world
 
-_TEXTS = {"agent", "scenario", "ended", "knows"}  # columns of texts, beside those of sets of measures
+_TEXTS = {"agent", "scenario", "ended", "knows"}  # columns of texts, in addition to those of sets of measures
 
-_ALWAYS_SHOWN = ("gaps_m", "speeds_mps", "obstacle_gap_m")  # quantities in those files even if all worlds agree
+_ALWAYS_SHOWN = ("gaps_m", "speeds_mps", "obstacle_gap_m")  # quantities in these tables even if all worlds agree
 
-_LIBRARIES = ("pandas", "polars", "columns")  # of a frame, in the order of preference
+_LIBRARIES = ("pandas", "polars", "columns")  # kinds of frame, in order of preference
 
 
 T = TypeVar("T")
@@ -43,7 +43,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Outcomes of agents that drove the same vehicles in the same worlds, row k of every array being world k.
+    """Outcomes of several agents that drove the same vehicles in the same worlds; row k of every array is world k.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -54,15 +54,15 @@ class Evaluation:
 
     """
 
-    scenario: Scenario  # of the worlds
+    scenario: Scenario  # scenario of the worlds
     vehicles: tuple[int, ...]  # indices (0 = front) of the controlled vehicles; the others followed scripts
-    worlds: Worlds  # at the alert
+    worlds: Worlds  # the n worlds at the alert
     index: Ints  # [n] number of each world in its list
-    seed: int | None  # of the list; None for worlds that were given
-    outcomes: dict[str, Outcome]  # by the agent's name
+    seed: int | None  # seed of the list; None for worlds that the caller passed
+    outcomes: dict[str, Outcome]  # outcome of each agent, by name
     left_out: tuple[LeftOut, ...] = ()  # worlds of the list that are in none of the arrays, the same for all agents
     kinds: Mapping[str, NDArray[np.str_]] = field(default_factory=dict)  # ``scenario``, ``vehicle_2_type``: each [n]
-    host: str = ""  # a simulator that moved the worlds; "": the physics of this package
+    host: str = ""  # name of the simulator that moved the worlds; "": the physics of this package
     _computed: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # see ``once``
 
     def __repr__(self) -> str:
@@ -77,7 +77,7 @@ class Evaluation:
 
     @property
     def vehicle(self) -> int:
-        """The controlled vehicle; raises ``InvalidInput`` if there is not exactly one."""
+        """The controlled vehicle; raises ``InvalidInput`` unless there is exactly one."""
         return self.task.vehicle
 
     @property
@@ -86,7 +86,7 @@ class Evaluation:
         return Task(self.scenario, self.vehicles)
 
     def once(self, compute: Callable[[Evaluation], T]) -> T:
-        """``compute(self)``, computed once for everybody who asks for it."""
+        """Return ``compute(self)``, computed at most once for this evaluation."""
         if compute not in self._computed:
             self._computed[compute] = compute(self)
         found: T = self._computed[compute]
@@ -94,7 +94,7 @@ class Evaluation:
 
     @classmethod
     def join(cls, parts: Sequence[Evaluation]) -> Evaluation:
-        """One evaluation of consecutive parts of a list; raises ``PhysicsError`` if every world was left out."""
+        """Join evaluations of consecutive parts of a list; raise ``PhysicsError`` if every world was left out."""
         left_out = tuple(left for part in parts for left in part.left_out)
         some = [part for part in parts if part.worlds.n]
         if not some:
@@ -111,7 +111,7 @@ class Evaluation:
         )
 
     def take(self, rows: Ints | Bools) -> Evaluation:
-        """The evaluation restricted to ``rows``; no world counts as left out."""
+        """Return the evaluation restricted to ``rows``; its list of left-out worlds is empty."""
         outcomes = {name: outcome.take(rows) for name, outcome in self.outcomes.items()}
         kinds = {name: column[rows] for name, column in self.kinds.items()}
         return replace(
@@ -120,22 +120,22 @@ class Evaluation:
 
     @property
     def hidden(self) -> Bools:
-        """Worlds in which the channel hides something of the line from a driven vehicle, [n]; see ``v2x``."""
+        """Worlds in which the channel hides something about the line from a controlled vehicle, [n]; see ``v2x``."""
         from_each = [self.worlds.vehicles.hide_from(i) | Messages.of(self.worlds).periodic for i in self.vehicles]
         hidden: Bools = np.logical_or.reduce([np.zeros(self.worlds.n, np.bool_), *from_each])
         return hidden
 
     @property
     def conditions(self) -> Conditions:
-        """The conditions of these results: scenario, list, controlled vehicles, and every quantity of the worlds."""
+        """Conditions of these results: scenario, list, controlled vehicles, and every quantity of the worlds."""
         because = silent_because(contexts_of(self))
         return Conditions.of_test(self.task, self.seed, self.worlds.n, because, Conditions.of(self.worlds))
 
     def per_world(self, objectives: Sequence[Declared] = ()) -> Columns:
-        """One row per agent and world; docs/per-world.md lists the columns. None where there is no value.
+        """Return a table with one row per agent and world, as columns; None stands for a missing value.
 
-        Initial quantities are named as in a table of initial states: ``gap_1_m``, ``speed_1_mps``, ``latency_2_s``,
-        ``restitution``.
+        docs/per-world.md lists the columns. Initial quantities are named as in a table of initial states: ``gap_1_m``,
+        ``speed_1_mps``, ``latency_2_s``, ``restitution``.
         """
         n, contexts = self.worlds.n, contexts_of(self)
         initial: Columns = {"world": self.index.tolist()}
@@ -166,7 +166,7 @@ class Evaluation:
         return found
 
     def arrays(self, objectives: Sequence[Declared] = ()) -> dict[str, NDArray[Any]]:
-        """``per_world`` as arrays: NaN for no number, the empty text for no text."""
+        """Return ``per_world`` as arrays: NaN for a missing number, the empty text for a missing text."""
         found, of_sets = {}, [each.texts for each in MEASURE_SETS.values()]
         for name, values in self.per_world(objectives).items():
             texts = name in _TEXTS.union(*of_sets) or (name.startswith("vehicle_") and name.endswith("_type"))
@@ -174,11 +174,12 @@ class Evaluation:
         return found
 
     def to_frame(self, library: str | None = None) -> Any:
-        """One row per agent and world: the columns of ``--per-world`` (docs/per-world.md), NaN for no number.
+        """Return a table with one row per agent and world: the columns of ``--per-world``, NaN for a missing number.
 
-        A pandas ``DataFrame`` where pandas is installed, else one of polars, else a mapping of column names to arrays.
-        ``library`` asks for one of them: ``pandas``, ``polars`` or ``columns``. Raises ``UnknownName`` for another, and
-        ``InvalidInput`` for one that is not installed.
+        docs/per-world.md lists the columns. The result is a pandas ``DataFrame`` if pandas is installed, else a polars
+        ``DataFrame``, else a mapping from column name to array. ``library`` chooses one of them: ``pandas``, ``polars``
+        or ``columns``. Raises ``UnknownName`` for another name, and ``InvalidInput`` for a library that is not
+        installed.
         """
         if library is not None and library not in _LIBRARIES:
             raise unknown_name("library", library, _LIBRARIES)
@@ -190,7 +191,7 @@ class Evaluation:
         return import_module(chosen).DataFrame(self.arrays())
 
     def rescore(self, declared: Sequence[Declared] | None = None) -> Rescores:
-        """Every agent under every objective and both counts, in that order."""
+        """Return the mean harm of every agent under every objective and both counts."""
         return Rescores(
             [
                 Rescored(agent, objective, harm_count, tuple(mean(column) for column in values.T))
@@ -201,7 +202,7 @@ class Evaluation:
         )
 
     def _repr_html_(self) -> str:
-        """What each agent did, for a notebook."""
+        """Return a summary table of the agents, for a notebook."""
         share = Column("Collisions", digits=1, scale=100.0, unit=" %")
         rows = [
             (agent, rate(int(each.collided.sum()), self.worlds.n), mean(each.first_impact_harm), mean(each.total_harm))
@@ -211,13 +212,13 @@ class Evaluation:
         return Sheet(repr(self), ("Agent", share, Column("First-impact harm"), Column("Total harm")), rows, note).html()
 
     def complete(self) -> Evaluation:
-        """The evaluation itself, for who needs every world; raises ``PhysicsError`` if some were left out."""
+        """Return the evaluation unchanged; raise ``PhysicsError`` if some worlds were left out."""
         if self.left_out:
             raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
         return self
 
     def outcome(self, agent: str) -> Outcome:
-        """The outcome of one agent; raises ``InvalidInput`` naming those that were evaluated."""
+        """Return the outcome of one agent; raise ``InvalidInput``, naming the evaluated agents, for any other."""
         if agent not in self.outcomes:
             raise InvalidInput(f"agent {agent!r} was not evaluated; evaluated: {', '.join(self.outcomes)}")
         return self.outcomes[agent]

@@ -1,4 +1,4 @@
-"""An evaluation by group: the worlds of each scenario of a mixture, or those in which a vehicle is of one type."""
+"""Evaluation by group: the worlds of each scenario of a mixture, or of each type of a vehicle."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.measures import BASELINE
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
 
-NO_TYPE = "no type"  # of a vehicle of a mixture's member without types
+NO_TYPE = "no type"  # group of worlds in which the vehicle has no type
 
 
 def summarise_by(evaluation: Evaluation, by: str, *, baseline: str = BASELINE) -> dict[str, SummaryTable]:
-    """Rows as ``summarise`` for each group of worlds, by the group's name, sorted.
+    """Return a ``summarise`` table for each group of worlds, by the group's name, sorted.
 
     Args:
-        evaluation: of a mixture, or of a scenario with types of vehicles.
-        by: ``scenario``, or whose type: ``vehicle_2_type``.
-        baseline: as in ``summarise``.
+        evaluation: evaluation on a mixture, or on a scenario with types of vehicles.
+        by: ``scenario``, or a vehicle's type such as ``vehicle_2_type``.
+        baseline: agent to compare with, as in ``summarise``.
 
-    Raises ``InvalidInput`` for worlds that were drawn without such, ``UnknownName`` for another column.
+    Raises ``InvalidInput`` for worlds without groups, ``UnknownName`` for an unknown ``by``.
 
     >>> import ethbrake_marl as eb
     >>> delays = eb.load_scenario("mixture-delays")

@@ -1,19 +1,14 @@
-"""Several agents by their specs, as the command line takes them."""
+"""Build several agents from their specs, as the command line takes them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
 from ethbrake_marl.agents.driving import episode_engine, script_agents
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Agent, Driver, Team
-from ethbrake_marl.agents.registry import (
-    agents_of_group,
-    make_agent,
-    parse_spec,
-    settings_needed,
-    shields_with,
-    split_specs,
-)
+from ethbrake_marl.agents.registry import agents_of_group, settings_needed, shields_with
+from ethbrake_marl.agents.spec import parse_spec, split_specs
 from ethbrake_marl.engine.memory import ask_script, begin_script
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.evaluation.familiar import warn_unfamiliar
@@ -23,9 +18,9 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, *, warn: bool = False) -> None:
-    """Try every agent before the first of them starts a long evaluation; raises what it would raise then.
+    """Try every agent before a long evaluation, so that errors show at once; raises what the evaluation would raise.
 
-    Scripts that need no state are tried on all worlds, which takes no time; all others on the first. ``warn``: as
+    Scripts that do not depend on the state are tried on all worlds, others on the first world. With ``warn``, also call
     ``warn_unfamiliar``.
     """
     if warn:
@@ -52,13 +47,20 @@ def make_lineup(
     alone: bool = False,
     bare: bool = False,
 ) -> dict[str, Driver]:
-    """One fresh agent per spec of ``make_agent``, by its spec, to drive the scenario's learners.
+    """Return one fresh agent per spec of ``make_agent``, by spec, to drive the scenario's learners.
 
-    A text has commas between specs. ``ladder`` and other names of groups stand for several agents.
-    ``harm_count`` is the harm that optimising and choosing agents minimise. ``uncertainty`` is for shields that
-    do not know the world. ``alone``: each drives one vehicle. ``bare``: they go behind a shield, and have none.
-    Raises ``InvalidInput`` for a spec given twice, an uncertainty that is missing or that nobody uses, a team or a
-    shield that has no place, and what ``make_agent`` raises.
+    Args:
+        specs: a list of specs, or a text with commas between them. ``ladder`` and other names of groups stand for
+            several agents.
+        scenario: the scenario whose learners they drive.
+        harm_count: harm that optimising and choosing agents minimise.
+        uncertainty: uncertainty for shields that need one.
+        alone: require that each agent drives a single vehicle.
+        bare: require agents without a shield, because the caller adds one.
+
+    Raises ``InvalidInput`` for a repeated spec, a missing or unused uncertainty, a team or a shield where none is
+    allowed, and whatever ``make_agent`` raises.
+
     """
     listed = split_specs(specs) if isinstance(specs, str) else specs
     specs = [each for spec in listed for each in agents_of_group(spec) or (spec,)]
@@ -85,5 +87,5 @@ def make_lineup(
 
 
 def make_agents(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCount = "first") -> dict[str, Agent]:
-    """``make_lineup`` where one vehicle is driven."""
+    """Return ``make_lineup`` for a single controlled vehicle, so without teams."""
     return make_lineup(specs, scenario, harm_count=harm_count, alone=True)  # type: ignore[return-value]  # no teams

@@ -1,8 +1,8 @@
-"""Measures of an agent, the sets they come in, and the core's set, which is about the episode.
+"""Measures of an agent, the sets that they form, and the core's set, which measures the episode.
 
-A measure is a formula from what an agent did in every world to a value per world. Measures that need to know the same
-thing of the worlds form a set. Extensions add sets by entry points of the
-group ``ethbrake_marl.measure_sets``: tables, JSON and files show the measures of every set that is installed.
+A measure is a formula that turns an agent's outcome into one value per world. Measures that need the same knowledge of
+the worlds form a set. Extensions add sets by entry points of the group ``ethbrake_marl.measure_sets``: tables, JSON and
+files show the measures of every installed set.
 """
 
 from __future__ import annotations
@@ -27,89 +27,91 @@ BASELINE = "full_brake"
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """One thing that is said of every agent: a rate where each world has a truth, a mean where it has a number.
+    """One measure of an agent: a rate where each world has a true/false value, a mean where it has a number.
 
-    ``of`` takes the outcome and the context of the measure's set. It gives a value for every world, [n], or None where
-    this outcome has none. Or ``of`` is the name of the measure that is compared with the baseline.
+    ``of`` is a function of the outcome and the context of the measure's set. It returns a value for every world, [n],
+    or None where the outcome has none. Or ``of`` is the name of another measure, whose values are compared with the
+    baseline.
     """
 
-    name: str  # in JSON
+    name: str  # name in JSON
     of: Callable[[Outcome, Any], Values | None] | str
-    heading: str = ""  # of its column in tables; "": in none
-    short: str = ""  # the same in a terminal
-    about: str = ""  # what it means; stands once for headings that begin alike
-    percent: bool = False  # how a table shows it
-    against: Literal["", "difference", "decrease"] = ""  # how it is compared with the baseline, paired by world
-    always: bool = True  # JSON shows it as null where it does not exist
+    heading: str = ""  # heading of its column in tables; "": no column
+    short: str = ""  # heading in a terminal
+    about: str = ""  # explanation for users; one is enough for headings that begin alike
+    percent: bool = False  # whether tables show percent
+    against: Literal["", "difference", "decrease"] = ""  # kind of comparison with the baseline, paired by world
+    always: bool = True  # whether JSON shows null for a missing value, instead of omitting the key
 
     def values(self, outcome: Outcome, context: Any) -> Values | None:
-        """The value in every world of an outcome, [n]; None without one."""
+        """Return the measure's value in every world of an outcome, [n]; None if the measure does not exist for it."""
         if isinstance(self.of, str) or isinstance(context, Silent):
             return None
         return self.of(outcome, context)
 
     def column(self) -> Column:
-        """Its column in a table."""
+        """Return the measure's column in a table."""
         shown = {"digits": 1, "scale": 100.0, "unit": " %"} if self.percent else {}
         return Column(self.heading, self.name, short=self.short, **shown)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, slots=True)
 class Silent:
-    """The context of a set that has nothing to say of an evaluation."""
+    """Context of a set of measures that does not apply to an evaluation."""
 
-    because: str  # a clause
+    because: str  # reason, as a clause
 
 
 @dataclass(frozen=True, slots=True)
 class GroupColumn:
-    """What a table of several scenarios shows of a set: one measure, and what stands below about it."""
+    """Column of a set of measures in a table of several scenarios: one measure, and a note below the table."""
 
     column: Column
-    measures: Mapping[HarmCount, str]  # by the harm that agents minimise
-    note: str  # a sentence with ``{harm}`` in it
+    measures: Mapping[HarmCount, str]  # name of the shown measure, by the harm that agents minimise
+    note: str  # sentence with a placeholder ``{harm}``
 
 
 class MeasureSet:
-    """Measures that need to know the same thing of the worlds: their *context*, computed once for an evaluation.
+    """Measures that need the same knowledge of the worlds, their *context*, computed once per evaluation.
 
-    A subclass names its measures, and overrides the methods that it needs.
+    A subclass lists its measures, and overrides the methods that it needs.
     """
 
     measures: tuple[Measure, ...] = ()
-    counted: tuple[Measure, ...] = ()  # truths that are counted for ``row``, without an interval
-    baseline: str | None = None  # the agent that they are compared with; None: the one that ``summarise`` is asked for
-    whole: str | None = None  # a counted truth: unless it holds everywhere, nothing is compared, and means have a "≥"
-    narrow: tuple[str, ...] = ()  # columns that also a narrow terminal shows, where they have values
+    counted: tuple[Measure, ...] = ()  # true/false measures that are only counted, for ``row``, without an interval
+    baseline: str | None = None  # agent to compare with; None: the baseline of ``summarise``
+    whole: str | None = None  # counted measure; unless it is true everywhere, no comparisons, and means marked "≥"
+    narrow: tuple[str, ...] = ()  # columns that a narrow terminal shows, too, if they have values
     notebook: tuple[str, ...] = ()  # columns that a notebook shows
     group_column: GroupColumn | None = None
     per_world: Mapping[str, Callable[[Outcome, Any], Values | None]] = {}  # columns of files with every world
-    texts: frozenset[str] = frozenset()  # those of them that hold texts
-    because_key: str | None = None  # under which the conditions of a result say why the set is silent
-    not_in_long_lists: str = ""  # why it is silent about lists that are not held in memory; "": it is not
+    texts: frozenset[str] = frozenset()  # names of the ``per_world`` columns that hold texts
+    because_key: str | None = None  # key in a result's conditions for the reason why the set does not apply
+    not_in_long_lists: str = ""  # why the set does not apply to lists that are not held in memory; "": it applies
 
     def prepare(self, evaluation: Any) -> Any:
-        """The context that ``Measure.of`` gets for this ``Evaluation``, or ``Silent`` with a reason."""
+        """Return the context that ``Measure.of`` gets for this ``Evaluation``, or ``Silent`` with a reason."""
         return None
 
     def row(self, tally: Any, worlds: int, context: Any) -> dict[str, Any]:
-        """More fields of an agent's object in JSON, from its ``AgentTally``; the same keys where it is silent.
+        """Return more fields of an agent's JSON object, computed from its ``AgentTally``.
 
-        ``context`` is None for a list that is not held in memory.
+        The keys must be the same where the set does not apply. ``context`` is None for a list that is not held in
+        memory.
         """
         return {}
 
     def warnings(self, rows: Sequence[Any]) -> Sequence[str]:
-        """What must not be overlooked about these ``SummaryRow``, as clauses."""
+        """Return warnings about these rows (``SummaryRow``), as clauses."""
         return ()
 
     def notes(self, rows: Sequence[Any]) -> Sequence[str]:
-        """What stands below a table of these ``SummaryRow``, as sentences."""
+        """Return notes below a table of these rows (``SummaryRow``), as sentences."""
         return ()
 
 
 class EpisodeMeasures(MeasureSet):
-    """What agents did, whatever else is known of the worlds."""
+    """The core's measures, which need no knowledge of the worlds beyond the episodes."""
 
     measures = (
         Measure(
@@ -174,7 +176,7 @@ class EpisodeMeasures(MeasureSet):
 
 
 class RegisteredMeasures(MeasureSet):
-    """Measures of the user's own, by the columns that an outcome has of them; see ``register_measure``."""
+    """Measures that the user registered, one for each column of an outcome; see ``register_measure``."""
 
     def __init__(self, columns: Iterable[str] = ()) -> None:
         self.measures = tuple(Measure(COLUMN + name, partial(_registered, name), heading_of(name)) for name in columns)
@@ -188,9 +190,10 @@ EPISODE = EpisodeMeasures()
 
 
 def register_measure_set(name: str, measures: MeasureSet) -> None:
-    """Make every evaluation show these measures; an entry point of ``ethbrake_marl.measure_sets`` is registered so.
+    """Add a set of measures to every evaluation.
 
-    Raises ``InvalidInput`` for what is no set, ``AlreadyExists`` for a set or a measure whose name is taken.
+    This function also adds the entry points of ``ethbrake_marl.measure_sets``. Raises ``InvalidInput`` if ``measures``
+    is not a ``MeasureSet``, ``AlreadyExists`` if the name of the set or of one of its measures is taken.
     """
     if not isinstance(measures, MeasureSet):
         raise InvalidInput(f"set of measures {name!r}: must be a MeasureSet")
@@ -205,7 +208,7 @@ MEASURE_SETS: Registry[MeasureSet] = Registry("set of measures", "measure_sets",
 
 
 def contexts_of(evaluation: Any, *, long_list: bool = False) -> dict[str, Any]:
-    """Context of every installed set for an evaluation, by the set's name; each is computed once.
+    """Return the context of every installed set for an evaluation, by the set's name; each is computed once.
 
     ``long_list``: the evaluation is a part of a list that is not held in memory.
     """
@@ -214,23 +217,23 @@ def contexts_of(evaluation: Any, *, long_list: bool = False) -> dict[str, Any]:
 
 
 def silent_in_long_lists() -> dict[str, Silent]:
-    """The sets that are silent about lists that are not held in memory, by name."""
+    """Return the sets that do not apply to lists that are not held in memory, by name."""
     return {name: Silent(why) for name, each in MEASURE_SETS.items() if (why := each.not_in_long_lists)}
 
 
 def silent_because(contexts: Mapping[str, Any]) -> dict[str, str | None]:
-    """Why sets are silent, by the keys of the conditions; None where they are not."""
+    """Return why sets do not apply, by their key in the conditions; None where they do."""
     found = {key: contexts[name] for name, each in MEASURE_SETS.items() if (key := each.because_key) is not None}
     return {key: context.because if isinstance(context, Silent) else None for key, context in found.items()}
 
 
 def every_set(columns: Iterable[str] = ()) -> Iterator[tuple[str, MeasureSet]]:
-    """All sets by name, in the order of JSON; ``columns`` are those of registered measures, as an outcome has them."""
+    """Iterate over all sets by name, in the order of JSON; ``columns`` are an outcome's registered measures."""
     yield "", EPISODE
     yield "", RegisteredMeasures(columns)
     yield from MEASURE_SETS.items()
 
 
 def measures(columns: Iterable[str] = ()) -> tuple[Measure, ...]:
-    """All measures, in the order of JSON; ``columns`` as in ``every_set``."""
+    """Return all measures, in the order of JSON; ``columns`` as in ``every_set``."""
     return tuple(measure for _, each in every_set(columns) for measure in each.measures)

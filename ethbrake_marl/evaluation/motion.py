@@ -1,4 +1,4 @@
-"""The motion of whole episodes, exact at every moment."""
+"""The exact motion of whole episodes, at every moment."""
 
 from __future__ import annotations
 
@@ -17,39 +17,40 @@ from ethbrake_marl.physics.trace import segment_pieces
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
 
-_SAME = 1e-9  # m, m/s: a piece that goes on like the one before it is part of it
+_SAME = 1e-9  # tolerance (m, m/s) within which a piece continues the piece before it, so both are joined
 
-_SHORT_S = 1e-4  # pieces of a cascade of tiny bounces may be shorter; they are not told apart
+_SHORT_S = 1e-4  # time (s) within which the pieces of a cascade of tiny bounces are joined
 
 
 @dataclass(frozen=True, slots=True)
 class EpisodeMotion:
-    """One world from the alert to the end of its episode, driven by one agent."""
+    """Motion of one world from the alert to the end of its episode, driven by one agent."""
 
-    world: Worlds  # n = 1, at the alert
-    # [k, 1 + 4 N] time (s), place of Vehicle 1 (m), gaps, speeds, accelerations and jerks where each begins
+    world: Worlds  # the world at the alert, n = 1
+    # k pieces of cubic motion, [k, 1 + 4 N]: at the beginning of each, time (s), position of Vehicle 1 (m), gaps,
+    # speeds, accelerations and jerks
     pieces: Floats
-    end_s: float
-    impacts: ImpactRows  # in order of time; world is 0
-    stepped_in_s: Floats  # beginnings of the decisions in which a shield replaced what was proposed
-    ledger: Ledger  # n = 1
-    final: Worlds  # n = 1, as the episode left it
-    at_rest: bool  # the line came to rest; else the horizon cut the episode off
+    end_s: float  # time at which the episode ends
+    impacts: ImpactRows  # impacts in order of time; world is 0
+    stepped_in_s: Floats  # times of the decisions in which a shield replaced the proposed action
+    ledger: Ledger  # harm of the episode, n = 1
+    final: Worlds  # the world at the end of the episode, n = 1
+    at_rest: bool  # whether the line came to rest before the horizon
 
     @property
     def harm(self) -> tuple[float, float]:
-        """Harm of the line, by first impacts and in total (m2/s2)."""
+        """Harm of the line (m2/s2): first-impact harm and total harm."""
         first, total = (float(self.ledger.world_harm(count)[0]) for count in HARM_COUNTS)
         return first, total
 
 
 def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[EpisodeMotion]:
-    """Let an agent drive the scenario's learners through every world, as ``evaluate`` does, and keep every motion.
+    """Let an agent drive the scenario's learners through every world, as ``evaluate`` does, and return every motion.
 
     Args:
-        worlds: at the alert.
-        agent: drives each learner, or, as a team, its vehicles; it is left as it is.
-        scenario: of the worlds; its scripts drive the other vehicles.
+        worlds: worlds at the alert.
+        agent: agent for each learner, or a team; it is not changed.
+        scenario: scenario of the worlds, whose scripts drive the other vehicles.
 
     Raises ``PhysicsError`` naming the worlds that could not be advanced.
 
@@ -62,7 +63,7 @@ def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[E
 
 
 class _Follower(Tape):
-    """Keeps the steps, and in which decisions a shield stepped in."""
+    """Watcher that records the steps, and the decisions in which a shield replaced an action."""
 
     def __init__(self, worlds: Worlds, team: Team, engine: Engine) -> None:
         super().__init__(worlds)
@@ -72,16 +73,16 @@ class _Follower(Tape):
         self._engine, self._ruling = engine, engine.ruling
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Keep one step."""
+        """Record one step."""
         super().see(before, command_mps2, until_s)
         ruling = self._engine.ruling
-        if ruling is not None and ruling is not self._ruling:  # a step is shown in parts
+        if ruling is not None and ruling is not self._ruling:  # ``see`` may be called several times in a step
             for k in np.flatnonzero(ruling.stepped_in & ruling.asked).tolist():
                 self._stepped_in[k].append(float(before.time_s[k]))
             self._ruling = ruling
 
     def motions(self, episodes: Episodes) -> list[EpisodeMotion]:
-        """What was seen, world by world."""
+        """Return the recorded motion of each world."""
         n, N = self.worlds.n, self.worlds.N
         impacts, pieces = self.impacts(), self._pieces()
         ends = np.searchsorted(impacts.world, np.arange(n + 1))
@@ -109,7 +110,7 @@ class _Follower(Tape):
         return found
 
     def _pieces(self) -> list[Floats]:
-        """The pieces of each world's motion, one after the other; one piece where it ends at once."""
+        """Return the pieces of each world's motion in order of time; a single piece where the episode ends at once."""
         parts: list[list[Floats]] = [[] for _ in range(self.worlds.n)]
         way_m = np.zeros(self.worlds.n)
         for before, command, until_s in self.steps:
@@ -128,7 +129,7 @@ class _Follower(Tape):
 
 
 def join_pieces(pieces: Floats, vehicles: int) -> Floats:
-    """The pieces without those that go on like the one before; of many within ``_SHORT_S`` the last one stays."""
+    """Join pieces that continue the piece before; of several pieces within ``_SHORT_S``, keep the last."""
     last_of_many = np.append(np.diff(np.floor(pieces[:, 0] / _SHORT_S)) > 0.0, True)
     last_of_many[0] = True
     kept: list[Floats] = []
@@ -139,7 +140,10 @@ def join_pieces(pieces: Floats, vehicles: int) -> Floats:
 
 
 def state_at(piece: Floats, time_s: float, vehicles: int) -> Floats:
-    """Place of Vehicle 1, gaps, speeds, accelerations and jerks [4 N] at a time of a piece [1 + 4 N]."""
+    """Return the state [4 N] at a time within a piece [1 + 4 N].
+
+    The state is the position of Vehicle 1, gaps, speeds, accelerations and jerks.
+    """
     t, N = time_s - piece[0], vehicles
     speeds, rates, jerks = (piece[1 + part * N : 1 + (part + 1) * N] for part in (1, 2, 3))
     way = (speeds + 0.5 * (rates + jerks * t / 3.0) * t) * t

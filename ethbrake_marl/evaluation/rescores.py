@@ -11,7 +11,7 @@ from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 
 @dataclass(frozen=True, slots=True)
 class Rescored:
-    """One agent under one objective and count: the mean for each vehicle, front to rear (m2/s2); less is better."""
+    """Mean harm of one agent under one objective and count, for each vehicle, front to rear (m2/s2); less is better."""
 
     agent: str
     objective: str
@@ -19,13 +19,13 @@ class Rescored:
     each: tuple[Estimate, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data for JSON: objective, harm count, and each vehicle's mean with its interval."""
+        """Return plain data for JSON: objective, harm count, and each vehicle's mean with its interval."""
         each = Estimate.side_by_side({f"vehicle_{i + 1}": estimate for i, estimate in enumerate(self.each)})
         return {"objective": self.objective, "harm_count": self.harm_count, **each}
 
 
 class Rescores(list[Rescored]):
-    """Agents under objectives and counts: a list that ``print`` and a notebook show as two tables."""
+    """List of ``Rescored`` rows that ``print`` and a notebook show as two tables, one per count."""
 
     def __str__(self) -> str:
         return terminal_text(self.sheet("first"), "", self.sheet("total"))
@@ -34,7 +34,7 @@ class Rescores(list[Rescored]):
         return "\n".join(self.sheet(harm_count).html() for harm_count in HARM_COUNTS)
 
     def sheet(self, harm_count: HarmCount) -> Sheet:
-        """The means under one count: one line per agent and objective, one column per vehicle."""
+        """Return the table of one count: one line per agent and objective, one column per vehicle."""
         shown = [row for row in self if row.harm_count == harm_count]
         vehicles = range(len(shown[0].each) if shown else 0)
         columns = [Column(f"Vehicle {i + 1}", interval="below") for i in vehicles]

@@ -1,6 +1,6 @@
-"""Evaluate agents: draw a fixed list of worlds, let every agent drive each world once, measure what it did.
+"""Evaluate agents: draw a fixed list of worlds, let every agent drive each world once, and measure the results.
 
-Counting "the first episodes that finish" instead would over-count short episodes, and crashes end early.
+The list is fixed because "the first episodes that finish" would contain too many short episodes, and crashes end early.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
 
-OnWorlds = Callable[[str, int], None]  # agent, worlds done so far
+OnWorlds = Callable[[str, int], None]  # callback with an agent's name and its number of worlds done so far
 
 
 def evaluate(
@@ -61,20 +61,21 @@ def evaluate(
     worlds. A world that cannot be advanced (a defect of the physics) is left out for all agents; ``left_out`` names it.
 
     Args:
-        worlds: at the alert, or a sample of the scenario's list; None: draw the first ``episodes`` of ``seed``.
-        agents: specs as on the command line (``"full_brake,ppo@shipped"``, or a list), made for first-impact harm; or
-            name -> agent or ``Team``. Each controlled vehicle gets a copy of its agent; the originals do not change.
-        scenario: of the worlds, also by name or path.
+        worlds: worlds at the alert, or a sample of the scenario's list; None: draw the first ``episodes`` of ``seed``.
+        agents: specs as on the command line (``"full_brake,ppo@shipped"``, or a list), which minimise first-impact
+            harm; or a mapping from name to agent or ``Team``. Each controlled vehicle gets a copy of its agent; the
+            originals do not change.
+        scenario: scenario of the worlds, also by name or path.
         vehicle: the controlled vehicle, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
         episodes: number of worlds to draw; None: 10,000.
-        seed: of the list; None: 7. With given worlds it is only noted in the result.
-        chunk: worlds advanced together; None: 2,500.
+        seed: seed of the list; None: 7. With ``worlds``, it is only recorded in the result.
+        chunk: number of worlds advanced together; None: 2,500.
         on_progress: called after each chunk with an agent's name and the number of its worlds done.
-        aftermath: also measure how far Vehicle 1 is shoved, the paper's sum over samples, and registered measures;
+        aftermath: also measure how far Vehicle 1 is shoved, the paper's sampled harm, and registered measures;
             takes longer.
 
-    Warns (``Unfamiliar``) of policies beyond their training. Raises ``PhysicsError`` if no world is left;
-    ``InvalidInput`` for worlds of another scenario or after the alert, and if agents and vehicles do not fit.
+    Warns (``Unfamiliar``) about policies in worlds unlike those of their training. Raises ``PhysicsError`` if no world
+    is left; ``InvalidInput`` for worlds of another scenario or after the alert, and if agents and vehicles do not fit.
 
     """
     scenario = load_scenario(scenario)
@@ -102,7 +103,7 @@ def evaluate(
 
 
 def chunks_of(sample: Sample, size: int = CHUNK) -> Iterator[tuple[int, Sample]]:
-    """The worlds in parts of this size, each with the row of its first."""
+    """Iterate over parts of this size, each with the row of its first world."""
     for first in range(0, sample.worlds.n, size):
         yield first, sample.take(np.arange(first, min(first + size, sample.worlds.n)))
 
@@ -116,13 +117,13 @@ def drive_chunk(
     first: int = 0,
     aftermath: bool = True,
 ) -> Evaluation:
-    """Let each agent drive all of these worlds at the alert together.
+    """Let each agent drive all of these worlds together, from the alert on.
 
-    ``first`` is the row of the first world, for messages. If every world was left out, the evaluation has none.
+    ``first`` is the row of the first world, for messages. If every world fails, the evaluation is empty.
     """
     n, others = sample.worlds.n, [script.name for script in script_agents(scenario, except_for=vehicles).values()]
     outcomes: dict[str, Outcome] = {}
-    advanced: dict[str, Ints] = {}  # rows of the worlds that are in each outcome
+    advanced: dict[str, Ints] = {}  # rows of the worlds in each outcome
     lost: dict[int, LeftOut] = {}
     for name, agent in agents.items():
         roll_out = partial(_roll_out, sample.worlds, agent, vehicles, scenario, aftermath)
@@ -142,7 +143,7 @@ def drive_chunk(
 
 
 def _check_request(worlds: object, agents: object, chunk: object) -> None:
-    """Refuse arguments of ``evaluate`` that are not what they must be."""
+    """Raise ``InvalidInput`` for arguments of ``evaluate`` of the wrong kind."""
     if not isinstance(worlds, Worlds | Sample):
         raise InvalidInput(
             f"evaluate: worlds = {worlds!r}: must be worlds or a sample, as scenario.sample(n, seed) gives"
@@ -155,20 +156,26 @@ def _check_request(worlds: object, agents: object, chunk: object) -> None:
         raise InvalidInput("evaluate: no agents given; at least one is needed, for instance full_brake")
     for name, agent in agents.items():
         check_agent(agent, f"evaluate: agent {name!r}", alone=False)
-        Knowledge.of(agent)  # refuses what is no statement
+        Knowledge.of(agent)  # raises for an invalid ``knows``
     if chunk is not None:
         check_whole_number("evaluate: chunk", chunk, 1)
 
 
 def driven_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mapping[str, Driver]) -> tuple[int, ...]:
-    """Indices of the controlled vehicles: the given one, or all learners; none if the agents are teams of nobody."""
+    """Return the indices of the controlled vehicles: ``vehicle``, or else all learners.
+
+    Without learners the result is empty if all agents are teams; otherwise raises ``InvalidInput``.
+    """
     if vehicle is not None or (not scenario.learners and any(not isinstance(a, Team) for a in agents.values())):
         return (controlled_vehicle(scenario, vehicle),)
     return scenario.learners
 
 
 def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
-    """Index of the controlled vehicle: the given one, or the scenario's only learner; raises ``InvalidInput``."""
+    """Return the index of the controlled vehicle: ``vehicle``, or else the scenario's only learner.
+
+    Raises ``InvalidInput`` unless exactly one vehicle is controlled.
+    """
     learners = scenario.learners
     names = [scenario.vehicle_names[i] for i in learners]
     if vehicle is None:
@@ -191,7 +198,7 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
 def _roll_out(
     whole: Worlds, agent: Driver, vehicles: tuple[int, ...], scenario: Scenario, aftermath: bool, rows: Ints
 ) -> Outcome:
-    """Outcome of a fresh team in the worlds of these rows."""
+    """Let a fresh team drive the worlds of these rows, and return its outcome."""
     team = Team.of(agent, vehicles)
     worlds = scenario.play_pieces(whole.take(rows), tuple(team.drivers))
     task = Task(scenario, tuple(team.drivers))
@@ -209,9 +216,9 @@ def _roll_out(
 
 
 def outcome_of(team: Team, episodes: Episodes) -> Outcome:
-    """What a team achieved in its episodes, without their aftermath.
+    """Return the outcome of a team's episodes, without the measures of ``aftermath``.
 
-    What an agent predicts about a world counts where it drives alone, or where its shield predicts.
+    ``predicted_harm`` and ``chosen_policy`` come from the memory of an agent that drives alone, or from a shield.
     """
     memory: Any = next(iter(episodes.memories.values()), None) if len(team.drivers) == 1 else None
     if episodes.guarded is not None:
@@ -231,7 +238,7 @@ def outcome_of(team: Team, episodes: Episodes) -> Outcome:
 
 
 def _read_column(team: Team, memory: Any, what: str, n: int) -> NDArray[np.generic] | None:
-    """A column of an agent's memory, one number per world; None where the memory has no such column."""
+    """Return a column of an agent's memory, one number per world; None if the memory has no such column."""
     value = memory.get(what) if isinstance(memory, Mapping) else None
     if value is None:
         return None

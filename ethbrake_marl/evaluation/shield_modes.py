@@ -1,4 +1,4 @@
-"""The modes of the shield compared on the same worlds: harm, and what each intervention was good for."""
+"""Comparison of the shield's modes on the same worlds: harm, and the effect of each intervention."""
 
 from __future__ import annotations
 
@@ -24,43 +24,43 @@ from ethbrake_marl.shield.episodes import Shielded
 from ethbrake_marl.shield.evidence import SAME_HARM, VERDICTS, review
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
 
-# ``step-alert``: rollout at the alert only; ``step-cap``: no vehicle above its cap.
+# ``step-alert``: rollouts of the policy only at the alert; ``step-cap``: no vehicle bears more harm than its cap.
 Mode = Literal["none", "episode", "step", "step-alert", "step-cap"]
 
-CHUNK = 500  # worlds advanced together: bounds memory, changes no result
+CHUNK = 500  # worlds advanced together; limits memory, and does not change results
 
 
 class VehicleRow(NamedTuple):
-    """One vehicle of the line in step mode."""
+    """Results of one vehicle of the line in step mode."""
 
     vehicle: str
-    replaced: float | None  # share of its decisions; None: it is not shielded
-    harm: float  # mean over worlds of what it bears (m2/s2)
-    baseline: float  # ... of what it would bear under the baseline plan
-    above_baseline: float  # share of the worlds in which it bears more than that
+    replaced: float | None  # share of its decisions that were replaced; None: not shielded
+    harm: float  # mean harm that it bears per world (m2/s2)
+    baseline: float  # mean harm that it would bear under the baseline plan (m2/s2)
+    above_baseline: float  # share of worlds in which it bears more than under the baseline plan
 
 
 @dataclass(frozen=True, slots=True)
 class ModeRow:
-    """One agent, or one team, behind one mode of the shield."""
+    """Results of one agent, or one team, behind one mode of the shield."""
 
     agent: str
     mode: Mode
-    harm: Estimate  # mean over worlds (m2/s2)
-    horizon_ends: int  # worlds that the horizon cut off before the line stood: no bound says what comes after
-    against_episode: Estimate | None  # minus that of episode mode, paired by world; None: of that itself, and of teams
-    against_none: Estimate | None = None  # likewise, minus that without a shield
-    # all that follows is of step mode alone
-    replaced: float | None = None  # share of the decisions of all shielded vehicles
-    bound: Estimate | None = None  # at the alert, mean over worlds (m2/s2)
+    harm: Estimate  # mean harm per world (m2/s2)
+    horizon_ends: int  # number of worlds still moving at the horizon, after which no bound holds
+    against_episode: Estimate | None  # harm minus episode mode's harm, paired by world; None: episode mode, and teams
+    against_none: Estimate | None = None  # harm minus the harm without a shield, paired by world
+    # the fields from here to ``above_bound`` exist only in step mode
+    replaced: float | None = None  # share of the decisions of all shielded vehicles that were replaced
+    bound: Estimate | None = None  # mean bound at the alert (m2/s2)
     vehicles: tuple[VehicleRow, ...] = ()
-    verdicts: tuple[float, ...] | None = None  # shares of the replaced decisions, in the order of VERDICTS
-    above_bound: int | None = None  # worlds whose realised harm is above the bound told at the alert
-    left_out: LeftOutRows = ()  # worlds that could not be advanced: in no row, whichever agent and mode met them
-    policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle -> the policy's that proposes, if one does
+    verdicts: tuple[float, ...] | None = None  # share of each verdict among the interventions, ordered as VERDICTS
+    above_bound: int | None = None  # number of worlds whose harm exceeds the bound at the alert
+    left_out: LeftOutRows = ()  # worlds that could not be advanced with some agent and mode; no row counts them
+    policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle -> SHA-256 of its proposing policy
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data for JSON; what does not exist is null, intervals are ``[low, high]``."""
+        """Return plain data for JSON; missing values are null, intervals are ``[low, high]``."""
         shares = self.verdicts or (None,) * len(VERDICTS)
         return {
             "agent": self.agent,
@@ -79,22 +79,22 @@ class ModeRow:
 
 
 class ShieldModes(list[ModeRow]):
-    """The rows of ``compare_modes``: every agent behind every mode."""
+    """List of the rows of ``compare_modes``: every agent behind every mode."""
 
     @property
     def of_teams(self) -> bool:
-        """Whether the rows are of several learners: there is no episode mode to compare with."""
+        """Whether the rows are about several learners, which have no episode mode."""
         return all(row.against_episode is None for row in self)
 
     def to_json(self, sample: Sample, task: Task) -> list[dict[str, Any]]:
-        """What a results file of ``ethbrake shield`` holds: one object per row, of the worlds of ``sample``."""
+        """Return the content of a results file of ``ethbrake shield``: one object per row."""
         left_out = [world for world, _ in self[0].left_out]
         about = result_identity("shield", task.scenario, sample, left_out)
         about |= {"harm_count": task.harm_count, "episodes": sample.worlds.n - len(left_out)}
         return [about | row.to_json() for row in self]
 
     def sheets(self) -> list[Sheet]:
-        """The rows as tables, below the name of each agent; of teams also what each vehicle bears."""
+        """Return the rows as tables, below the name of each agent; for teams, also the harm that each vehicle bears."""
         share, teams = partial(Column, digits=1, scale=100.0, unit=" %"), self.of_teams
         head = [Column("agent, mode", text=True), Column("harm", interval="hidden")]
         head += [Column("minus no shield" if teams else "minus episode mode", sign="+")]
@@ -123,17 +123,17 @@ def compare_modes(
     behind: bool = False,
     on_progress: Callable[[str, int], None] | None = None,
 ) -> ShieldModes:
-    """Let every agent drive alone, in episode mode and in step mode, through every world; see ``ModeRow``.
+    """Let every agent drive through every world without a shield, in episode mode and in step mode; see ``ModeRow``.
 
-    Where several vehicles learn, a team (an agent: a copy for each) drives alone, behind one step shield, and behind
-    one that caps what each vehicle bears; episode mode is for one vehicle. Each replaced decision of step mode is
-    simulated again without the shield (``shield.review.review``). The given agents are left as they are. A world that
-    cannot be advanced with one of them is left out for all, and named in ``left_out``.
+    If several vehicles learn, a team (from an agent: a copy for each vehicle) drives without a shield, behind one step
+    shield, and behind one that caps each vehicle's harm; episode mode exists for one vehicle only. Each replaced
+    decision of step mode is simulated again without the shield (``shield.evidence.review``). The agents are not
+    changed. A world that cannot be advanced with one of them is left out for all, and listed in ``left_out``.
 
-    ``behind``: of what is behind a shield among these agents, and nothing where nobody has one. Agents whose shield
-    does not know the world are left out then: their modes are another question.
+    With ``behind``, compare only the policies behind the shields of these agents; the result is empty if no agent has
+    an episode or step shield. Agents behind other shields are omitted.
 
-    Raises ``InvalidInput`` where a shield refuses the scenario, ``PhysicsError`` where no world is left.
+    Raises ``InvalidInput`` where a shield refuses the scenario, ``PhysicsError`` where every world is left out.
     """
     if behind:
         shields = [agent.shield if isinstance(agent, Team) else agent for agent in agents.values()]
@@ -156,18 +156,18 @@ def compare_modes(
 
 
 class _Part(NamedTuple):
-    """One chunk of worlds under one mode; what is not None is of step mode."""
+    """Results of one chunk of worlds in one mode; the optional fields exist only in step mode."""
 
-    harm: Floats  # [n]
-    moving: int  # worlds that the horizon cut off
+    harm: Floats  # [n] harm of each world (m2/s2)
+    moving: int  # number of worlds still moving at the horizon
     shielded: Shielded | None = None
-    verdicts: Ints | None = None  # how many interventions got each of VERDICTS
+    verdicts: Ints | None = None  # number of interventions with each of VERDICTS
 
 
 def _compare(
     agents: Mapping[str, Driver], worlds: Worlds, task: Task, on_progress: Callable[[str, int], None] | None
 ) -> list[ModeRow]:
-    """The rows of worlds that can all be advanced; ``PhysicsError`` names those that cannot."""
+    """Return the rows of all agents and modes; raise ``PhysicsError`` naming the worlds that cannot be advanced."""
     rows = []
     for name, agent in agents.items():
         parts: list[dict[Mode, _Part]] = []
@@ -183,7 +183,7 @@ def _compare(
 
 
 def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[Mode, _Part]:
-    """Each mode in one chunk."""
+    """Return the results of every mode in one chunk of worlds."""
     several, found = len(task.vehicles) > 1, {}
     alone: dict[Mode, Team] = {"none": Team.of(agent, task.vehicles)}
     if not several:
@@ -205,7 +205,7 @@ def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[Mode, _Part]:
 
 
 def _row(agent: str, mode: Mode, parts: list[_Part], harm: Mapping[Mode, Floats], task: Task) -> ModeRow:
-    """One mode of an agent, from its parts and the harm under every mode; of step mode with what the shield did."""
+    """Return the row of one mode of an agent, from the results of its chunks and the harms under every mode."""
 
     def minus(other: Mode) -> Estimate | None:
         return None if mode == other or other not in harm else paired_difference(harm[mode], harm[other])

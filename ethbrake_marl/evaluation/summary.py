@@ -1,4 +1,4 @@
-"""The table of an evaluation: a row per agent, for a terminal, a document and a notebook."""
+"""The table of an evaluation: one row per agent, for a terminal, a document and a notebook."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ _HEAD = {
     " something here.",
 }
 
-# Columns that a narrow terminal shows, beside those of the last set that has values for its own.
+# Columns that a narrow terminal shows, in addition to the ``narrow`` columns of the last set that has values for them.
 _ALWAYS_SHOWN = ("collision_rate", "first_impact_harm", "total_harm", "sampled_harm", "vehicle_1_shoved_m")
 
-_BELOW = ("collision_rate", "first_impact_harm", "total_harm")  # a terminal shows their intervals; JSON has all
+_BELOW = ("collision_rate", "first_impact_harm", "total_harm")  # measures whose intervals a terminal shows
 
 
 @dataclass(frozen=True, slots=True)
 class RowsBeside:
-    """Printed rows of another source that stand below a table of ours, and what must be said of them.
+    """Rows from another source, such as the paper, that are printed below our table, with notes about them.
 
-    A row is a name and texts by measure; a text alone begins a section.
+    A row is a name with texts by measure; a plain text is the heading of a section.
     """
 
     rows: Sequence[str | tuple[str, Mapping[str, str]]]
@@ -48,7 +48,7 @@ class RowsBeside:
 
 
 class SummaryTable(list[SummaryRow]):
-    """The rows of ``summarise``: a list that ``print`` and a notebook show as a table.
+    """Rows of ``summarise``: a list that ``print`` and a notebook show as a table.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -78,16 +78,16 @@ class SummaryTable(list[SummaryRow]):
         return sheet.only(k for k, name in enumerate(sheet.names) if name in shown).html()
 
     def meanings(self) -> dict[str, str]:
-        """What the columns mean, by the beginning of their headings; those of registered measures last."""
+        """Return the explanation of each column, by the beginning of its heading; registered measures come last."""
         about = {each.heading.partition(",")[0]: each.about for each in measures() if each.about and each.heading}
         own = [registered_measure(column) for column in self[0].metrics] if self else []
         return _HEAD | about | {metric.name: metric.about for metric in own if metric is not None}
 
     def sheet(self) -> Sheet:
-        """The table: agent, what it knows, and every measure that has a heading, registered measures last.
+        """Return the table: agent, its knowledge, and every measure that has a heading; registered measures come last.
 
-        Where a set of measures holds in some of the worlds alone, its means are marked as lower bounds. Rows of other
-        sources stand below.
+        If the condition of a set of measures holds only in some of the worlds, its means are marked as lower bounds.
+        Rows from other sources stand below.
         """
         columns = [each.column() for each in measures() if each.heading]
         columns += [Column(heading_of(name), COLUMN + name) for name in (self[0].metrics if self else ())]
@@ -111,7 +111,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", ["Agent", "Knows", *columns], lines)
 
     def terminal(self) -> Sheet:
-        """The table for a terminal of 80 columns or more: our rows, rows beside them, then the conditions of each."""
+        """Return the table for a terminal of 80 columns or more, with rows from other sources and the conditions."""
         narrow = self._narrow()
         columns = [
             replace(each, wide=each.name not in narrow, interval="below" if each.name in _BELOW else "hidden")
@@ -125,7 +125,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", [Column("Agent,\nwhat it knows", text=True), *columns], lines, self._conditions(), gap=1)
 
     def _narrow(self) -> tuple[str, ...]:
-        """Columns of a narrow terminal: the usual ones, and those of the last set that has values for them."""
+        """Return the columns of a narrow terminal: the usual ones, and those of the last set that has values."""
         last: tuple[str, ...] = EPISODE.narrow
         for _, each in every_set():
             if self and any(self[0].estimates.get(name) is not None for name in each.narrow):
@@ -133,13 +133,13 @@ class SummaryTable(list[SummaryRow]):
         return (*_ALWAYS_SHOWN, *last)
 
     def tables(self) -> list[Sheet]:
-        """``terminal``, and below it the registered measures: a line per agent, the mean per world, its interval."""
+        """Return ``terminal`` and, if there are registered measures, a second table with one line for each of them."""
         lines = [(row.agent, heading_of(column), value) for row in self for column, value in row.metrics.items()]
         own = Sheet("Measures", ["Agent", Column("Measure", text=True), Column("Mean or rate")], lines)
         return [self.terminal(), own] if lines else [self.terminal()]
 
     def markdown(self) -> str:
-        """The table for a document, with the conditions of our rows and of those beside them below it."""
+        """Return the table for a document, with the conditions of all rows below it."""
         return f"{self.sheet().markdown()}\n\n{self._conditions()}\n"
 
     def _conditions(self) -> str:
@@ -152,16 +152,16 @@ class SummaryTable(list[SummaryRow]):
         return "\n\n".join([ours, *(text for _, text in self.notes())])
 
     def notes(self) -> list[Note]:
-        """What must be said below the table: of our rows, then of the rows beside them."""
+        """Return the notes below the table, first about our rows, then about rows from other sources."""
         return [*notes_of(self), *(self.beside.notes if self and self.beside else ())]
 
 
 def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTable:
-    """One row per agent, in the order of the evaluation.
+    """Return one row per agent, in the order of the evaluation.
 
     Args:
-        evaluation: of the agents.
-        baseline: agent to compare with, where it was evaluated.
+        evaluation: evaluation of the agents.
+        baseline: agent to compare with, if it was evaluated.
 
     """
     contexts = contexts_of(evaluation)
@@ -190,13 +190,13 @@ def summarise_sums(
     baseline: str = BASELINE,
     **shared: Any,
 ) -> SummaryTable:
-    """One row per agent, from the sums of what was measured in the worlds of a list.
+    """Return one row per agent, from sums of the measures over the worlds of a list.
 
     Args:
-        tallies: sums, by agent.
-        conditions: of the test.
-        contexts: what each set of measures knows of the worlds.
-        knows: what agents say they know, by agent.
+        tallies: sums of each agent.
+        conditions: conditions of the test.
+        contexts: context of each set of measures.
+        knows: stated knowledge of each agent.
         policies: SHA-256 of policies, by agent and by the vehicle's name.
         baseline: agent to compare with.
         shared: fields of ``SummaryRow`` that all rows have in common.

@@ -17,9 +17,9 @@ from ethbrake_marl.files.sheet import Estimate
 
 @dataclass(frozen=True, slots=True)
 class SummaryRow:
-    """What one agent achieved over the list of worlds; harms are means per world, m2/s2.
+    """Results of one agent over a list of worlds; harms are means per world, m2/s2.
 
-    ``row["harm_decrease_total"]`` is the estimate of any measure, by its name in JSON; None where it does not exist.
+    ``row["harm_decrease_total"]`` is the estimate of a measure, by its name in JSON; None where it does not exist.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -30,65 +30,65 @@ class SummaryRow:
 
     """
 
-    agent: str  # its name
-    episodes: int  # worlds
-    estimates: Mapping[str, Estimate | None]  # of every measure, by its name in JSON
-    collisions: int  # worlds with at least one impact
-    horizon_ends: int  # worlds that the horizon cut off before the line stood
-    parameters: Conditions  # of the test
+    agent: str  # name of the agent
+    episodes: int  # number of worlds
+    estimates: Mapping[str, Estimate | None]  # estimate of every measure, by its name in JSON
+    collisions: int  # number of worlds with at least one impact
+    horizon_ends: int  # number of worlds still moving at the horizon
+    parameters: Conditions  # conditions of the test
     policy_share: float | None = None  # share of worlds in which a hybrid drove by its policy
     more: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # fields of sets of measures, by set
     bounds: frozenset[str] = frozenset()  # measures whose means are lower bounds
-    left_out: tuple[LeftOut, ...] = ()  # worlds of the list that no row counts: they could not be advanced
-    knows: Knowledge = UNSTATED  # what the agent says it knows of the line
-    hidden_share: float = 0.0  # worlds in which the channel hides something from a driven vehicle, whoever drives
-    worlds_sha256: str = ""  # of the list; results on the same worlds have the same
-    scenario_sha256: str = ""  # of all that shapes an episode
-    policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle -> its policy's, where one drives
-    versions: Mapping[str, str] = field(default_factory=dict)  # of what computed it
+    left_out: tuple[LeftOut, ...] = ()  # worlds of the list that could not be advanced; no row counts them
+    knows: Knowledge = UNSTATED  # the agent's stated knowledge of the line
+    hidden_share: float = 0.0  # share of worlds in which the channel hides something from a controlled vehicle
+    worlds_sha256: str = ""  # hash of the list; the same for results on the same worlds
+    scenario_sha256: str = ""  # hash of everything in the scenario that affects an episode
+    policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle -> SHA-256 of its policy
+    versions: Mapping[str, str] = field(default_factory=dict)  # versions of the packages that computed the result
 
     def __getitem__(self, measure: str) -> Estimate | None:
         return self.estimates[measure]
 
     @property
     def collision_rate(self) -> Estimate:
-        """Share of worlds."""
+        """Share of worlds with at least one impact."""
         return self.estimates["collision_rate"]  # type: ignore[return-value]  # every agent has it in every world
 
     @property
     def first_impact_harm(self) -> Estimate:
-        """Each pair's first impact."""
+        """Mean harm per world, counting only each pair's first impact (m2/s2)."""
         return self.estimates["first_impact_harm"]  # type: ignore[return-value]  # all have it in all worlds
 
     @property
     def total_harm(self) -> Estimate:
-        """Every impact."""
+        """Mean harm per world, counting every impact (m2/s2)."""
         return self.estimates["total_harm"]  # type: ignore[return-value]  # all have it in all worlds
 
     @property
     def metrics(self) -> dict[str, Estimate]:
-        """Registered measures, by column."""
+        """Estimates of registered measures, by column."""
         found = {name.removeprefix(COLUMN): each for name, each in self.estimates.items() if name.startswith(COLUMN)}
         return {name: each for name, each in found.items() if each is not None}
 
     @property
     def sees_through(self) -> bool:
-        """Whether the channel hides something here that this agent reads all the same."""
+        """Whether the agent knows something that the channel hides in these worlds."""
         return self.hidden_share > 0.0 and self.knows.sees_through
 
     @property
     def exploits(self) -> Exploits:
-        """What it does that harm does not count."""
+        """Behaviour of the agent that harm does not count."""
         shoved = self.estimates["vehicle_1_shoved_m"]
         return Exploits(None if shoved is None else shoved.value, self.horizon_ends / self.episodes)
 
     @property
     def marked(self) -> str:
-        """Its agent, marked where it exploits what harm does not count."""
+        """Name of the agent, with a mark if it exploits what harm does not count."""
         return f"{self.agent} {MARK}" if self.exploits.names else self.agent
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data for JSON; what does not exist is null, intervals are ``[low, high]``."""
+        """Return plain data for JSON; missing values are null, intervals are ``[low, high]``."""
         registered = RegisteredMeasures(n.removeprefix(COLUMN) for n in self.estimates if n.startswith(COLUMN))
         more: dict[str, Any] = {}
         for name, each in MEASURE_SETS.items():
@@ -117,7 +117,7 @@ class SummaryRow:
         }
 
     def _estimates_of(self, of: MeasureSet) -> dict[str, Any]:
-        """The estimates of one set, side by side."""
+        """Return the estimates of one set as JSON entries."""
         there = {m.name: self.estimates[m.name] for m in of.measures if m.name in self.estimates}
         optional = {measure.name for measure in of.measures if not measure.always}
         return Estimate.side_by_side({name: each for name, each in there.items() if each or name not in optional})

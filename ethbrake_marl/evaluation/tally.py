@@ -1,4 +1,4 @@
-"""Sums over some worlds of a list, added up chunk by chunk to the same bits in any order."""
+"""Sums over some worlds of a list. Sums of chunks can be added in any order, with the same bits."""
 
 from __future__ import annotations
 
@@ -21,19 +21,22 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """The statistics of some worlds of a list, added in any order; ``worlds_hash`` as in ``worlds_sha256``."""
+    """Statistics of some worlds of a list; tallies can be added in any order.
 
-    worlds: int = 0  # that count, driven by all agents
-    hidden: int = 0  # in which the channel hides something from a driven vehicle
+    ``worlds_hash`` is the hash of the worlds as in ``worlds_sha256``.
+    """
+
+    worlds: int = 0  # number of worlds that all agents drove
+    hidden: int = 0  # number of worlds in which the channel hides something from a controlled vehicle
     worlds_hash: int = 0
-    ranges: Mapping[str, tuple[Range, ...]] = field(default_factory=dict)  # least and largest of every quantity
+    ranges: Mapping[str, tuple[Range, ...]] = field(default_factory=dict)  # smallest and largest of every quantity
     left_out: tuple[LeftOut, ...] = ()
     agents: Mapping[str, AgentTally] = field(default_factory=dict)
-    silent: Mapping[str, str | None] = field(default_factory=dict)  # why sets of measures say nothing, by key
+    silent: Mapping[str, str | None] = field(default_factory=dict)  # why sets of measures do not apply, by key
 
     @classmethod
     def of(cls, part: Evaluation, objectives: Sequence[str] | None = None, *, long_list: bool = True) -> Tally:
-        """The statistics of a part of a list.
+        """Return the statistics of a part of a list.
 
         ``objectives`` as in ``tally_agents``; ``long_list`` as in ``contexts_of``.
         """
@@ -71,7 +74,7 @@ class Tally:
         )
 
     def rescore(self, objectives: Sequence[str], vehicles: int) -> Rescores:
-        """Every agent under these objectives and both counts, as ``Evaluation.rescore``."""
+        """Return the mean harm of every agent under these objectives and both counts, as in ``Evaluation.rescore``."""
         return Rescores(
             [
                 Rescored(

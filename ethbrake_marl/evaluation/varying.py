@@ -1,4 +1,4 @@
-"""Differences between the worlds of a list: their initial states, and the quantities that are drawn."""
+"""Differences between the worlds of a list: their initial states, and the quantities that vary."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 def states_of(worlds: Worlds, scenario: Scenario) -> list[dict[str, float | None]]:
-    """The initial state of each world: the columns that the scenario does not fix, and gaps and speeds.
+    """Return the initial state of each world: gaps, speeds, and all columns that the scenario does not fix.
 
-    The distance to an obstacle is None where only other worlds have one.
+    The distance to an obstacle is None in worlds without one.
     """
     fixed = {
         rule.column_of(i)
@@ -31,13 +31,13 @@ def states_of(worlds: Worlds, scenario: Scenario) -> list[dict[str, float | None
     ]
 
 
-_LONGEST_OWNERS = 30  # characters
+_LONGEST_OWNERS = 30  # longest list of vehicle or pair names, in characters
 
 
 def drawn_alike(worlds: Worlds, scenario: Scenario) -> dict[str, dict[str, Floats]]:
-    """Every quantity in which the worlds differ, by key, apart for vehicles and pairs that have other bounds.
+    """Return every quantity that varies between the worlds, by key, in groups with the same bounds.
 
-    Their values [n, entries] stand under who they are, in a few words; under "" if they are all that there are.
+    Each group maps a short name of its vehicles or pairs, or "" if it contains all of them, to its values [n, entries].
     """
     found: dict[str, dict[str, Floats]] = {}
     for key, rule in QUANTITY.of(worlds).items():

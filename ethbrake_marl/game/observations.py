@@ -34,9 +34,9 @@ from ethbrake_marl.physics.state import Floats, Ints, Worlds
 
 @dataclass(frozen=True, slots=True)
 class ObservationSpec:
-    """How many neighbours an observation holds on each side, and whether place, obstacle and contacts follow.
+    """What a vehicle observes: a number of neighbours on each side, and whether place, obstacle and contacts are added.
 
-    With ``chosen`` it holds these features alone, in this order; ``choose_observation`` makes such a one.
+    With ``chosen`` the observation has exactly these features, in this order; use ``choose_observation`` to make it.
 
     >>> import ethbrake_marl as eb
     >>> spec = eb.ObservationSpec(front=2, rear=0)
@@ -48,15 +48,15 @@ class ObservationSpec:
     """
 
     front: int = 1  # neighbours ahead, 0 to 64
-    rear: int = 1  # neighbours behind
-    role: bool = False  # ROLE_FEATURES
-    obstacle: bool = False  # OBSTACLE_FEATURES
-    chosen: tuple[str, ...] = ()  # full names; the other fields say how far these look
-    contact: bool = False  # CONTACT_FEATURES; those of contact_far must be chosen
-    time_step_s: float | None = None  # between two decisions; contact features need it, others do not look at it
+    rear: int = 1  # neighbours behind, 0 to 64
+    role: bool = False  # whether to add GROUPS.role
+    obstacle: bool = False  # whether to add GROUPS.obstacle
+    chosen: tuple[str, ...] = ()  # full names; the other fields are then what these features need
+    contact: bool = False  # whether to add GROUPS.contact; contact_far only through ``chosen``
+    time_step_s: float | None = None  # time between two decisions; only contact features need it
 
     def __post_init__(self) -> None:
-        """Refuse what is not a number of neighbours, and features that the rest does not fit."""
+        """Raise ``InvalidInput`` for an invalid number of neighbours, or fields that contradict ``chosen``."""
         for side, count in (("front", self.front), ("rear", self.rear)):
             whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
             if not whole or not 0 <= count <= MOST_NEIGHBOURS:
@@ -77,12 +77,12 @@ class ObservationSpec:
 
     @property
     def features(self) -> tuple[Feature, ...]:
-        """Every number of an observation in order; names are unique (``own.speed``, ``front_1.gap``)."""
+        """Every feature of an observation in order; names are unique (``own.speed``, ``front_1.gap``)."""
         return tuple(feature_named(name) for name in self.chosen) or self.whole
 
     @property
     def whole(self) -> tuple[Feature, ...]:
-        """The same with all built-in features of every group that it looks at."""
+        """All built-in features of every group of which the observation has a feature."""
         groups = [("own", GROUPS.own), *((prefix, GROUPS.neighbour) for prefix, _ in self.sides)]
         groups += [("role", GROUPS.role)] if self.role else []
         groups += [("obstacle", GROUPS.obstacle)] if self.obstacle else []
@@ -92,7 +92,7 @@ class ObservationSpec:
 
     @property
     def far(self) -> bool:
-        """Whether any of GROUPS.contact_far is chosen."""
+        """Whether a feature of GROUPS.contact_far is chosen."""
         return any(name.startswith("contact_far.") for name in self.chosen)
 
     @property
@@ -102,27 +102,27 @@ class ObservationSpec:
 
     @property
     def plan(self) -> Plan:
-        """Offsets of the neighbours and scaling of every feature, in order; what is picked, and what is added.
+        """The ``Plan`` that computes this observation.
 
-        Made once for each specification, not to be changed. Raises ``InvalidInput`` for contact features without a
+        It is cached per specification and must not be changed. Raises ``InvalidInput`` for contact features without a
         time step.
         """
         return _plan(self, tuple(registered_in(self.chosen).items()) if self.chosen else ())
 
     def at_steps_of(self, time_step_s: float) -> ObservationSpec:
-        """The same for decisions every ``time_step_s`` (s), where it needs to know and does not say so itself."""
+        """Return the specification with ``time_step_s`` (s) filled in, if it needs one and has none."""
         return replace(self, time_step_s=time_step_s) if self.contact and self.time_step_s is None else self
 
 
-Observation = ObservationSpec | Sequence[str] | Mapping[str, Any]  # or a list of groups and features, or the fields
+Observation = ObservationSpec | Sequence[str] | Mapping[str, Any]  # list: groups and features; mapping: fields
 
 
 def choose_observation(listed: Observation, time_step_s: float | None = None) -> ObservationSpec:
-    """The observation of a list of groups and single features: ``[own, front_1, rear_1.gap, my_feature]``.
+    """Return the observation for a list of groups and single features: ``[own, front_1, rear_1.gap, my_feature]``.
 
-    A mapping names the fields of an ``ObservationSpec``, which is what JSON makes of one. ``time_step_s`` (s) is the
-    time between two decisions; an environment knows its own, so only who observes without one gives it, for contact
-    features. Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for what is no such list.
+    A mapping gives the fields of an ``ObservationSpec``, as in JSON. ``time_step_s`` (s) is the time between two
+    decisions; only contact features outside an environment need it. Raises ``UnknownName`` with a suggestion,
+    ``InvalidInput`` for an invalid list.
     """
     if isinstance(listed, ObservationSpec):
         spec = listed
@@ -145,7 +145,7 @@ def choose_observation(listed: Observation, time_step_s: float | None = None) ->
 
 
 def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool, bool]:
-    """How far features look: neighbours in front and behind, the own place, the obstacle, contacts."""
+    """Return what the features need: neighbours in front and behind, own place, obstacle, contacts."""
     sides = [side for name in names if (side := side_of(name)) is not None]
     front, rear = (max((k for at, k in sides if at == wanted), default=0) for wanted in ("front", "rear"))
     groups = {name.partition(".")[0] for name in names}
@@ -160,7 +160,7 @@ _ROLE, _OBSTACLE = len(GROUPS.role), len(GROUPS.obstacle)
 
 
 def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations:
-    """Observation of ``vehicle`` (0 = front) in every world, [n, F] float32 in its own memory."""
+    """Return the observation of ``vehicle`` (0 = front) in every world, [n, F] float32 in new memory."""
     if not 0 <= vehicle < worlds.N:
         raise InvalidInput(f"observe: vehicle index {vehicle}; must be in 0..{worlds.N - 1}")
     packed = Packed.of(worlds)
@@ -168,12 +168,12 @@ def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations
 
 
 class Scaling(NamedTuple):
-    """The groups of a specification as the kernel wants them."""
+    """Arguments of the kernel that computes all groups except the contact features."""
 
-    offsets: Ints  # of the neighbours in the line
+    offsets: Ints  # offsets of the neighbours in the line
     role: bool
     obstacle: bool
-    features: Floats  # [3, F] 1 / scale, low, high
+    features: Floats  # [3, F] 1 / scale, low, high of each feature
 
 
 class Extra(NamedTuple):
@@ -181,24 +181,24 @@ class Extra(NamedTuple):
 
     column: int
     entry: RegisteredFeature
-    offset: int  # of the neighbour in the line; 0: its own
+    offset: int  # offset of the neighbour in the line; 0: the vehicle itself
     known: int  # column of the neighbour's ``known`` in the whole groups
 
 
 class Plan(NamedTuple):
-    """How an observation is made: by kernels, which fill whole groups, and by functions of registered features."""
+    """How to compute an observation: kernels fill whole groups, functions compute registered features."""
 
     scaling: Scaling
-    contacts: Contacts | None  # their group is the last one; None: it holds none
-    picked: Ints | None  # [F] columns of the whole groups; None: all of them
+    contacts: Contacts | None  # contact features, after all other groups; None: no such features
+    picked: Ints | None  # [F] columns to take from the whole groups; None: all
     extras: tuple[Extra, ...]
 
     def observe(self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None = None) -> Observations:
-        """Observations of several vehicles in worlds given as rows of ``physics.batch``, [n, len(vehicles), F].
+        """Return the observations of several vehicles in packed worlds (``physics.columns``), [n, len(vehicles), F].
 
-        ``steps`` [n] is how many steps each world has made, for error texts. Over a channel of periodic messages a
-        vehicle sees the worlds as it takes them to be (``physics.messages``). Contact features of commands that are
-        not wanted are 0. Raises ``PhysicsError`` naming the worlds in which a forecast of contacts failed.
+        ``steps`` [n] is the number of steps so far, for messages. With periodic messages a vehicle observes the worlds
+        as it estimates them (``physics.estimates``). Contact features of commands that are not needed are 0. Raises
+        ``PhysicsError`` with the worlds in which a forecast of contacts failed.
         """
         if not Packed(state, params).has_messages:
             return self._observe_present(state, params, vehicles, steps)
@@ -209,7 +209,7 @@ class Plan(NamedTuple):
         return np.concatenate(seen, axis=1)
 
     def _observe_present(self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None) -> Observations:
-        """The same where everything known is known as it is."""
+        """``observe`` without estimation: the state of every known vehicle is its present state."""
         shape = len(state), len(vehicles)
         whole = np.empty((*shape, self.scaling.features.shape[1]), np.float32)
         _observe_rows(state, params, vehicles, *self.scaling, whole)
@@ -230,9 +230,9 @@ class Plan(NamedTuple):
         for extra, (o, vehicle) in product(self.extras, enumerate(vehicles.tolist())):
             neighbour = vehicle + extra.offset if extra.offset else None
             counts = np.ones(worlds.n, np.bool_) if neighbour is None else whole[:, o, extra.known] == 1.0
-            if counts.any():  # one of a neighbour tells where the kernel says that it is known
+            if counts.any():  # a neighbour's feature counts where the neighbour is known
                 values = extra.entry.checked(worlds, vehicle, neighbour, counts, steps)
-            else:  # nobody is there, or nobody is heard
+            else:  # no such neighbour, or no news of it
                 values = extra.entry.scaled(np.full(worlds.n, extra.entry.unknown))
             out[:, o, extra.column] = values
         return out
@@ -268,7 +268,7 @@ def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature]
 
 
 def _scales(features: Sequence[Feature]) -> Floats:
-    """1 / scale, low, high of every feature, [3, F]."""
+    """Return 1 / scale, low, high of every feature, [3, F]."""
     return np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]])
 
 
@@ -277,15 +277,15 @@ def _observe_rows(
     state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, with_obstacle: bool, features: Floats,
     out: Observations,
 ) -> None:  # fmt: skip
-    """Fill ``out`` with the clipped features of each observer, in the order of the lists of features above.
+    """Fill ``out`` with the clipped features of each observer, in the order of ``GROUPS``.
 
-    One long loop on purpose: handing these arrays on to functions made it four times as slow.
+    This is one long loop on purpose: passing these arrays to functions made it four times slower.
     """
     of = columns(state)
     N, speed, command, gap_column, hit, obstacle = of.vehicles, of.speed, of.command, of.gap, of.hit, of.obstacle
     braking, driving, latency, mass, news = of.braking, of.driving, of.latency, of.mass, of.news
     by_link, some_obstacle = params.shape[1] > of.own_latency, state.shape[1] > obstacle
-    own_part = of.own_latency if by_link else latency  # of vehicle j's latency: own_part + j
+    own_part = of.own_latency if by_link else latency  # column own_part + j has vehicle j's own latency
     value = np.zeros(out.shape[2])
     for k in range(out.shape[0]):
         time = state[k, of.time]
@@ -350,10 +350,10 @@ def _observe_rows(
 
 @compiled
 def _fitting_deceleration(speed: float, latency_left: float, room: float) -> float:
-    """Constant deceleration that uses up exactly ``room`` after the own latency: ``v^2 / (2 (room - v tau))``.
+    """Return the constant deceleration that uses up ``room`` after the own latency: ``v^2 / (2 (room - v tau))``.
 
-    Room below 1 mm counts as 1 mm. Without room it therefore reads as the upper clipping bound (20 m/s2) from 0.2 m/s
-    on, and lower for a slower vehicle; at rest it is 0.
+    Room below 1 mm counts as 1 mm. So without room the feature is at its upper bound (20 m/s2) from 0.2 m/s on, and
+    lower for a slower vehicle; at rest it is 0.
     """
     speed = max(speed, 0.0)
     left = max(room - speed * latency_left, 1e-3)

@@ -10,10 +10,10 @@ from ethbrake_marl.game.observations import Observation, ObservationSpec, choose
 
 
 def observation_for(scenario: Game, vehicle: str | None = None) -> ObservationSpec:
-    """What a vehicle, or any learner, observes in this scenario unless somebody says otherwise: what it declares.
+    """Return the observation of a vehicle, or of all learners, that the scenario declares.
 
-    Where it declares nothing: one neighbour on each side; where Vehicle 1 has an obstacle ahead, also the own place in
-    the line and the obstacle. Raises ``InvalidInput`` naming two learners that observe different features.
+    By default a vehicle observes one neighbour on each side; with an obstacle ahead also its own place in the line and
+    the obstacle. Raises ``InvalidInput`` naming two learners with different observations, if ``vehicle`` is None.
     """
     observations = observations_of(scenario)
     if vehicle is None:
@@ -24,10 +24,10 @@ def observation_for(scenario: Game, vehicle: str | None = None) -> ObservationSp
 
 
 def observations_of(scenario: Game, given: Observation | None = None) -> tuple[ObservationSpec, ...]:
-    """What each vehicle observes, front to rear, [N]: what is given, or else what the scenario declares.
+    """Return the observation of each vehicle, front to rear, [N]: from ``given``, otherwise from the scenario.
 
-    Both say it of all vehicles, or by name of some: ``{"vehicle_2": ["own", "front_1"]}``. Raises ``UnknownName`` for a
-    vehicle that is not there, and what ``choose_observation`` raises.
+    Both give one observation for all vehicles, or one by name for some: ``{"vehicle_2": ["own", "front_1"]}``. Raises
+    ``UnknownName`` for an unknown vehicle, and what ``choose_observation`` raises.
     """
     names, step_s, said = scenario.vehicle_names, scenario.time_step_s, scenario.observation
     usual = ObservationSpec(role=scenario.has_obstacle, obstacle=scenario.has_obstacle)
@@ -47,9 +47,9 @@ def observations_of(scenario: Game, given: Observation | None = None) -> tuple[O
 
 
 def common_observation(observations: tuple[ObservationSpec, ...], scenario: Game) -> ObservationSpec:
-    """What all learners observe, of what each vehicle does; of all vehicles where nobody learns.
+    """Return the observation that all learners share, of one per vehicle; without learners, that all vehicles share.
 
-    Raises ``InvalidInput`` naming two that observe different features.
+    Raises ``InvalidInput`` naming two of them with different observations.
     """
     first, *others = scenario.learners or range(scenario.vehicles)
     for other in others:

@@ -1,10 +1,13 @@
-"""Brakes that build up: the force moves towards the command at a constant rate, so the motion is a cubic in time.
+"""Motion with brake build-up: the force moves towards the command at a constant rate, so motion is cubic in time.
 
-What a vehicle's brakes or engine call for (FORCE) falls at BRAKE_RATE and rises at RELEASE_RATE until it is the
-command; before the latency has elapsed the command is 0. It goes on while a vehicle stands, is held, or is struck.
-Between events each vehicle, and each body of joined vehicles, has a constant jerk. Two more events bound a piece: the
-force reaches the command or passes 0; and joined vehicles part, or a body that is held is so no more. A world in
-which all rates are infinite never comes here.
+The *force* of a vehicle (row FORCE) is the acceleration that its brakes or engine call for at the moment. It falls at
+the rate BRAKE_RATE and rises at the rate RELEASE_RATE until it equals the command; before the latency has elapsed the
+command counts as 0. The force keeps moving while a vehicle stands, is held, or is struck.
+
+Between events each vehicle, and each body of touching vehicles that move together, has a constant jerk. Build-up adds
+two kinds of events to those of ``physics.constant_motion``: a force reaches its command or passes 0; and touching
+vehicles separate, or a body that was held starts to move. Worlds in which all rates are infinite do not use this
+module.
 """
 
 from __future__ import annotations
@@ -17,16 +20,16 @@ from ethbrake_marl.physics.pieces import begin_piece, force_now, pieces_to_come
 from ethbrake_marl.physics.rows import ROW
 from ethbrake_marl.physics.state import Floats
 
-_SAME_MPS2 = 5e-13  # touching vehicles whose accelerations differ by less are one body: less than parting needs
+_SAME_MPS2 = 5e-13  # touching vehicles with accelerations closer than this move as one body
 
-_PARTS_LATE_S = 1e-9  # joined vehicles part this much late, so that rounding cannot undo it: it costs 1e-26 m
+_PARTS_LATE_S = 1e-9  # delay of a separation, so that rounding cannot undo it; error 1e-26 m
 
-_PARTS_LATE_MPS2 = 1e-12  # and by no smaller a difference of accelerations
+_PARTS_LATE_MPS2 = 1e-12  # smallest difference of accelerations at a separation
 
 
 @compiled(bare=True)
 def built_up(table: Floats) -> bool:
-    """Whether every force is the command in effect, so that until the next onset the motion is that of ``move``."""
+    """Return whether every force equals the command in effect, so that ``move`` is exact until the next onset."""
     there = True
     for i in range(table.shape[1]):
         there = there and table[ROW.FORCE, i] == table[ROW.COMMAND, i] * table[ROW.ACTIVE, i]
@@ -35,7 +38,10 @@ def built_up(table: Floats) -> bool:
 
 @compiled
 def first_return(value: float, rate: float, jerk: float) -> float:
-    """First time > 0 at which ``value + rate t + jerk t^2 / 2`` is 0; infinite: never. A start at 0 does not count."""
+    """Return the first time > 0 at which ``value + rate t + jerk t^2 / 2`` is 0; infinite if there is none.
+
+    A value of 0 at the start does not count.
+    """
     if value == 0.0:
         return -2.0 * rate / jerk if rate * jerk < 0.0 else math.inf
     if jerk == 0.0:
@@ -54,16 +60,22 @@ def first_return(value: float, rate: float, jerk: float) -> float:
 
 @compiled
 def gap_after(gap: float, closing: float, pressing: float, jerk: float, time: float) -> float:
-    """Gap after ``time`` of constant closing jerk: ``g - (w + (b + j t / 3) t / 2) t``. [m]"""
+    """Return the gap after ``time`` t at constant closing jerk: ``g - (w + (b + j t / 3) t / 2) t``, in m.
+
+    g is ``gap`` (m), w ``closing`` (closing speed, m/s), b ``pressing`` (closing acceleration, m/s2), j ``jerk``
+    (m/s3).
+    """
     return gap - (closing + 0.5 * (pressing + jerk * time / 3.0) * time) * time
 
 
 @compiled
 def contact_within(gap: float, closing: float, pressing: float, jerk: float, end: float) -> tuple[float, float]:
-    """``contact`` of a pair whose closing acceleration changes at the rate ``jerk`` (m/s3), until ``end`` (s).
+    """Return the time of a pair's first contact before ``end`` (s) and the closing speed there; ``(inf, 0)`` if none.
 
-    The closing speed ``w + b t + j t^2 / 2`` has at most two roots, between which the gap is monotone. The first
-    stretch at whose end the gap is not positive holds the contact. Newton's method finds it, kept inside by bisection.
+    Like ``contact``, for a closing acceleration that changes at the rate ``jerk`` (m/s3). The closing speed ``w + b t +
+    j t^2 / 2`` has at most two roots, and between them the gap is monotone. The contact lies in the first monotone
+    stretch that ends with a gap of at most 0. Newton's method finds it; bisection keeps the iterates inside the
+    stretch.
     """
     if jerk == 0.0:
         return contact(gap, closing, pressing)
@@ -105,7 +117,10 @@ def contact_within(gap: float, closing: float, pressing: float, jerk: float, end
 
 @compiled(bare=True)
 def plan_force(table: Floats, i: int, wanted: float) -> None:
-    """Where the force of vehicle ``i`` goes from now on, and when it is there: the command, or 0 on the way to it."""
+    """Set the rate of vehicle ``i``'s force, its next goal and the time until then.
+
+    The goal is the command ``wanted``, or 0 if the force changes sign on the way to it.
+    """
     force = table[ROW.FORCE, i]
     force = force_now(force, wanted, table[ROW.BRAKE_RATE, i], table[ROW.RELEASE_RATE, i])
     table[ROW.FORCE, i] = force
@@ -122,7 +137,7 @@ def plan_force(table: Floats, i: int, wanted: float) -> None:
 
 @compiled
 def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple[float, float, float, float]:
-    """``force_range``, and the rates at which both ends move."""
+    """Return ``force_range`` under the present force, and the rates at which its two ends move."""
     if force < 0.0 or (force == 0.0 and rate < 0.0):
         if speed > 0.0:
             return force, force, rate, rate
@@ -139,7 +154,7 @@ def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple
 
 @compiled
 def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) -> tuple[float, float]:
-    """Acceleration and jerk of a free body whose forces range over a moving ``[low, high]``."""
+    """Return acceleration and jerk of a free body whose force range ``[low, high]`` moves at the two given jerks."""
     if low > 0.0 or (low == 0.0 and low_jerk > 0.0):
         return low, low_jerk
     if high < 0.0 or (high == 0.0 and high_jerk < 0.0):
@@ -149,10 +164,11 @@ def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) ->
 
 @compiled(apart=True, bare=True)
 def pool_moving(table: Floats, first: int, last: int) -> float:
-    """Accelerations and jerks of touching vehicles ``first..last`` of equal speed; the time until one of them parts.
+    """Set accelerations and jerks of the touching vehicles ``first..last``; return the time until two separate (s).
 
-    The regression of ``pool``, but vehicles of equal acceleration are joined, and part by their jerks. Accelerations
-    that differ by rounding alone are equal.
+    All have the same speed. The rule is the isotonic regression of ``impact.pool`` with two differences: vehicles of
+    equal acceleration are joined, and separate later by their jerks; accelerations that differ by no more than rounding
+    count as equal. The time is infinite if no joined vehicles separate.
     """
     count = 0
     for i in range(first, last + 1):
@@ -189,7 +205,7 @@ def pool_moving(table: Floats, first: int, last: int) -> float:
 
 @compiled(bare=True)
 def settle_block(table: Floats, block: int, out: int) -> None:
-    """Acceleration and jerk of a block, into column ``out``."""
+    """Write acceleration and jerk of the pooled block ``block`` into column ``out``."""
     mass = table[ROW.BLOCK_MASS, block]
     table[ROW.ACCELERATION, out], table[ROW.JERK, out] = settle_moving(
         table[ROW.BLOCK_LOW, block] / mass, table[ROW.BLOCK_HIGH, block] / mass,
@@ -199,16 +215,17 @@ def settle_block(table: Floats, block: int, out: int) -> None:
 
 @compiled(bare=True)
 def parting_s(table: Floats, head: int, tail: int, value: float, jerk: float) -> float:
-    """Time until the block of vehicles ``head..tail`` is one no more.
+    """Return the time until the joined vehicles ``head..tail`` stop moving as one body (s).
 
-    A block that moves parts where the front ones of it alone would be faster than it; one that is held moves where its
-    front ones drive away or its rear ones would be pushed back.
+    ``value`` and ``jerk`` are the body's acceleration and jerk. A moving body splits where its front vehicles alone
+    would be faster than the whole. A body that is held starts to move where its front vehicles drive away or its rear
+    vehicles would be pushed back.
     """
     soonest = math.inf
     held = value == 0.0 and jerk == 0.0
     forward = value > 0.0 or (value == 0.0 and jerk > 0.0)
     mass, force, rate = 0.0, 0.0, 0.0
-    for i in range(head, tail + (1 if held else 0)):  # the front ones, up to i
+    for i in range(head, tail + (1 if held else 0)):  # the front vehicles, up to i
         if table[ROW.MASS, i] == math.inf:
             mass = math.inf
             continue
@@ -218,7 +235,7 @@ def parting_s(table: Floats, head: int, tail: int, value: float, jerk: float) ->
         rate += table[ROW.MASS, i] * table[side + ROW.LOW_JERK - ROW.FORCE_LOW, i]
         soonest = min(soonest, crossing_s(force / mass - value, rate / mass - jerk))
     mass, force, rate = 0.0, 0.0, 0.0
-    for i in range(tail if held else head - 1, head - 1, -1):  # the rear ones, from i on
+    for i in range(tail if held else head - 1, head - 1, -1):  # the rear vehicles, from i on
         if table[ROW.MASS, i] == math.inf:
             break
         mass += table[ROW.MASS, i]
@@ -230,7 +247,10 @@ def parting_s(table: Floats, head: int, tail: int, value: float, jerk: float) ->
 
 @compiled
 def crossing_s(below: float, rate: float) -> float:
-    """When a difference of accelerations that is not positive is surely positive; infinite: never. [m/s2, m/s3]"""
+    """Return when a difference of accelerations, at first ``below`` <= 0, is surely positive (s); infinite: never.
+
+    ``below`` in m/s2; it grows at ``rate`` m/s3.
+    """
     if rate <= 0.0:
         return math.inf
     return max(-below / rate, 0.0) + _PARTS_LATE_S + _PARTS_LATE_MPS2 / rate
@@ -238,7 +258,10 @@ def crossing_s(below: float, rate: float) -> float:
 
 @compiled(apart=True, bare=True)
 def accelerate_moving(table: Floats) -> float:
-    """``accelerate`` where brakes build up: accelerations and jerks; the time until touching vehicles part."""
+    """Version of ``accelerate`` for brake build-up: set accelerations and jerks; return the time until vehicles part.
+
+    The time (s) is that until the first touching vehicles separate.
+    """
     vehicles = table.shape[1]
     for i in range(vehicles):
         plan_force(table, i, table[ROW.COMMAND, i] * table[ROW.ACTIVE, i])
@@ -268,7 +291,7 @@ def accelerate_moving(table: Floats) -> float:
 
 @compiled(apart=True, bare=True)
 def next_moving_event(table: Floats, now: float, end: float, parting: float) -> float:
-    """``next_event`` where brakes build up."""
+    """Version of ``next_event`` for brake build-up; ``parting`` is the time until touching vehicles separate (s)."""
     vehicles = table.shape[1]
     soonest = min(end - now, parting)
     for i in range(vehicles):
@@ -284,7 +307,7 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
             table[ROW.JERK, i],
             table[ROW.LIMIT, i],
         )
-        most = (abs(rate) + abs(jerk) * soonest) * soonest  # by so much the speed can change
+        most = (abs(rate) + abs(jerk) * soonest) * soonest  # largest possible change of speed
         time, value = math.inf, 0.0
         if most >= abs(speed):
             time = first_return(speed, rate, jerk)
@@ -302,7 +325,7 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
             pressing = table[ROW.ACCELERATION, p + 1] - table[ROW.ACCELERATION, p]
             jerk = table[ROW.JERK, p + 1] - table[ROW.JERK, p]
             most = max(closing, 0.0) + (max(pressing, 0.0) + max(jerk, 0.0) * soonest) * soonest
-            if most * soonest >= gap:  # else it cannot close in this piece
+            if most * soonest >= gap:  # otherwise the gap cannot close before the next event
                 time, speed = contact_within(gap, closing, pressing, jerk, soonest)
         table[ROW.CONTACT_TIME, p] = time
         table[ROW.CONTACT_SPEED, p] = speed
@@ -312,7 +335,7 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
 
 @compiled(apart=True, bare=True)
 def move_on_cubics(table: Floats, duration: float) -> bool:
-    """``move`` where brakes build up: gaps, speeds and forces."""
+    """Version of ``move`` for brake build-up: move gaps, speeds and forces; return False if a contact was missed."""
     vehicles, sound = table.shape[1], True
     for p in range(vehicles - 1):
         if table[ROW.CONTACT_TIME, p] <= duration:
@@ -354,7 +377,10 @@ def move_on_cubics(table: Floats, duration: float) -> bool:
 
 @compiled(apart=True, bare=True)
 def move_apart_on_cubics(table: Floats, duration: float) -> bool:
-    """``move_apart`` where brakes build up: each vehicle from event to event on its own, and how near two can come."""
+    """Version of ``move_apart`` for brake build-up: move each vehicle alone if no two can meet, else return False.
+
+    Whether two can meet is bounded by the speeds that each of them reaches on its way.
+    """
     vehicles = table.shape[1]
     slowest_in_front = math.inf
     for i in range(vehicles):
@@ -394,10 +420,13 @@ def move_apart_on_cubics(table: Floats, duration: float) -> bool:
 
 @compiled(bare=True)
 def move_alone(table: Floats, i: int, wanted: float, duration: float) -> tuple[float, float]:
-    """Move vehicle ``i`` under one command, from SPEED_VALUE on, and add its WAY; its lowest and its highest speed."""
+    """Move vehicle ``i`` alone under the command ``wanted``; return its lowest and its highest speed.
+
+    The motion starts at the speed SPEED_VALUE, which is updated; the distance is added to WAY.
+    """
     speed = table[ROW.SPEED_VALUE, i]
     force = force_now(table[ROW.FORCE, i], wanted, table[ROW.BRAKE_RATE, i], table[ROW.RELEASE_RATE, i])
-    rate, building = 0.0, 0.0  # at which the force moves towards the command, and for how long
+    rate, building = 0.0, 0.0  # rate (m/s3) and duration (s) of the force's move to the command
     if wanted != force:
         rate = -table[ROW.BRAKE_RATE, i] if wanted < force else table[ROW.RELEASE_RATE, i]
         building = duration if abs(rate * duration) < abs(wanted - force) else (wanted - force) / rate
@@ -419,7 +448,7 @@ def move_alone(table: Floats, i: int, wanted: float, duration: float) -> tuple[f
 
 @compiled(apart=True, bare=True)
 def move_alone_by_events(table: Floats, i: int, wanted: float, duration: float) -> tuple[float, float]:
-    """``move_alone`` where the vehicle may come to rest, or to its speed limit."""
+    """Version of ``move_alone`` for a vehicle that may come to rest or reach its speed limit: event by event."""
     speed, limit, now = table[ROW.SPEED_VALUE, i], table[ROW.LIMIT, i], 0.0
     slowest, fastest = speed, speed
     while now < duration:

@@ -1,4 +1,4 @@
-"""Motion under constant accelerations: forces, the next event, the move to it. Compiled."""
+"""Motion under constant accelerations: set the accelerations, find the next event, move to it. Compiled."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(bare=True)
 def accelerate(table: Floats) -> None:
-    """Accelerations in force, touching vehicles coupled; marks the pairs that move as one body."""
+    """Set the acceleration of every vehicle, coupling touching ones, and mark the pairs that move as one body."""
     vehicles = table.shape[1]
     for i in range(vehicles):
         wanted = table[ROW.COMMAND, i] * table[ROW.ACTIVE, i]
@@ -39,7 +39,10 @@ def accelerate(table: Floats) -> None:
 
 @compiled(bare=True)
 def next_event(table: Floats, now: float, end: float) -> float:
-    """Time from ``now`` to the next event, at most ``end - now``; fills the candidates of each vehicle and pair."""
+    """Return the time from ``now`` to the next event, at most ``end - now`` (s).
+
+    Also writes into the table when each vehicle reaches its next speed event and when each pair comes into contact.
+    """
     vehicles = table.shape[1]
     soonest = end - now
     for i in range(vehicles):
@@ -64,7 +67,10 @@ def next_event(table: Floats, now: float, end: float) -> float:
 
 @compiled(bare=True)
 def move(table: Floats, duration: float) -> bool:
-    """Move to the next event, putting event values exactly; False when a gap became impossible."""
+    """Move the world by ``duration`` (s), to its next event; return False if a gap became impossibly negative.
+
+    Quantities that reach an event are set to its exact value: a gap to 0, a speed to 0 or the speed limit.
+    """
     sound = True
     for p in range(table.shape[1] - 1):
         if table[ROW.CONTACT_TIME, p] <= duration:
@@ -83,7 +89,10 @@ def move(table: Floats, duration: float) -> bool:
 
 @compiled(bare=True)
 def move_speeds(table: Floats, duration: float) -> None:
-    """Speeds after ``duration``: one value for each joined body, and a pair in contact differs by its closing speed."""
+    """Set the speeds after ``duration`` (s).
+
+    Joined vehicles get one common speed; the speeds of a pair in contact differ exactly by its closing speed.
+    """
     vehicles = table.shape[1]
     first = 0
     while first < vehicles:

@@ -1,6 +1,6 @@
-"""The forecast of contacts: when the pairs of a line first meet under commands held constant, and how hard.
+"""Forecast of contacts: when each pair of a line first meets under constant commands, and at what closing speed.
 
-The physics of ``advance``, on a table that somebody has filled; nothing of the motion is kept.
+Uses the physics of ``advance`` on a table that the caller has filled. The resulting motion is not kept.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from ethbrake_marl.physics.state import Floats
 
 
 class _Contact(NamedTuple):
-    """Rows of a forecast of the next impact of each pair."""
+    """Rows of the forecast array: the next impact of each pair."""
 
-    TIME: int = 0  # from now to the first impact from now on (s); infinite: none
-    CLOSING: int = 1  # its closing speed (m/s); 0: none
+    TIME: int = 0  # time from now to the pair's next impact (s); infinite: none
+    CLOSING: int = 1  # closing speed of that impact (m/s); 0: none
     WIDTH: int = 2
 
 
@@ -29,9 +29,10 @@ CONTACT = _Contact()
 
 @compiled(apart=True)
 def forecast_contacts(table: Floats, restitution: float, duration: float, found: Floats) -> int:
-    """Take one world ``duration`` (s) on; its status. Fills ``found`` [CONTACT_ROWS, N], and the harm of the table.
+    """Simulate one world for ``duration`` (s) and fill ``found`` [CONTACT.WIDTH, N] with each pair's next impact.
 
-    A pair that has had an impact before may have another first one from now on; in first-impact harm it counts no more.
+    Also fills the harm rows of the table. A pair that had an impact before the forecast can have a next impact here,
+    but it adds no first-impact harm. Returns the status: ``FLAG.DONE``, or the check that failed.
     """
     for p in range(table.shape[1] - 1):
         found[CONTACT.TIME, p], found[CONTACT.CLOSING, p] = math.inf, 0.0

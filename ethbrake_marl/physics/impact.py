@@ -1,17 +1,17 @@
-"""Impacts and resting contact of touching vehicles: one order-free law for both.
+"""Impacts and resting contact of touching vehicles, resolved together by one law that does not depend on an order.
 
-Pairs resolved one after another give results that depend on their order. Here a whole cluster of touching
-vehicles is resolved at once by a mass-weighted isotonic regression ``P`` (pool adjacent violators):
+Resolving pairs one after another gives results that depend on the order. Here a *cluster*, a run of touching vehicles,
+is resolved at once by a mass-weighted isotonic regression ``P`` (pool adjacent violators):
 
 * impact: ``v+ = (1 + e) P(v-) - e v-``; for two vehicles this is the paper's eq. (13);
-* resting contact: accelerations are ``P`` of the vehicles' own ones, a block's common acceleration being
-  ``sum(m u) / sum(m)``; forces that hold (brakes at rest) enter as a range, so a block at rest moves only when
-  pushed harder than its braked members hold.
+* resting contact: the accelerations are ``P`` of the vehicles' own accelerations; a pooled block accelerates with
+  ``sum(m u) / sum(m)``. Forces that hold (brakes at rest) enter as a range, so a block at rest moves only if the push
+  exceeds what its braked members can hold.
 
-Vehicles are ordered front to rear; feasible means that no vehicle is faster than the one before it.
+Vehicles are ordered front to rear; a result is feasible if no vehicle is faster than the one in front of it.
 
-The kernels work on one table of floats for one world, ``table[row, vehicle or pair]``; the rows are named here. (One
-array is cheap to hand from function to function; twenty small ones cost more than the physics.)
+The kernels work on one table of floats per world, ``table[row, vehicle or pair]``, with the rows of ``physics.rows``.
+One array is cheap to pass from function to function; passing twenty small ones costs more than the physics.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(bare=True)
 def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) -> int:
-    """Mass-weighted isotonic regression of vehicles ``first..last`` (inclusive) into row ``out``; the number of blocks.
+    """Pool vehicles ``first..last`` by mass-weighted isotonic regression into row ``out``; return the number of blocks.
 
-    Rows ``low`` and ``high`` bound each vehicle's own value (equal for an ordinary one). All members of a pooled
-    block get the same bits. Rows BLOCK_* describe the blocks. A vehicle of infinite mass (``obstacle``) stands, and
-    so does its block.
+    Rows ``low`` and ``high`` bound the value of each vehicle; they are equal for an ordinary value. All members of a
+    pooled block get the same bits. Rows BLOCK_* describe the blocks. A vehicle of infinite mass (the obstacle) stands
+    still, and so does its block.
     """
     count = 0
     for i in range(first, last + 1):
@@ -63,13 +63,13 @@ def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) ->
 def resolve_cluster(table: Floats, restitution: float, first: int, last: int) -> None:
     """Replace the speeds of touching vehicles ``first..last`` by their speeds after the impact.
 
-    One restitution holds per world, so clusters never mix two; the cluster is plastic when its largest closing speed
-    is below ``PLASTIC_SPEED_MPS``. A block's common speed is refined by the mean of what is left over, so the momentum
-    error stays within 4 eps of ``sum(m |v|)`` whatever the masses; a vehicle that nobody strikes keeps its bits.
+    All clusters of a world have the same restitution. A cluster is plastic if its largest closing speed is below
+    ``PLASTIC_SPEED_MPS``. The common speed of a block is corrected by the mean of the remaining error, so the momentum
+    error stays within 4 eps of ``sum(m |v|)`` for any masses. A vehicle that is not struck keeps its bits.
 
-    The exact blocks are ordered, their refined speeds only up to rounding. A plastic cluster is therefore put in order
-    at the end (front to rear, nobody faster than the one before): then no pair approaches any more, and the instant has
-    no further round. Without it two blocks can hand the last bit to and fro for ever.
+    Exact block speeds are ordered; corrected ones only up to rounding. So in a plastic cluster each speed is finally
+    limited to that of the vehicle in front. Then no pair approaches any more and the instant needs no further round of
+    impacts. Without this step two blocks could exchange a rounding error forever.
     """
     largest = 0.0
     for p in range(first, last):
@@ -94,9 +94,9 @@ def resolve_cluster(table: Floats, restitution: float, first: int, last: int) ->
 
 @compiled(bare=True)
 def resolve_impacts(table: Floats, restitution: float) -> bool:
-    """One round of impacts of one world: every cluster that holds an approaching pair, once. False if there is none.
+    """Resolve every cluster with an approaching pair, once; return False if no pair approaches.
 
-    Rows CLOSING, BEFORE and STRUCK tell what happened. CONTACT_SPEED is used up.
+    Writes the rows CLOSING, BEFORE and STRUCK of this round of impacts; clears CONTACT_SPEED.
     """
     pairs = table.shape[1] - 1
     approaching = False
@@ -130,7 +130,7 @@ def resolve_impacts(table: Floats, restitution: float) -> bool:
 
 @compiled(bare=True)
 def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recorded: int) -> int:
-    """Add the last round of impacts to the harm, and to the list of impacts."""
+    """Add the last round of impacts to the harm and to the list ``rows``; return the new number of impacts."""
     for p in range(table.shape[1] - 1):
         if table[ROW.STRUCK, p] == 0.0:
             continue

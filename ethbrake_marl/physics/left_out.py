@@ -1,4 +1,4 @@
-"""Worlds that cannot be advanced: left out, named, and never at the expense of the others."""
+"""Worlds that cannot be advanced are left out and reported; the results of the others do not change."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 Result = TypeVar("Result")
 
-LeftOutRows = tuple[tuple[int, str], ...]  # row of the batch that was given, why its world counts nowhere
+LeftOutRows = tuple[tuple[int, str], ...]  # row of each world that was left out, and why
 
 
 def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[Result, Ints, LeftOutRows]:
-    """What ``measure`` finds in those of ``n`` worlds in which it does not fail, their rows, and which were left out.
+    """Return the result of ``measure`` on those of ``n`` worlds that do not fail, their rows, and the worlds left out.
 
-    As ``leaving_out_failed``, but raises ``PhysicsError`` where no world is left.
+    Like ``leaving_out_failed``, but raises ``PhysicsError`` if every world fails.
     """
     found, rows, failed = leaving_out_failed(measure, np.arange(n))
     if found is None:
@@ -28,11 +28,11 @@ def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[
 
 
 def leaving_out_failed(work: Callable[[Ints], Result], rows: Ints) -> tuple[Result | None, Ints, dict[int, str]]:
-    """Result of ``work`` on those of ``rows`` in which it does not fail, these rows, and what went wrong in the others.
+    """Return the result of ``work`` on those ``rows`` that do not fail, these rows, and the failures as row -> reason.
 
-    ``work`` takes rows of a batch and raises ``PhysicsError`` by the place in what it was given. As the result of a
-    world does not depend on its batch, it is simply done again without those that failed; each time there are fewer.
-    The result is None where no row is left.
+    ``work`` takes rows of a batch; its ``PhysicsError`` numbers the worlds within the rows it was called with. A
+    world's result does not depend on its batch, so ``work`` is simply repeated without the failed rows until none
+    fails. The result is None if no row is left.
     """
     failed: dict[int, str] = {}
     while len(rows):
@@ -47,30 +47,30 @@ def leaving_out_failed(work: Callable[[Ints], Result], rows: Ints) -> tuple[Resu
 
 @dataclass(frozen=True, slots=True)
 class ImpactRows:
-    """Every impact of a segment, by world and then by time; arrays [k]."""
+    """Every impact of a segment, ordered by world and then by time; arrays [k]."""
 
     world: Ints
-    pair: Ints  # -1: Vehicle 1 and the obstacle ahead
+    pair: Ints  # index of the pair; -1: Vehicle 1 and the obstacle ahead
     time_s: Floats  # since Vehicle 1 began to brake
-    closing_speed_mps: Floats  # immediately before, > 0
-    first: Bools  # the pair had no impact before
-    front_speed_change_mps: Floats  # of the pair's front vehicle in this cluster of impacts, >= 0
-    rear_speed_change_mps: Floats  # of its rear vehicle, usually negative
+    closing_speed_mps: Floats  # just before the impact, > 0
+    first: Bools  # whether this is the pair's first impact
+    front_speed_change_mps: Floats  # change of the front vehicle's speed in this round of impacts, >= 0
+    rear_speed_change_mps: Floats  # change of the rear vehicle's speed, usually negative
 
 
 @dataclass(frozen=True, slots=True)
 class Impacts:
-    """What happened in a segment. Harm of a pair's impact is its squared closing speed (m2/s2)."""
+    """Harm and number of impacts in a segment. The harm of an impact is its squared closing speed (m2/s2)."""
 
-    first_impact_harm: Floats  # [n, P] only impacts of pairs that had none before
-    total_harm: Floats  # [n, P] every impact
-    count: Ints  # [n, P]
-    obstacle_first_harm: Floats  # [n] the same of Vehicle 1's impacts with the obstacle ahead
-    obstacle_total_harm: Floats  # [n]
-    obstacle_count: Ints  # [n]
-    rows: ImpactRows | None = None  # only when recorded
+    first_impact_harm: Floats  # [n, P] harm of each pair's first impact of the episode, if it is in this segment
+    total_harm: Floats  # [n, P] harm of every impact
+    count: Ints  # [n, P] number of impacts
+    obstacle_first_harm: Floats  # [n] first-impact harm of Vehicle 1 with the obstacle ahead
+    obstacle_total_harm: Floats  # [n] total harm of Vehicle 1 with the obstacle
+    obstacle_count: Ints  # [n] number of impacts of Vehicle 1 with the obstacle
+    rows: ImpactRows | None = None  # every single impact; None if not recorded
 
     @staticmethod
     def no_obstacle(n: int) -> tuple[Floats, Floats, Ints]:
-        """Harm, by both counts, and impacts of ``n`` worlds without an obstacle."""
+        """Return zeros for first-impact harm, total harm and number of impacts with an obstacle, [n] each."""
         return np.zeros(n), np.zeros(n), np.zeros(n, np.int64)

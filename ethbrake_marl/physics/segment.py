@@ -1,4 +1,4 @@
-"""A world moved through one segment of constant commands, from event to event. Compiled."""
+"""Advance one world through a segment of constant commands, from event to event. Compiled."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from ethbrake_marl.physics.state import Floats
 def advance_table(
     table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int
 ) -> tuple[int, int]:
-    """Take one world through a segment. Returns how many impacts are recorded by now, and a status (DONE if well).
+    """Advance one world through a segment; return the number of recorded impacts and a status (DONE if successful).
 
-    Harm of the segment is in rows FIRST_HARM, TOTAL_HARM and COUNT. ``rows`` [capacity, LISTED.WIDTH] receives the
-    impacts that fit, those beyond are only counted.
+    Writes the harm of the segment to the rows FIRST_HARM, TOTAL_HARM and COUNT. ``rows`` [capacity, LISTED.WIDTH]
+    receives impacts until it is full; further ones are only counted.
     """
     if builds_up(table):
         return advance_on_cubics(table, restitution, duration, start_s, world, rows, recorded)
@@ -38,7 +38,7 @@ def advance_table(
 def advance_on_cubics(
     table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int
 ) -> tuple[int, int]:
-    """``advance_table`` where brakes build up."""
+    """Version of ``advance_table`` for brake build-up."""
     for i in range(table.shape[1]):
         if not command_acts(table[ROW.ONSET, i], duration):
             table[ROW.ONSET, i] = max(table[ROW.ONSET, i], duration)
@@ -50,7 +50,7 @@ def _advance(
     table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int,
     building: bool,
 ) -> tuple[int, int]:  # fmt: skip
-    """``advance_table``; as ``building`` is a constant where it is called, only one of both motions is compiled."""
+    """``advance_table`` for both kinds of motion; callers pass ``building`` as a constant, so only one is compiled."""
     for p in range(table.shape[1] - 1):
         table[ROW.FIRST_HARM, p] = 0.0
         table[ROW.TOTAL_HARM, p] = 0.0
@@ -69,11 +69,11 @@ def _advance(
 
 @compiled(bare=True)
 def move_apart(table: Floats, duration: float, building: bool) -> bool:
-    """Move a world whose vehicles surely stay apart; leave it and return False when that is not sure.
+    """Move a world to the end of the segment if no two vehicles can touch; otherwise leave it and return False.
 
-    Where both of a pair have constant accelerations, the contact time says it exactly. Else: speeds are monotone
-    within a segment, so a pair closes by at most ``(max rear speed - min front speed) T``. ``building``: brakes build
-    up, see ``builds_up``.
+    If both vehicles of a pair have constant accelerations, the time of contact decides exactly. Otherwise a bound
+    decides: speeds are monotone within a segment, so a pair closes by at most ``(max rear speed - min front speed) T``.
+    ``building``: brakes build up, see ``builds_up``.
     """
     if building:
         return move_apart_on_cubics(table, duration)
@@ -106,7 +106,7 @@ def move_apart(table: Floats, duration: float, building: bool) -> bool:
 
 @compiled(bare=True)
 def start_events(table: Floats, building: bool) -> None:
-    """Make the table ready for ``to_next_impact`` from the start of a segment."""
+    """Prepare the table for ``to_next_impact`` at the start of a segment."""
     for i in range(table.shape[1]):
         table[ROW.ACTIVE, i] = 1.0 if table[ROW.ONSET, i] <= 0.0 else 0.0
         table[ROW.CONTACT_SPEED, i] = 0.0
@@ -116,9 +116,9 @@ def start_events(table: Floats, building: bool) -> None:
 
 @compiled(bare=True)
 def to_next_impact(table: Floats, restitution: float, now: float, duration: float, building: bool) -> tuple[int, float]:
-    """Move from ``now`` event by event up to and through the next round of impacts, or to the end of the segment.
+    """Move from ``now`` through the events up to and including the next round of impacts, or to the end of the segment.
 
-    Returns IMPACT (call again), DONE, or what went wrong; and the time reached.
+    Returns a status and the time reached: IMPACT (call again), DONE, or the check that failed.
     """
     for _ in range(BOUND.MOST_EVENTS):
         if resolve_impacts(table, restitution):
@@ -133,7 +133,10 @@ def to_next_impact(table: Floats, restitution: float, now: float, duration: floa
 
 @compiled(bare=True)
 def to_next_event(table: Floats, now: float, duration: float, building: bool) -> tuple[bool, float]:
-    """Move from ``now`` to the next event or to the end of the segment; False where a gap became impossible."""
+    """Move from ``now`` to the next event or the end of the segment; return False if a gap became impossible.
+
+    Also returns the time reached.
+    """
     if building and not built_up(table):
         passed = next_moving_event(table, now, duration, accelerate_moving(table))
         sound = move_on_cubics(table, passed)
@@ -149,7 +152,7 @@ def to_next_event(table: Floats, now: float, duration: float, building: bool) ->
 
 @compiled(bare=True)
 def begin_commands(table: Floats, now: float, passed: float, building: bool) -> None:
-    """Let those commands and pieces act that begin within ``passed`` (s) from ``now`` on."""
+    """Put into effect the commands and pieces that begin within ``passed`` (s) from ``now`` on."""
     for i in range(table.shape[1]):
         if table[ROW.ONSET, i] - now <= passed:
             table[ROW.ACTIVE, i] = 1.0

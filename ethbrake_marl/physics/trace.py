@@ -1,4 +1,4 @@
-"""A segment of constant command as pieces of constant acceleration: what a picture needs to be exact between events."""
+"""The motion within a segment as pieces of constant jerk, from which a figure can draw it exactly."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _CAPACITY = 64
 
 @compiled
 def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) -> int:
-    """Write down time from the start, gaps, speeds, accelerations and jerks where each piece begins; their number.
+    """Write time, gaps, speeds, accelerations and jerks at the start of each piece into ``rows``; return their number.
 
-    Those that do not fit into ``rows`` [capacity, 1 + P + 3 N] are only counted; minus their number where a contact
+    ``rows`` is [capacity, 1 + P + 3 N]; pieces that do not fit are only counted. The number is negative if a contact
     was missed.
     """
     vehicles, building = table.shape[1], builds_up(table)
@@ -55,21 +55,21 @@ def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) ->
 
 
 def segment_pieces(worlds: Worlds, command_mps2: Floats, until_s: Floats) -> list[Floats]:
-    """The motion of each world until a time, under one command: a row per piece of constant jerk.
+    """Return the motion of each world until a time, under constant commands: one row per piece of constant jerk.
 
     Args:
-        worlds: n, of N vehicles; they stay as they are.
-        command_mps2: signed accelerations wanted, [n, N] m/s2.
-        until_s: where the segments end, [n] s.
+        worlds: n worlds of N vehicles; they are not changed.
+        command_mps2: commanded accelerations, [n, N] m/s2.
+        until_s: end of each segment, [n] s.
 
-    Returns for each world [k, 1 + N + 3 N]: the absolute time at which the piece begins (s), how far Vehicle 1 has come
-    since the segment began, the gaps (m), the speeds (m/s), the accelerations (m/s2) and the jerks (m/s3).
+    Returns for each world an array [k, 1 + N + 3 N]: absolute time at which the piece begins (s), distance that Vehicle
+    1 has travelled since the segment began (m), gaps (m), speeds (m/s), accelerations (m/s2) and jerks (m/s3).
 
     """
     v, N, durations = worlds.vehicles, worlds.N, until_s - worlds.time_s
-    front_gaps = worlds.with_post_ahead(durations).obstacle_gap_m  # says where Vehicle 1 is
+    front_gaps = worlds.with_post_ahead(durations).obstacle_gap_m  # its change is the distance that Vehicle 1 travels
     latencies, restitutions = v.latency_s, v.restitution
-    # all but the post's own
+    # columns of the vehicles, without the dummy obstacle
     wanted = [*range(N + 1), *(part * (N + 1) + i for part in (1, 2, 3) for i in range(1, N + 1))]
     found = []
     for k in range(worlds.n):

@@ -23,9 +23,9 @@ _PACKAGES = ("ethbrake-marl", "gymnasium", "numba", "numpy", "safetensors", "sta
 
 
 def installed_versions() -> dict[str, str]:
-    """Name -> version of this package, Python and every package that a training's numbers depend on.
+    """Return name -> version of Python, this package and every package that a training's results depend on.
 
-    Those that gave a part to this process are among them.
+    Packages that have added a part to this process (``registry.versions_used``) are included.
     """
     return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES} | versions_used()
 
@@ -49,11 +49,11 @@ class FeatureDefinition(_Strict):
     low: float
     high: float
     unknown: float
-    tried: Annotated[tuple[float, ...], Field(max_length=64)]  # what it gave in a few worlds
+    tried: Annotated[tuple[float, ...], Field(max_length=64)]  # its values in a few test worlds
 
 
 class ObservationSchema(_Strict):
-    """What the policy sees: neighbours on each side, feature names in order, and a hash of how each is scaled."""
+    """The observation of the policy: neighbours on each side, feature names in order, and a hash of the scaling."""
 
     front: Neighbours
     rear: Neighbours
@@ -63,7 +63,7 @@ class ObservationSchema(_Strict):
 
     @classmethod
     def of(cls, spec: ObservationSpec) -> Self:
-        """Describe ``spec`` so that a later change of a name, unit, scale or bound is noticed."""
+        """Describe ``spec``, so that a later change of a name, unit, scale or bound is detected."""
         names = tuple(f.name for f in spec.features)
         scaling = [[f.name, f.unit, f.scale, f.low, f.high] for f in spec.features]
         return cls(
@@ -82,15 +82,15 @@ class ObservationSchema(_Strict):
 
     @property
     def spec(self) -> ObservationSpec:
-        """The observation as the environment builds it, from the names; raises ``UnknownName``."""
+        """The observation that the environment builds from the names; raises ``UnknownName``."""
         return choose_observation(self.features)
 
 
 class Manifest(_Strict):
-    """Everything about a policy but its tensors; ``action`` is a fraction of the own capacity, -1 = full braking.
+    """Everything about a policy except its tensors; an action is a fraction of the own capacity, -1 = full braking.
 
-    Format 3 is for policies of several networks, 4 for one that scores its choices, 5 for one that chooses among
-    policies; any other network is written as ever, for earlier versions too.
+    Format 3 is for a mixture of experts, 4 for a network that scores actions, 5 for one that also chooses among
+    policies. Any other network keeps format 2, which earlier versions can read.
     """
 
     format: Literal["ethbrake-policy"] = "ethbrake-policy"
@@ -106,7 +106,7 @@ class Manifest(_Strict):
     steps: Annotated[int, Field(ge=0)]
     versions: dict[str, str]
     weights_sha256: Sha256
-    manifest_sha256: Sha256  # of everything above, see ``content_sha256``
+    manifest_sha256: Sha256  # hash of all fields above, see ``content_sha256``
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Manifest:
@@ -139,9 +139,9 @@ class Manifest(_Strict):
 
 
 def content_sha256(content: Mapping[str, Any]) -> str:
-    """SHA-256 of a manifest's plain content without its own hash: sorted keys, no blanks, ASCII.
+    """Return the SHA-256 of a manifest's plain content without its own hash: sorted keys, no spaces, ASCII.
 
-    It binds names, architecture and weights together, against accidents and edits; it is no signature.
+    It ties names, architecture and weights together and detects accidents and edits; it is not a signature.
     """
     hashed = {key: value for key, value in content.items() if key != "manifest_sha256"}
     return hashlib.sha256(json.dumps(hashed, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

@@ -21,21 +21,21 @@ class PolicyTeam:
 
     @property
     def steps(self) -> int:
-        """Decisions of learners after which they were taken."""
+        """Number of learners' decisions in training before the policies were saved."""
         return next(iter(self.drivers.values())).steps
 
     def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
-        """Write a folder ``vehicle_i/`` for each learner with its bundle, as ``Policy.save`` writes one."""
+        """Write a folder with one bundle per learner, ``vehicle_i/``, each as by ``Policy.save``."""
         with new_folder(Path(folder), replace=replace) as partial:
             for name, policy in self.drivers.items():
                 policy.save(partial / name)
 
 
-Trained = Policy | PolicyTeam  # what a training makes: one policy for all its learners, or one for each
+Trained = Policy | PolicyTeam  # result of a training: one policy for all learners, or one for each
 
 
 def read_trained(folder: Path) -> Trained:
-    """Read what their ``save`` wrote; raises ``CorruptBundle``, and what ``load_policy`` raises."""
+    """Read what ``save`` of a policy or team wrote; raise ``CorruptBundle``, and what ``load_policy`` raises."""
     if (folder / MANIFEST).exists():
         return load_policy(folder)
     names = sorted((path.name for path in folder.glob("vehicle_*")), key=lambda name: int(name.split("_")[1]))

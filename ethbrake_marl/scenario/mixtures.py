@@ -1,4 +1,4 @@
-"""Mixtures of scenarios: each world is drawn from one member, by weight, and is then that member's own world."""
+"""Mixtures of scenarios: each world is drawn from one member, by weight, and equals that member's own world."""
 
 from __future__ import annotations
 
@@ -13,17 +13,20 @@ from ethbrake_marl.scenario.vehicle_types import Member
 
 WORDS = ("title", "description", "source")
 
-_OWN = {"name", *WORDS, "mixture"}  # of the mixture itself; every other key beside it holds for all members
+_OWN = {"name", *WORDS, "mixture"}  # the mixture's own keys; every other key applies to all members
 
 _ONE_FOR_ALL = ("vehicles", "time_step_s", "horizon_s", "roles", "objective", "observation")
 
-_SHARED = (*_ONE_FOR_ALL, "v2x", "early_impacts")  # told of the mixture where all members agree
+_SHARED = (*_ONE_FOR_ALL, "v2x", "early_impacts")  # keys that the mixture takes over if all members agree
 
 AnyScenario = TypeVar("AnyScenario", bound=ScenarioFields)
 
 
 def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """What a scenario says, with other values under some keys; a new way to declare gaps takes the old one's place."""
+    """Return the content of a scenario with changed values.
+
+    A new way to declare gaps or speeds replaces the old one.
+    """
     old = {key for pair in QUANTITY.alternatives.items() for key in pair if changes.keys() & set(pair)}
     if "speeds_mps" in changes:
         old.add("speed_deviations_mps")
@@ -33,10 +36,10 @@ def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> d
 def build_members(
     document: Document, build: Callable[[Document], AnyScenario]
 ) -> tuple[Document, tuple[AnyScenario, ...]]:
-    """The members that a document's ``mixture`` lists, and the document with what follows from them.
+    """Return the document with what follows from its members, and the members that its ``mixture`` lists.
 
-    What stands beside ``mixture`` replaces what every member says. A list that is none stays for the schema to refuse.
-    Raises ``InvalidInput`` naming the member that is wrong, or the key in which two of them differ.
+    Keys next to ``mixture`` replace those of every member. An invalid list is left for the schema to refuse. Raises
+    ``InvalidInput`` naming the invalid member, or the key in which two members differ.
     """
     listed, content = document.content["mixture"], document.content
     if not (isinstance(listed, list | tuple) and listed and all(_is_whole(entry) for entry in listed)):
@@ -53,18 +56,18 @@ def build_members(
 
 
 def _is_whole(entry: Any) -> bool:
-    known = Member.model_fields.keys()  # else the schema names the key that is not
+    known = Member.model_fields.keys()  # the schema reports an unknown key
     return isinstance(entry, dict) and isinstance(entry.get("scenario"), dict) and entry.keys() <= known
 
 
 def member_content(member: ScenarioFields) -> dict[str, Any]:
-    """What shapes a member's worlds, as plain data: what it says but its texts, and all that a batch has in common."""
+    """Return what determines a member's worlds, as plain data: declared values and shared settings, without texts."""
     declared = member.model_dump(mode="json", exclude_unset=True, exclude_none=True, exclude=set(WORDS))
     return {**declared, **member.model_dump(mode="json", include=set(_SHARED), exclude_none=True)}
 
 
 def _member_document(document: Document, i: int, entry: Mapping[str, Any], beside: Mapping[str, Any]) -> Document:
-    """What one member says but its texts, with what stands beside the mixture, each on its line."""
+    """Return the content of one member without texts, updated with the keys next to the mixture, with line numbers."""
     own = {key: value for key, value in entry["scenario"].items() if key not in WORDS}
     inside = {path[3:]: line for path, line in document.lines.items() if path[:3] == ("mixture", i, "scenario")}
     own = {**{key: document.content[key] for key in ("vehicles",) if key in document.content}, **own}
@@ -74,7 +77,7 @@ def _member_document(document: Document, i: int, entry: Mapping[str, Any], besid
 
 
 def _check_members(document: Document, members: Sequence[ScenarioFields]) -> None:
-    """Refuse mixtures in mixtures, a name given twice, and members that cannot be one batch."""
+    """Refuse nested mixtures, repeated names, and members that cannot share one batch."""
     where = f"{document.where(('mixture',))}: mixture"
     first = members[0]
     if (given := document.content.get("vehicles", first.vehicles)) != first.vehicles:

@@ -1,8 +1,10 @@
-"""``certify``: is there a plan behind the proposed action that keeps the budget? If not, apply the backup's action.
+"""``certify``: apply the proposed action if a plan behind it keeps the budget, else apply the backup plan's action.
 
-A plan is tried in every member of a world, one after the other, with the kernels of ``members``. After the proposal
-these plans are tried: the rest of the current plan, then the best constant action. ``step`` says why the harm of the
-episode then stays within the first bound.
+A *plan* holds one action for each decision up to the horizon. The *backup* is the plan that the shield currently holds.
+The *budget* is the largest harm that the shield accepts for the whole episode. A *member* is one of the possible worlds
+that a world stands for. Each plan is simulated in every member, with the kernels of ``members``. Two plans are tried
+after a proposal: the rest of the current plan, then the best constant action. ``step`` proves that the harm of the
+episode then never exceeds the first bound.
 """
 
 from __future__ import annotations
@@ -39,14 +41,20 @@ from ethbrake_marl.shield.reasons import (
 )
 from ethbrake_marl.shield.running import Running, put
 
-APPLIED, REASON, BOUND, MARGIN = range(4)  # columns of a decision, of each vehicle
+APPLIED, REASON, BOUND, MARGIN = range(4)  # columns of the decision of one vehicle
 
-NEARLY = 1e-9  # a constant whose harm (m2/s2) in one segment is above the limit by less is certified step by step
+# A constant action is first simulated in one segment. If its harm (m2/s2) is above the limit by at most this much, the
+# exact simulation, decision by decision, still gets its chance.
+NEARLY = 1e-9
 
 
 @compiled(apart=True)
 def best_constant(world: Members, states: Floats, ended: Bools, step: int, constants: Floats) -> tuple[int, float]:
-    """Which constant action [C, K] has the least worst harm from here on, and that harm, each in one segment."""
+    """Return the constant action of ``constants`` [C, K] with the least worst-case harm, as its index, and that harm.
+
+    Each action is held from now to the horizon, simulated in one segment. The worst case is over the members (possible
+    worlds) of the world.
+    """
     best, least, critical = 0, math.inf, 0
     for c in range(constants.shape[0]):
         worst, first = 0.0, critical
@@ -67,9 +75,11 @@ def better_plan(
     world: Members, states: Floats, ended: Bools, step: int, constants: Floats, value: float, most: float,
     plan: Floats, trial: Floats,
 ) -> tuple[float, float]:  # fmt: skip
-    """Replace the plan from ``step`` on by the best constant, if that harms less than ``value`` and at most ``most``.
+    """Replace the rest of a plan by the best constant action, if this reduces its harm.
 
-    Returns the harm that is certified now, and the least harm found, certified or not.
+    ``value`` is the plan's harm. The replacement happens from decision ``step`` on, in place, and only if its harm is
+    less than ``value`` and at most ``most``. Returns the harm of the plan afterwards, and the least harm found,
+    certified or not.
     """
     so_far = worst_so_far(world, states)
     if value <= so_far or so_far > most:  # nothing can be better
@@ -89,14 +99,14 @@ def better_plan(
 
 @compiled
 def copy_action(action: Floats, to: Floats) -> None:
-    """Copy the actions of one decision, one for each vehicle, or what else is a row of numbers."""
+    """Copy one row of numbers, usually the actions of one decision, one for each vehicle."""
     for c in range(to.shape[0]):
         to[c] = action[c]
 
 
 @compiled
 def is_planned(action: Floats, planned: Floats) -> bool:
-    """Whether all vehicles do what the plan says."""
+    """Return whether the actions of all vehicles equal the planned ones."""
     for c in range(planned.shape[0]):  # noqa: SIM110  # all() is not compiled
         if action[c] != planned[c]:
             return False
@@ -108,10 +118,11 @@ def try_action(
     world: Members, states: Floats, ended: Bools, step: int, action: Floats, budget: float, certified: float,
     constants: Floats, plan: Floats, room: Floats, after: Floats, over: Bools,
 ) -> tuple[float, float, int]:  # fmt: skip
-    """Take the step of an action [K], and look for a plan after it: harm certified, least harm found, and the reason.
+    """Take one step with ``action`` [K] and search for a plan that continues it within the budget.
 
-    Where the harm is within the budget, action and plan are in ``plan`` afterwards; else that is as it was, and its
-    harm ``certified``. An action from which the physics fails is not certified.
+    Returns the harm of the certified plan, the least harm found, and the code of the reason. If the harm is within the
+    budget, the action and the plan behind it are written into ``plan``; otherwise ``plan`` is unchanged, and
+    ``certified`` remains its harm. An action for which the physics fails is not certified.
     """
     going = take_steps(world, states, ended, step, action, after, over)
     value = worst_so_far(world, after) if going >= 0 else math.inf
@@ -134,7 +145,10 @@ def try_action(
 
 @compiled
 def tell_action(out: Floats, action: Floats, bound: float, margin: float) -> None:
-    """Note in ``out`` [K, 4] what is applied, its bound, and the margin of those that did not deviate."""
+    """Write applied action, bound and margin into ``out`` [K, 4].
+
+    Vehicles whose proposal has no certificate keep the margin that is there already.
+    """
     for c in range(action.shape[0]):
         out[c, APPLIED], out[c, BOUND] = action[c], bound
         if out[c, REASON] != NO_CERTIFICATE:
@@ -146,10 +160,12 @@ def decide_world(
     world: Members, states: Floats, ended: Bools, step: int, proposed: Floats, budget: float, certified: float,
     constants: Floats, plan: Floats, room: Floats, tried: Floats, after: Floats, over: Bools, out: Floats,
 ) -> bool:  # fmt: skip
-    """Decide in one world, see ``certify``: fills ``after``, ``over`` (by member) and ``out`` (by vehicle: applied,
-    reason, bound, margin); the plan is the one whose harm is ``out``'s bound. First all proposals [K] together; if they
-    have no certificate, one vehicle after the other, front to rear, each beside what is in the plan by then. Returns
-    whether the physics did not fail with what is applied.
+    """Decide in one world: certify the proposed actions [K], or replace them; see ``certify``.
+
+    All proposals are tried together first. If they have no certificate, the vehicles are tried one by one, front to
+    rear, each beside the actions that the plan holds by then. Fills ``after`` and ``over`` (by member, that is,
+    possible world) and ``out`` (by vehicle: applied action, reason, bound, margin). Afterwards ``plan`` is the plan
+    whose harm is the bound in ``out``. Returns False where the physics fails with the applied actions.
     """
     deviating = 0
     for c in range(proposed.shape[0]):
@@ -157,7 +173,7 @@ def decide_world(
         tried[0, c] = min(max(proposed[c], -1.0), 1.0) if usable else plan[step, c]
         out[c, REASON] = SAME_AS_PLAN if usable else NOT_A_NUMBER
         if tried[0, c] != plan[step, c]:
-            out[c, REASON] = -1  # open
+            out[c, REASON] = -1  # not decided yet
             deviating += 1
     value, least, reason = try_action(
         world, states, ended, step, tried[0], budget, certified, constants, plan, room, after, over
@@ -193,7 +209,10 @@ def certify_worlds(
     running: Running, proposed: Floats, budget: Floats, certified: Floats, constants: Floats, plans: Floats,
     after: Floats, out: Floats, over: Bools, failed: Bools,
 ) -> None:  # fmt: skip
-    """``decide_world`` in every world whose episode runs; ``failed`` [n] where it did. ``plans`` change in place."""
+    """Run ``decide_world`` in every world whose episode still runs; changes ``plans`` in place.
+
+    Sets ``failed`` [n] where the physics fails. A world whose episode has ended keeps its state and its plan.
+    """
     n, every = running.steps.shape[0], all_members(running)
     room, tried = np.zeros((2, plans.shape[1], plans.shape[2])), np.zeros((2, plans.shape[2]))
     M = running.states.shape[0] // max(n, 1)
@@ -217,9 +236,10 @@ def certify_worlds(
 
 @compiled
 def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Floats) -> None:
-    """Fill ``value`` [n] with the worst harm of the episodes if the plans are executed from here; infinity: it failed.
+    """Fill ``value`` [n] with the harm of executing the plans from now on, in the worst member (possible world).
 
-    Where one of the ``constants`` is better, it replaces the plan (in place) first.
+    The value is infinity where the physics fails. Where one of the ``constants`` (constant actions) harms less than a
+    plan, it replaces the rest of that plan in place first.
     """
     n, every = running.steps.shape[0], all_members(running)
     trial = np.zeros((plans.shape[1], plans.shape[2]))
@@ -236,10 +256,10 @@ def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Flo
 
 @compiled
 def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) -> None:
-    """How the episodes end if the plans are executed from here.
+    """Simulate the plans from now on and report how the episodes end.
 
-    Fills ``rests`` [n]: every member comes to rest before the horizon, and stays so; and ``borne`` [n * M, N]: the harm
-    that each vehicle bears then, an obstacle ahead none.
+    Fills ``rests`` [n]: whether every member (possible world) comes to rest before the horizon and stays at rest; and
+    ``borne`` [n * M, N]: the harm that each vehicle bears by then (an obstacle ahead bears none).
     """
     n, every = running.steps.shape[0], all_members(running)
     M = running.states.shape[0] // max(n, 1)
@@ -254,9 +274,10 @@ def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) 
 
 @compiled
 def descend_constants(running: Running, grid: Floats, rounds: int, action: Floats) -> None:
-    """Replace each vehicle's constant action [n, K] in turn by the best of the grid, by harm in one segment.
+    """Improve constant actions ``action`` [n, K] by coordinate descent over the vehicles, in place.
 
-    In place, one vehicle after the other; of worlds with one member each.
+    Each vehicle's action is replaced in turn by the action of ``grid`` with the least harm, simulated in one segment.
+    Every world must have exactly one member (possible world).
     """
     every, states, ended, steps = all_members(running), running.states, running.ended, running.steps
     for k in range(states.shape[0]):
@@ -272,36 +293,36 @@ def descend_constants(running: Running, grid: Floats, rounds: int, action: Float
             action[k, c] = best
 
 
-CONSTANTS = tuple(-k / 10 for k in range(11))  # actions that are tried as constants: coasting to full braking
+CONSTANTS = tuple(-k / 10 for k in range(11))  # constant actions that are tried, from coasting to full braking
 
 
 class Backup(NamedTuple):
-    """The plan that is executed where nothing else is certified."""
+    """The plan that the shield executes where it certifies nothing else."""
 
     plan: Floats  # [n, L] or [n, L, K] actions, column j for decision j
-    harm: Floats  # [n] of the episode, in the worst member, if the plan is executed from now on (m2/s2)
-    constants: Floats = np.array(CONSTANTS)  # [C] or [C, K] actions that may replace the rest of a plan
+    harm: Floats  # [n] harm of the episode in the worst member if the plan is executed from now on (m2/s2)
+    constants: Floats = np.array(CONSTANTS)  # [C] or [C, K] constant actions that may replace the rest of a plan
 
 
 class Decision(NamedTuple):
-    """The applied actions, the reasons, and the bound and plan that hold from now on."""
+    """Result of ``certify``: the applied actions, the reasons, and the bound and plan that hold from now on."""
 
     applied: Floats  # [n] or [n, K] actions in [-1, 1]
-    intervened: Bools  # [n] or [n, K] what is applied is not what was proposed (clipped)
-    reason: NDArray[np.int64]  # [n] or [n, K] values of ShieldReason
-    bound: Floats  # [n] harm of the episode is at most this from now on (m2/s2)
-    margin: Floats  # [n] or [n, K] budget minus the least harm found after the proposal; negative: why it was rejected
-    after: Running  # as it will be at the next decision
-    backup: Backup  # the plan that goes with the bound
+    intervened: Bools  # [n] or [n, K] whether the proposal was replaced (clipping to [-1, 1] does not count)
+    reason: NDArray[np.int64]  # [n] or [n, K] codes of ShieldReason
+    bound: Floats  # [n] largest possible harm of the episode from now on (m2/s2)
+    margin: Floats  # [n] or [n, K] budget minus the least harm found after the proposal; negative if rejected (m2/s2)
+    after: Running  # the episodes at the next decision
+    backup: Backup  # the plan whose harm is the bound
 
     @property
     def reason_names(self) -> NDArray[np.str_]:
-        """The reasons in words, [n] or [n, K]."""
+        """Reasons in words, [n] or [n, K]."""
         texts = [ShieldReason(code).text for code in self.reason.ravel().tolist()]
         return np.array(texts).reshape(self.reason.shape)
 
     def put(self, rows: Ints, other: Decision, taken: Ints) -> Decision:
-        """A copy with some worlds taken from another decision: ``rows`` of this one are ``taken`` of the other."""
+        """Return a copy with world ``rows[j]`` of this decision replaced by world ``taken[j]`` of ``other``."""
         columns: dict[str, Any] = {
             name: put(getattr(self, name), rows, getattr(other, name)[taken]) for name in self._fields[:5]
         }
@@ -316,15 +337,18 @@ class Decision(NamedTuple):
 
 
 def plan_harm(running: Running, plan: Floats) -> Floats:
-    """Harm of the episodes in the worst member if the plans are executed from here, [n] m2/s2, caps aside.
+    """Return the harm of the episodes if the plans are executed from now on, [n] m2/s2.
 
-    It equals the engine's to the bit.
+    It is the harm in the worst member (possible world), and equals the engine's to the bit. Caps are ignored.
     """
     return bettered_plan(running, plan, np.zeros(0))[1]
 
 
 def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Floats, Floats]:
-    """The plans, or the best constant action where it harms less in the worst member; and that harm."""
+    """Return each plan, or the best constant action if that harms less, and the harm of the result.
+
+    Harm is that in the worst member (possible world).
+    """
     value = np.empty(running.n)
     _check_plan(running, plan)
     plans = np.array(plan, np.float64, order="C")
@@ -336,22 +360,24 @@ def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Fl
 
 
 def from_now(past: Floats, later: Floats | float, steps: Ints) -> Floats:
-    """Plans with the actions of ``past``, which were applied, before the decisions ``steps`` [n], then ``later``."""
+    """Return plans with the actions of ``past`` before decision ``steps`` [n], and of ``later`` afterwards."""
     made = np.arange(past.shape[1]) < steps[:, np.newaxis]
     return np.where(made if past.ndim == 2 else made[:, :, np.newaxis], past, later)
 
 
 def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) -> Decision:
-    """Decide in every world which proposed actions are applied, and where the backup's; no argument is changed.
+    """Decide in every world: apply the proposed action if it can be certified, else the backup plan's.
+
+    No argument is changed.
 
     Args:
-        running: the episodes, at this decision.
-        proposed: actions [n] or [n, K]. One beyond [-1, 1] is clipped first; one that is no number is replaced.
-        backup: the plan that is applied where a proposal has no certificate, and its harm.
-        budget: the harm [n] that is guaranteed, at least the backup's.
+        running: the episodes at this decision.
+        proposed: actions [n] or [n, K]; clipped to [-1, 1] first. NaN is replaced by the planned action.
+        backup: the plan to apply where a proposal has no certificate, and its harm.
+        budget: largest accepted harm of each episode, [n]; at least the backup's harm.
 
-    Raises ``InvalidInput`` for shapes that do not fit or a budget below the backup's harm, ``PhysicsError`` naming the
-    worlds that cannot be advanced by what would be applied.
+    Raises ``InvalidInput`` for shapes that do not fit or a budget below the backup's harm, and ``PhysicsError`` naming
+    the worlds in which the physics fails with the applied action.
 
     """
     n, problem, vehicles = running.n, running.problem, len(running.problem.vehicles)

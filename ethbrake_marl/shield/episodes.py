@@ -1,4 +1,4 @@
-"""Episodes of a driver behind a step shield: harm, bound, and replaced decisions, world by world."""
+"""Results of whole episodes behind a step shield: harm, bound and replaced decisions of every world."""
 
 from __future__ import annotations
 
@@ -15,50 +15,50 @@ from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield.drivers import ShieldedDriver
 from ethbrake_marl.shield.step import StepShield
 
-CHUNK = 500  # worlds advanced together: bounds memory, changes no result
+CHUNK = 500  # worlds advanced together; limits memory, and does not change results
 
 
 class Shielded(NamedTuple):
-    """Episodes behind a step shield: n worlds (any axes before), N vehicles, K of them shielded."""
+    """Episodes behind a step shield: n worlds (with any leading axes), N vehicles, K of them shielded."""
 
-    harm: Floats  # [n] under the guarded count (m2/s2)
-    vehicle_harm: Floats  # [n, N] the share of it that each vehicle bears
-    bound: Floats  # [n] at the alert, with the allowance
-    baseline: Floats  # [n, N] harm that each vehicle bears under the baseline plan
-    replaced: Ints  # [n, K] replaced decisions of each shielded vehicle
-    decisions: Ints  # [n] decisions of each shielded vehicle
-    moving: Bools  # [n] the horizon cut the episode off
+    harm: Floats  # [n] harm under the guarded count (m2/s2)
+    vehicle_harm: Floats  # [n, N] part of that harm that each vehicle bears (m2/s2)
+    bound: Floats  # [n] bound at the alert, allowance included (m2/s2)
+    baseline: Floats  # [n, N] harm that each vehicle bears under the baseline plan (m2/s2)
+    replaced: Ints  # [n, K] number of replaced decisions of each shielded vehicle
+    decisions: Ints  # [n] number of decisions of each shielded vehicle
+    moving: Bools  # [n] whether something still moved at the horizon
 
     @staticmethod
     def of(episodes: Episodes, task: Task) -> Shielded:
-        """The episodes of a driver behind a step shield, once they have ended."""
+        """Collect the results of ended ``episodes`` that a driver behind a step shield drove."""
         shield: StepShield = episodes.guarded.shield
-        assert shield.running is not None
+        assert shield.memory.running is not None
         return Shielded(
             episodes.ledger.world_harm(task.harm_count),
             episodes.ledger.vehicle_harm(task.harm_count),
             shield.predicted_harm,
-            shield.baseline_shares,
-            shield.replaced.reshape(len(shield.replaced), -1),
-            shield.running.steps.copy(),
+            shield.memory.baseline_shares,
+            shield.memory.replaced.reshape(len(shield.memory.replaced), -1),
+            shield.memory.running.steps.copy(),
             ~episodes.at_rest,
         )
 
     @staticmethod
     def join(parts: Sequence[Shielded]) -> Shielded:
-        """The worlds of all parts, one after the other."""
+        """Concatenate the worlds of all parts."""
         return Shielded(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
     @staticmethod
     def stack(parts: Sequence[Shielded]) -> Shielded:
-        """Several drivers in the same worlds, on a new first axis."""
+        """Stack the results of several drivers in the same worlds along a new first axis."""
         return Shielded(*(np.stack(columns) for columns in zip(*parts, strict=True)))
 
 
 def drive_shielded(driver: Driver, worlds: Worlds, task: Task, **settings: Any) -> Shielded:
-    """Drive a copy of the ``driver`` behind a step shield through every world, ``CHUNK`` worlds at a time.
+    """Drive a copy of ``driver`` behind a step shield through every world, in chunks of ``CHUNK`` worlds.
 
-    ``settings`` are those of ``ShieldedDriver``.
+    ``settings`` are keywords of ``ShieldedDriver``.
     """
     parts = []
     for first in range(0, worlds.n, CHUNK):

@@ -1,4 +1,4 @@
-"""The log of a step shield: every decision in which it replaced a proposed action."""
+"""Log of a step shield: every decision in which it replaced a proposed action."""
 
 from __future__ import annotations
 
@@ -13,26 +13,29 @@ from ethbrake_marl.shield.running import Running
 
 
 class Intervention(NamedTuple):
-    """One replaced action."""
+    """Log entry: one action that the shield replaced."""
 
     world: int  # row of the batch
     vehicle: int  # index of the shielded vehicle, 0 = front
-    episode: int  # of that row, from 0
+    episode: int  # number of the episode in that row, from 0
     step: int  # number of the decision
     time_s: float
-    proposed: float  # action, as it was given
-    applied: float  # action
-    reason: int  # value of ShieldReason
-    bound: float  # m2/s2, from now on
-    margin: float  # m2/s2; negative: what the proposal would have cost beyond the budget at least
-    state: Floats  # [S] at the decision
-    plan: Floats  # [L] the plan at the decision, of several vehicles [L, K]; before ``step`` the applied actions
+    proposed: float  # proposed action, before clipping
+    applied: float  # applied action
+    reason: int  # code of ShieldReason
+    bound: float  # largest possible harm of the episode from now on (m2/s2)
+    margin: float  # budget minus least harm found after the proposal (m2/s2); negative: the proposal exceeds it
+    state: Floats  # [S] state at the decision
+    plan: Floats  # [L] or [L, K] plan at the decision; entries before ``step`` are the applied actions
 
 
 def interventions(
     now: Running, episode: Ints, vehicles: Sequence[int], proposed: Floats, decision: Decision, held: Backup
 ) -> list[Intervention]:
-    """The actions that a decision replaced. ``now``: the episodes before it; ``episode`` [n]: their numbers."""
+    """Return one log entry for each action that a decision replaced.
+
+    ``now`` are the episodes before the decision, ``episode`` [n] their numbers, and ``held`` the backup before it.
+    """
     times, states, shape = now.time_s, now.nominal().states, (now.n, len(vehicles))
     columns = (proposed, decision.applied, decision.reason, decision.margin, decision.intervened)
     given, applied, reason, margin, replaced = (np.reshape(column, shape) for column in columns)

@@ -1,4 +1,4 @@
-"""Running episodes at a decision, as a shield knows them: the state that it certifies from."""
+"""Running episodes at a decision: the state from which a shield certifies."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 
 class Running(NamedTuple):
-    """Running episodes at a decision: n worlds with M members each; M is 1 unless possible worlds are given.
+    """Running episodes at a decision: n worlds with M members (possible worlds) each. Usually M is 1.
 
-    The members of world k are the rows k * M to k * M + M - 1, the nominal one first. Of several shielded vehicles,
-    proposals and actions are [n, K], and plans [n, L, K]. Of one they are [n] and [n, L], or [n, 1] and [n, L, 1].
+    The members of world k are the rows k * M to k * M + M - 1; the first is the *nominal* member, the world itself.
+    With several shielded vehicles, actions are [n, K] and plans [n, L, K]. With one vehicle, they are [n] and [n, L],
+    or [n, 1] and [n, L, 1].
     """
 
-    problem: ProfileProblem  # parameters, commands of the others, grid of decisions; K vehicles; n * M rows
-    states: Floats  # [n * M, S] as ``physics.episode.save`` leaves them: speeds, gaps, hit flags, harms so far, forces
+    problem: ProfileProblem  # parameters, commands of the other vehicles and times of the decisions, in n * M rows
+    states: Floats  # [n * M, S] in the layout of ``physics.episode.save``: speeds, gaps, hit flags, harms, forces
     steps: Ints  # [n] number of the decision
-    ended: Bools  # [n * M]
-    caps: Floats = np.zeros((0, 0))  # [n * M, N] most harm that each vehicle may bear (m2/s2); [0, 0]: any
+    ended: Bools  # [n * M] whether the member's episode is over
+    caps: Floats = np.zeros((0, 0))  # [n * M, N] largest harm that each vehicle may bear (m2/s2); [0, 0]: no caps
 
     @property
     def uncapped(self) -> Running:
@@ -37,30 +38,30 @@ class Running(NamedTuple):
 
     @property
     def members(self) -> int:
-        """Number of members of each world (M)."""
+        """Number of members (possible worlds) of each world, M."""
         return len(self.ended) // max(self.n, 1)
 
     @property
     def finished(self) -> Bools:
-        """Worlds in which every member's episode is over, [n]."""
+        """Worlds in which the episode of every member (possible world) is over, [n]."""
         return np.asarray(self.ended.reshape(self.n, -1).all(axis=1), np.bool_)
 
     @property
     def time_s(self) -> Floats:
-        """Time of the decision in the nominal member, [n] s."""
+        """Time of the decision in each world's nominal member (the world itself), [n] s."""
         clock = self.problem.clock[:: self.members]
         return Decisions(clock[:, CLOCK.START], clock[:, CLOCK.TIME_STEP]).at(self.steps)
 
     def rows_of(self, worlds: Ints) -> Ints:
-        """The rows of the members of some worlds."""
+        """Return the rows that hold the members (possible worlds) of these worlds."""
         return np.asarray((worlds[:, np.newaxis] * self.members + np.arange(self.members)).ravel(), np.int64)
 
     def take(self, worlds: Ints) -> Running:
-        """Some of the worlds, with all their members."""
+        """Return the episodes of some worlds, with all their members (possible worlds)."""
         return self._select(self.rows_of(worlds), worlds)
 
     def nominal(self) -> Running:
-        """Every world with its nominal member alone."""
+        """Return every world with only its nominal member, the world itself, without its other possible worlds."""
         if self.members == 1:
             return self
         return self._select(np.arange(self.n) * self.members, np.arange(self.n))
@@ -71,7 +72,10 @@ class Running(NamedTuple):
 
 
 def begin_running(problem: ProfileProblem, members: int = 1) -> Running:
-    """The episodes of a problem at their first decision; its rows are worlds with ``members`` each."""
+    """Return the episodes of a problem at their first decision.
+
+    Every ``members`` rows of the problem are the possible worlds of one world.
+    """
     steps, ended = np.zeros(problem.n // members, np.int64), np.zeros(problem.n, np.bool_)
     return Running(problem, problem.start, steps, ended)
 
@@ -80,7 +84,7 @@ Number = TypeVar("Number", bound=np.generic)
 
 
 def put(old: NDArray[Number], rows: Ints, new: NDArray[Number]) -> NDArray[Number]:
-    """A copy of ``old`` with ``new`` in these rows."""
+    """Return a copy of ``old`` with ``rows`` replaced by ``new``."""
     placed = old.copy()
     placed[rows] = new
     return placed

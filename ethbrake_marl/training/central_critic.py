@@ -1,4 +1,4 @@
-"""A PPO policy whose actor sees its own row and whose critic sees the whole line."""
+"""PPO policy with a central critic: the actor sees its own observation, the critic sees the whole line."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from torch import Tensor
 
 
 class CentralCriticPolicy(ActorCriticPolicy):
-    """PPO's policy with an actor on the first ``own`` numbers of a row and a critic on all of them."""
+    """PPO policy whose actor sees the first ``own`` numbers of a row, and whose critic sees the whole row."""
 
     def __init__(self, *arguments: Any, own: int, **settings: Any) -> None:
-        self._own = own  # before the networks are built
+        self._own = own  # set first, because the base class builds the networks
         super().__init__(*arguments, **settings)
 
     def _build_mlp_extractor(self) -> None:
@@ -21,7 +21,7 @@ class CentralCriticPolicy(ActorCriticPolicy):
 
 
 class _OwnPartForTheActor(MlpExtractor):
-    """The hidden layers of both."""
+    """Hidden layers of the actor, on the first ``own`` numbers, and of the critic, on all of them."""
 
     def __init__(self, own: int, whole: int, net_arch: Any, activation_fn: Any) -> None:
         super().__init__(own, net_arch, activation_fn, device="cpu")
@@ -29,5 +29,5 @@ class _OwnPartForTheActor(MlpExtractor):
         self._own = own
 
     def forward_actor(self, features: Tensor) -> Tensor:
-        """The actor's last hidden layer."""
+        """Return the output of the actor's last hidden layer."""
         return super().forward_actor(features[:, : self._own])

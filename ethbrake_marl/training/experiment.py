@@ -1,4 +1,4 @@
-"""The main job, end to end: train a policy, shield it, and evaluate both beside the baselines on one list of worlds."""
+"""The main experiment: train a policy, and evaluate it, alone and behind its shield, beside the baselines."""
 
 from __future__ import annotations
 
@@ -39,35 +39,35 @@ BASELINES = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """A policy that was trained, and its evaluation; what reports are made of."""
+    """A trained policy and its evaluation, as input for reports."""
 
-    trained: TrainResult  # interrupted: the policy was not trained to the end, everything else is there
-    agents: Mapping[str, Agent]  # baselines, the trained policy, and the same behind its shield
+    trained: TrainResult  # result of the training, which may have been interrupted
+    agents: Mapping[str, Agent]  # baselines, the trained policy, and the trained policy behind its shield
     evaluation: Evaluation
     rows: SummaryTable
-    list_seed: int  # of the evaluation's worlds
-    harm_count: HarmCount  # that all agents minimise
-    started: float  # s, of ``time.monotonic``
+    list_seed: int  # seed of the evaluation's worlds
+    harm_count: HarmCount  # harm that all agents minimise
+    started: float  # start of the experiment by ``time.monotonic`` (s)
 
     @property
     def run(self) -> RunDirectory:
-        """The folder of the run."""
+        """Folder of the run."""
         return RunDirectory(self.trained.directory)
 
 
 @dataclass(frozen=True, slots=True)
 class RunReport:
-    """What a report adds to the folder and to the terminal."""
+    """Tables and note of a report about a run."""
 
-    tables: tuple[Any, ...]  # to print, in place of those of the rows alone
-    note: str  # where the report is
+    tables: tuple[Any, ...]  # tables to print instead of the usual ones
+    note: str  # text that says where the report is
 
 
 MakeReport = Callable[[Experiment, OnProgress], RunReport]
 
 
 def register_run_report(name: str, make: MakeReport) -> None:
-    """Let ``make`` write a report into the folder of every ``ethbrake run``, after its results.
+    """Register a function that writes a report into the folder of every ``ethbrake run``, after its results.
 
     An installed package does the same with an entry point of the group ``ethbrake_marl.run_reports``.
     """
@@ -79,12 +79,12 @@ RUN_REPORTS: Registry[MakeReport] = Registry("report of a run", "run_reports", r
 
 @dataclass(frozen=True, slots=True)
 class ExperimentResult:
-    """What an experiment left behind."""
+    """Result of an experiment: the training, and the tables and notes to print."""
 
     trained: TrainResult
     results: list[dict[str, Any]]  # content of results.json
-    tables: tuple[Any, ...]  # for a terminal
-    notes: tuple[str, ...]  # where the results and reports are
+    tables: tuple[Any, ...]  # tables for a terminal
+    notes: tuple[str, ...]  # texts that say where results and reports are
 
 
 def run_experiment(
@@ -102,14 +102,14 @@ def run_experiment(
 ) -> ExperimentResult:
     """Train a policy, evaluate it alone and behind its shield beside the baselines, and write the results.
 
-    All agents minimise the harm that the policy is trained for (``reward.harm_count`` of the recipe). Reports of
-    installed extensions follow the results.
+    All agents minimise the harm that the policy is trained for (``reward.harm_count`` of the recipe). Installed
+    extensions then write their reports.
 
     ``seed`` is the seed of the training. The evaluation list is ``episodes`` worlds of ``list_seed``. ``settings`` are
-    written to ``config.json``. Ctrl-C during the training ends it after the update in progress, and the policy so far
-    is evaluated. A second one, or one during the evaluation, raises ``KeyboardInterrupt``; the folder keeps the policy.
-    ``run.json`` always says which. Raises what ``train`` and ``evaluate`` raise, ``AlreadyExists`` for an existing run
-    before any work.
+    recorded in ``config.json``. Ctrl-C during the training ends it after the current update, and the policy so far is
+    evaluated. A second Ctrl-C, or one during the evaluation, raises ``KeyboardInterrupt``; the folder still contains
+    the policy. ``run.json`` records how the run ended. Raises what ``train`` and ``evaluate`` raise; ``AlreadyExists``
+    for an existing run, before any work.
     """
     started = time.monotonic()
     tell = on_progress or (lambda progress: None)
@@ -158,7 +158,7 @@ def run_experiment(
 def compared_agents(
     policy: Policy, scenario: Scenario, harm_count: HarmCount, baselines: Sequence[str] = BASELINES
 ) -> dict[str, Agent]:
-    """The baselines, the trained policy alone, and the same behind its shield (``hybrid``)."""
+    """Return the baselines, the trained policy alone, and the trained policy behind its shield (``hybrid``)."""
     alone = LearnedAgent(policy, TRAINED_POLICY)
     learned: dict[str, Agent] = {TRAINED_POLICY: alone, "hybrid": HybridAgent(alone, scenario, harm_count=harm_count)}
     return {**make_agents(baselines, scenario, harm_count=harm_count), **learned}
@@ -167,7 +167,7 @@ def compared_agents(
 def write_results(
     folder: Path, name: str, rows: Sequence[SummaryRow], harm_count: HarmCount, per_world: Path | None = None
 ) -> list[dict[str, Any]]:
-    """Write the rows as ``NAME.json`` and, flat, as ``NAME.csv``; return the content of the JSON file."""
+    """Write the rows as ``NAME.json`` and, as a flat table, ``NAME.csv``; return the content of the JSON file."""
     results = results_to_json(rows, per_world=per_world, settings={"harm_count": harm_count})
     content = json.dumps(results, indent=2, allow_nan=False) + "\n"
     write_output(folder / f"{name}.json", content.encode(), force=True)
@@ -176,7 +176,10 @@ def write_results(
 
 
 def results_csv(rows: Sequence[SummaryRow]) -> str:
-    """One line per agent; the interval of column ``x`` is ``x_low`` and ``x_high``, missing values are empty."""
+    """Return a CSV with one line per agent.
+
+    The interval of column ``x`` is in ``x_low`` and ``x_high``; missing values are empty.
+    """
     lines = []
     for told in (row.to_json() for row in rows):
         parameters = told.pop("parameters")
@@ -189,7 +192,7 @@ def results_csv(rows: Sequence[SummaryRow]) -> str:
 
 @contextmanager
 def _status(run: RunDirectory, status: str) -> Iterator[None]:
-    """Note in ``run.json`` that the evaluation runs, and then the training's status or what went wrong."""
+    """Record in ``run.json`` that the evaluation is running, and afterwards the training's status or the error."""
     _note(run, "running", "evaluation", None)
     try:
         yield
@@ -200,7 +203,7 @@ def _status(run: RunDirectory, status: str) -> Iterator[None]:
 
 
 def _note(run: RunDirectory, status: str, stage: str, reason: str | None) -> None:
-    """Update ``run.json``. Its steps and ``wall_s`` stay those of the training."""
+    """Update status and stage in ``run.json``. Its steps and ``wall_s`` remain those of the training."""
     content = read_object(run.status)
     ended = None if status == "running" else datetime.now(UTC).isoformat(timespec="seconds")
     run.write_json(run.status, {**content, "status": status, "stage": stage, "ended_utc": ended, "reason": reason})

@@ -1,4 +1,4 @@
-"""Measure policies in training on the recipe's fixed list of worlds."""
+"""Measurement of policies during training, on the recipe's fixed list of worlds."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from ethbrake_marl.training.training import Training
 
 AT_HORIZON = "horizon_rate"  # share of the fixed list's episodes in which something still moves at the horizon
 
-CHUNK = 2_500  # worlds driven together: bounds memory, and changes no figure
+CHUNK = 2_500  # worlds driven together; limits memory, and does not change results
 
-Evaluate = Callable[[Any], Mapping[str, float]]  # a ``Policy`` or a ``PolicyTeam`` -> metrics
+Evaluate = Callable[[Any], Mapping[str, float]]  # takes a ``Policy`` or a ``PolicyTeam``; returns its metrics
 
 Measure = Callable[[Training], Evaluate]
 
@@ -33,8 +33,8 @@ Measure = Callable[[Training], Evaluate]
 def measure_on_list(training: Training) -> Evaluate:
     """Draw the recipe's fixed list, and return the function that measures policies on it.
 
-    Metrics are means over the list, the same that ``evaluate`` finds there. If a learner has another objective than
-    total harm, the value of each learner's objective and their mean come after them.
+    Metrics are means over the list, equal to the results of ``evaluate``. If a learner has another objective than total
+    harm, the value of each learner's objective and their mean are added.
     """
     recipe, scenario = training.recipe, training.scenario
     names, harm_count = scenario.vehicle_names, recipe.reward.harm_count
@@ -65,9 +65,9 @@ def measure_on_list(training: Training) -> Evaluate:
 
 
 def drive_list(worlds: Worlds, team: Team, scenario: Scenario) -> Iterator[Episodes]:
-    """Let a team drive worlds at the alert, some at a time. Worlds that cannot be advanced are left out.
+    """Let a team drive worlds from the alert, in chunks. Worlds that cannot be advanced are left out.
 
-    Raises ``PhysicsError`` if no world is left.
+    Raises ``PhysicsError`` if every world is left out.
     """
     scripts = [script.name for script in script_agents(scenario, except_for=team.drivers).values()]
     failed: dict[int, str] = {}

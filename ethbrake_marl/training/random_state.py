@@ -1,4 +1,4 @@
-"""The global random generators, which Stable-Baselines3 uses: kept apart from the caller's, captured and restored."""
+"""The global random generators that Stable-Baselines3 uses: isolated from the caller's, captured and restored."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 @contextmanager
 def own_random_state() -> Iterator[None]:
-    """Give the global generators back as they were. Inside, torch has one thread.
+    """Context manager that restores the global random generators on exit. Inside, torch uses one thread.
 
-    A second thread makes a network this small 3 to 15 times slower as soon as another process wants a core.
+    With a network this small, a second thread makes training 3 to 15 times slower as soon as another process needs a
+    core.
     """
     states = random.getstate(), np.random.get_state(), torch.get_rng_state(), torch.get_num_threads()  # noqa: NPY002
     torch.set_num_threads(1)
@@ -30,7 +31,7 @@ def own_random_state() -> Iterator[None]:
 
 
 def capture_generators() -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Numbers and arrays that hold the states of the generators of Python, NumPy and torch."""
+    """Return the states of the random generators of Python, NumPy and torch, as numbers and arrays."""
     state: Any = np.random.get_state(legacy=False)  # noqa: NPY002
     version, python_state, gauss = random.getstate()
     numbers = {

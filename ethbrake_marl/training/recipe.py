@@ -1,4 +1,4 @@
-"""``TrainingRecipe``: a training set-up as one YAML file, whatever the algorithm."""
+"""``TrainingRecipe``: the settings of a training as one YAML file, for any algorithm."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ethbrake_marl.registry import Registry
 from ethbrake_marl.scenario.catalogue import check_file_name, shipped_folder
 from ethbrake_marl.scenario.schema import Scenario
 
-WORDS = ("title", "description", "source")  # fields that tell about a recipe and change nothing
+WORDS = ("title", "description", "source")  # descriptive fields that do not affect a training
 
 Scheme = Literal["single", "shared", "independent", "centralised"]
 
@@ -51,23 +51,23 @@ class LearningRate(FileModel):
     )
 
     def at(self, remaining: float) -> float:
-        """``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``, the share of steps done."""
+        """Return ``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``, the share of steps done."""
         done = min(max(1.0 - remaining, 0.0), 1.0)
         return self.end + (self.start - self.end) * 0.5 * (1.0 + math.cos(math.pi * done))
 
 
 class Shape(FileModel):
-    """Sizes of an algorithm's networks; a subclass lists them as keys."""
+    """Sizes of an algorithm's networks; a subclass declares them as keys."""
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """The network of a policy bundle, for one action in [-1, 1]: the actor, and whatever ``more`` adds."""
-        shape: Any = self  # its fields stand in an order of their own
+        """Return the network of a policy bundle, for one action in [-1, 1]: the actor, with the fields in ``more``."""
+        shape: Any = self  # subclasses declare the fields
         fields = {"policy_hidden": shape.policy, "value_hidden": (), "activation": shape.activation, "output": "clip"}
         return NetworkSpec(observation_size=observation_size, action_size=1, **(fields | more))
 
 
 class NetworkShape(Shape):
-    """Hidden layers of actor and critic, and the exploration noise they start with."""
+    """Hidden layers of actor and critic, and the initial exploration noise."""
 
     policy: Layers = Field(description=ACTOR_LAYERS)
     value: Layers = Field(description="hidden layers of the critic")
@@ -77,12 +77,12 @@ class NetworkShape(Shape):
     )
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """Actor and critic."""
+        """Return the network of a policy bundle: actor and critic."""
         return super().spec(observation_size, value_hidden=self.value, **more)
 
 
 class EvaluationPlan(FileModel):
-    """The fixed list on which the policy is measured while it learns."""
+    """The fixed list on which the policy is measured during training."""
 
     every_updates: Annotated[int, Field(ge=1)]
     worlds: Annotated[int, Field(ge=1, le=1_000_000)]
@@ -90,10 +90,10 @@ class EvaluationPlan(FileModel):
 
 
 class TrainingRecipe(FileModel):
-    """How to train, whatever the algorithm: its name, reward, seed, and what is saved and measured on the way.
+    """How to train, with any algorithm: algorithm, reward, seed, checkpoints and measurements.
 
-    An update is one round of collecting and learning. The recipes of an algorithm are a class made from this one. Each
-    key says what it means in ``Field(description=...)``: new files, the JSON Schema and the documentation show it.
+    An update is one round of collecting and learning. The recipes of an algorithm are a subclass. Each key is explained
+    in ``Field(description=...)``: new files, the JSON Schema and the documentation show this text.
 
     >>> import ethbrake_marl as eb
     >>> recipe = eb.load_recipe("ppo").replace(seed=3, total_steps=100_000)
@@ -102,8 +102,8 @@ class TrainingRecipe(FileModel):
 
     """
 
-    schemes: ClassVar[tuple[Scheme, ...]] = ("single", "shared")  # under which the algorithm can learn
-    most_decisions: ClassVar[float] = math.inf  # held in memory between two updates
+    schemes: ClassVar[tuple[Scheme, ...]] = ("single", "shared")  # schemes that the algorithm supports
+    most_decisions: ClassVar[float] = math.inf  # largest number of decisions held in memory between two updates
 
     name: str = Field(pattern=NAME_PATTERN, description="equal to the file's name without .yaml")
     title: str = Field("", description="one line for lists")
@@ -153,7 +153,7 @@ class TrainingRecipe(FileModel):
         return self
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """The network of the policy's bundle: that of the recipe's ``network``."""
+        """Return the network of the policy's bundle, as the recipe's ``network`` describes it."""
         shape: Shape = vars(self)["network"]
         return shape.spec(observation_size)
 
@@ -168,20 +168,20 @@ class TrainingRecipe(FileModel):
         return 1
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` if the recipe does not fit a line with that many learners."""
+        """Raise ``InvalidInput`` if the recipe does not fit this number of learners."""
 
     def begins(self, scenario: Scenario) -> str | None:
-        """What the weights begin as on a scenario, in words; None where the algorithm only knows random weights."""
+        """Describe the initial weights on a scenario; None if the algorithm always begins with random weights."""
         return None
 
     def derived(self) -> dict[str, float]:
-        """Figures that follow from the keys, for ``config.json``."""
+        """Return numbers that follow from the keys, for ``config.json``."""
         return {}
 
     def scheme_for(self, scenario: Scenario) -> Scheme:
-        """The recipe's scheme; where it names none, ``single`` for one learner and ``shared`` for several.
+        """Return the recipe's scheme; if it names none, ``single`` for one learner and ``shared`` for several.
 
-        Raises ``InvalidInput`` where nobody learns, or where the scheme or else the recipe does not fit the learners.
+        Raises ``InvalidInput`` if no vehicle learns, or if the scheme or the recipe does not fit the learners.
         """
         learners, where = len(scenario.learners), f"scenario {scenario.name!r}"
         if not learners:
@@ -202,22 +202,22 @@ class TrainingRecipe(FileModel):
         return scheme
 
     def make_algorithm(self) -> Any:
-        """Its algorithm, new."""
+        """Return a new instance of the recipe's algorithm."""
         algorithm = ALGORITHMS[self.algorithm][1]
         return (resolve_name(algorithm) if isinstance(algorithm, str) else algorithm)()
 
     @staticmethod
     def shipped() -> dict[str, Path]:
-        """Name -> file of every recipe that comes with the package: of the checkout's ``train/``, or installed.
+        """Return the file of every recipe that comes with the package, by name.
 
-        A recipe whose algorithm an extension brings stands in a folder of the extension's name.
+        A recipe for an algorithm of an extension is in a folder with the name of the extension.
         """
         files = sorted(shipped_folder("train").rglob("*.yaml"), key=lambda file: file.name)
         return {file.stem: file for file in files}
 
     @staticmethod
     def usable() -> dict[str, Path]:
-        """The shipped recipes whose algorithm is installed; the others need an extension."""
+        """Return the shipped recipes whose algorithm is installed; the others need an extension."""
         return {
             name: file
             for name, file in TrainingRecipe.shipped().items()
@@ -226,7 +226,7 @@ class TrainingRecipe(FileModel):
 
     @staticmethod
     def file(name_or_path: str | Path) -> Path:
-        """Where a recipe stands, a shipped name or any path; it need not exist. Raises ``UnknownName``."""
+        """Return the file of a recipe, from a shipped name or any path; it need not exist. Raises ``UnknownName``."""
         text = str(name_or_path)
         if Path(text).suffix in (".yaml", ".yml") or "/" in text or "\\" in text:
             return Path(text)
@@ -237,14 +237,14 @@ class TrainingRecipe(FileModel):
 
     @staticmethod
     def of(content: Any) -> TrainingRecipe:
-        """The recipe, of its algorithm's class, that ``model_dump(mode="json")`` wrote; raises ``InvalidInput``."""
+        """Return the recipe with this content of ``model_dump(mode="json")``; raise ``InvalidInput`` if invalid."""
         return _checked(Document("recipe", content, {}))
 
     def new_text(self, name: str) -> str:
-        """Text of a commented YAML file for a new recipe ``name`` with the values of this one, all keys written out.
+        """Return the text of a commented YAML file for a new recipe ``name`` that starts from this recipe.
 
-        A key that this one leaves out stands in a comment. Save it as ``<name>.yaml``. Raises ``InvalidInput`` for a
-        name that cannot be one.
+        All keys are written; a key without a value stands in a comment. Save the text as ``<name>.yaml``. Raises
+        ``InvalidInput`` for an invalid name.
         """
         check_file_name("recipe", name)
         words = {
@@ -256,7 +256,7 @@ class TrainingRecipe(FileModel):
         return self.replace(name=name, **words).text(head)
 
     def text(self, head: str) -> str:
-        """A commented YAML file below ``head``: all keys written out, one that the recipe leaves out in a comment."""
+        """Return a commented YAML file below ``head``, with all keys; a key without a value stands in a comment."""
         lines = [head, schema_lines("recipe", "train --schema")]
         values, meanings = self.model_dump(mode="json"), key_meanings(type(self))
         for key in type(self).model_fields:
@@ -272,17 +272,17 @@ class TrainingRecipe(FileModel):
         return "".join(lines)
 
     def replace(self, **changes: Any) -> Self:
-        """The same recipe with other values in some fields, checked again; raises ``InvalidInput``."""
+        """Return the same recipe with other values in some fields; raise ``InvalidInput`` if it is invalid."""
         content = {**self.model_dump(mode="json"), **changes}
         changed = _checked(Document(f"recipe {self.name!r}", content, {}))
         assert isinstance(changed, type(self)) or "algorithm" in changes
-        return changed  # type: ignore[return-value]  # of another class only if another algorithm was asked for
+        return changed  # type: ignore[return-value]  # another class only with another algorithm
 
     @staticmethod
     def json_schema() -> dict[str, Any]:
-        """JSON Schema of a recipe file, for editors that complete and check YAML.
+        """Return the JSON Schema of a recipe file, for editors that complete and check YAML.
 
-        Which keys there are depends on ``algorithm``. Registered algorithms and reward terms are known, too.
+        The allowed keys depend on ``algorithm``. Registered algorithms and reward terms are included.
         """
         classes = {name: recipe for name, (recipe, _) in ALGORITHMS.usable().items()}
         places, whole = models_json_schema(
@@ -318,7 +318,7 @@ class TrainingRecipe(FileModel):
 
 
 def key_meanings(recipe: type[TrainingRecipe]) -> dict[str, str]:
-    """Key -> what it means, for the recipes of one algorithm; a key without a meaning of its own has its parent's."""
+    """Return the meaning of each key in the recipes of one algorithm; a key without its own has the base class's."""
     found: dict[str, str] = {}
     for each in reversed(recipe.__mro__):
         for key, field in each.model_fields.items() if issubclass(each, TrainingRecipe) else ():
@@ -330,18 +330,18 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
 
 
 def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[Any] | str) -> None:
-    """Make ``algorithm: name`` a recipe that can be read, trained, stopped and resumed.
+    """Register an algorithm, so that recipes with ``algorithm: name`` can be read, trained, stopped and resumed.
 
     An installed package does the same with an entry point of the group ``ethbrake_marl.algorithms``: a ``Part`` of
-    both.
+    recipe and algorithm.
 
     Args:
         name: 1 to 64 of ``a-z``, digits, ``-`` and ``_``.
-        recipe: the class of its recipes, made from ``TrainingRecipe``; it checks the YAML file.
-        algorithm: the class of the algorithm, made from ``training.algorithm.Algorithm``; or ``"module:class"``, so
-            that recipes are read without importing it, since torch takes seconds.
+        recipe: the class of its recipes, a subclass of ``TrainingRecipe``; it checks the YAML file.
+        algorithm: the class of the algorithm, a subclass of ``training.algorithm.Algorithm``; or ``"module:class"``, so
+            that recipes can be read without importing it, since torch takes seconds.
 
-    Raises ``InvalidInput`` for a name that is taken or is no such name, or a class that lacks what is needed.
+    Raises ``InvalidInput`` for an invalid or taken name, or a class that lacks a required method.
 
     """
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
@@ -360,7 +360,7 @@ ALGORITHMS: Registry[tuple[type[TrainingRecipe], type[Any] | str]] = Registry(
 
 
 def algorithm_names() -> tuple[str, ...]:
-    """Every name, the package's own first."""
+    """Return the names of all algorithms, the package's own first."""
     return tuple(ALGORITHMS)
 
 
@@ -373,7 +373,7 @@ def load_recipe(name_or_path: str | Path) -> TrainingRecipe:
 
 
 def _algorithm_in(document: Document) -> object:
-    """What a recipe file names as its algorithm."""
+    """Return the algorithm that a recipe file names."""
     return document.content.get("algorithm", "ppo") if isinstance(document.content, dict) else "ppo"
 
 
@@ -394,5 +394,5 @@ def _checked(source: Path | Document) -> TrainingRecipe:
 
 class _RecipeWording(Wording):
     def known(self, path: YamlPath) -> list[str]:
-        """Registered terms have their weights beside the others."""
+        """Return the known keys at a path; below ``reward``, include the weights of registered terms."""
         return setting_names() if path[:-1] == ("reward",) else super().known(path)

@@ -30,7 +30,7 @@ NETWORK = "hidden layers of the actor, and of the critic if there is one, and th
 
 
 class PpoRecipe(TrainingRecipe):
-    """PPO: collect ``n_steps`` decisions of every learner, then go through them ``n_epochs`` times."""
+    """PPO recipe: collect ``n_steps`` decisions of every learner, then learn from them in ``n_epochs`` passes."""
 
     schemes = get_args(Scheme)
     most_decisions = 2**24
@@ -60,7 +60,7 @@ class PpoRecipe(TrainingRecipe):
         return self
 
     def check_learners(self, learners: int) -> None:
-        """Every turn needs an update of its own."""
+        """Raise ``InvalidInput`` unless there is at least one update for every turn."""
         updates = -(-self.total_steps // (self.n_envs * learners * self.n_steps))
         if self.turns is not None and self.turns * learners > updates:
             raise InvalidInput(
@@ -70,19 +70,19 @@ class PpoRecipe(TrainingRecipe):
 
 
 class SquashedShape(Shape):
-    """Hidden layers of the actor and of each of the two critics; the actor's noise depends on what it sees."""
+    """Hidden layers of SAC's actor and of each of its two critics; the actor's noise depends on the observation."""
 
     policy: Layers = Field(description=ACTOR_LAYERS)
     value: Layers = Field(description="hidden layers of each of the two critics")
     activation: Activation = "relu"
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """The actor, whose squashed mean is the action. Critics stay in the checkpoints."""
+        """Return the network of a policy bundle: the actor only, whose action is the tanh of its mean."""
         return super().spec(observation_size, output="tanh", **more)
 
 
 class SacRecipe(TrainingRecipe):
-    """SAC: collect ``steps_per_update`` decisions of every learner, then ``gradient_steps`` steps from the memory."""
+    """SAC recipe: collect ``steps_per_update`` decisions of every learner, then take ``gradient_steps`` steps."""
 
     algorithm: Literal["sac"]
     batch_size: int = Field(ge=2, description=BATCH_SIZE)
@@ -131,7 +131,7 @@ class SacRecipe(TrainingRecipe):
         return self.gradient_steps / (self.n_envs * self.steps_per_update)
 
     def derived(self) -> dict[str, float]:
-        """The update ratio."""
+        """Return the update ratio, for ``config.json``."""
         return {"update_ratio": self.update_ratio}
 
 

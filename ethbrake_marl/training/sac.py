@@ -16,10 +16,10 @@ from ethbrake_marl.training.training import Training
 
 
 class Sac(Algorithm):
-    """Stable-Baselines3's SAC, one for all learners."""
+    """Stable-Baselines3's SAC, with one policy for all learners."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> SAC:
-        """The model."""
+        """Return the model."""
         recipe = training.recipe
         assert isinstance(recipe, SacRecipe)
         automatic = recipe.ent_coef == "auto"
@@ -44,22 +44,22 @@ class Sac(Algorithm):
         )
 
     def optimizers(self, model: Any) -> dict[str, Optimizer]:
-        """Those of actor and critics, and of the entropy coefficient where it is learned."""
+        """Return the optimisers of actor and critics, and of the entropy coefficient if it is learned."""
         found = {"actor": model.actor.optimizer, "critic": model.critic.optimizer}
         return found if model.ent_coef_optimizer is None else {**found, "ent_coef": model.ent_coef_optimizer}
 
     def learned_beside(self, model: Any) -> dict[str, Tensor]:
-        """The logarithm of the entropy coefficient, where it is learned."""
+        """Return the logarithm of the entropy coefficient, if it is learned."""
         coefficient = self.log_noise(model)
         return {} if coefficient is None else {"log_ent_coef": coefficient}
 
     def log_noise(self, model: Any) -> Tensor | None:
-        """The logarithm of the entropy coefficient; None where it is fixed."""
+        """Return the logarithm of the entropy coefficient; None if it is fixed."""
         return None if model.log_ent_coef is None else model.log_ent_coef.detach()
 
 
 def sac_arguments(recipe: SacRecipe) -> dict[str, Any]:
-    """Arguments of SAC's policy: an actor and two critics."""
+    """Return the arguments of SAC's policy: an actor and two critics."""
     shape = recipe.network
     return {
         "net_arch": {"pi": list(shape.policy), "qf": list(shape.value)},

@@ -1,31 +1,34 @@
-"""Settings ``key=value``: which are the scenario's and which the recipe's, and what belongs together."""
+"""Settings ``key=value``: which ones belong to the scenario, to the recipe or to the agents."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from ethbrake_marl.agents.registry import split_names
+from ethbrake_marl.agents.spec import split_names
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.overrides import Override
 from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.recipe import WORDS, TrainingRecipe
 
-_NO_SETTING = {"name", *WORDS}  # they tell about a file, and change nothing
+_NO_SETTING = {"name", *WORDS}  # descriptive fields, which cannot be set
 
 
 class Settings(NamedTuple):
-    """What is asked for."""
+    """Settings of a command, sorted by whom they belong to."""
 
-    texts: tuple[str, ...]  # as they were given
+    texts: tuple[str, ...]  # the settings as the user wrote them
     scenario: tuple[Override, ...]
     recipe: tuple[Override, ...]
-    harm_count: HarmCount = "first"  # that agents minimise
-    measures: tuple[str, ...] = ()  # that an evaluation tells beside the usual ones
+    harm_count: HarmCount = "first"  # harm that agents minimise
+    measures: tuple[str, ...] = ()  # additional measures of an evaluation
 
     def change(self, recipe: TrainingRecipe, tell: Callable[[str], None] | None = None) -> TrainingRecipe:
-        """The recipe with those of its settings that it has; ``tell`` hears what else may have to be changed."""
+        """Return the recipe with those settings that it has as keys.
+
+        ``tell`` is called with a note if only one of two keys was set that should be equal.
+        """
         own = [override for override in self.recipe if override.top in type(recipe).model_fields]
         if not own:
             return recipe
@@ -44,10 +47,10 @@ class Settings(NamedTuple):
 def read_settings(
     texts: Sequence[str] | None, recipes: Sequence[TrainingRecipe] = (), *, of_agents: Sequence[str] = ()
 ) -> Settings:
-    """Tell the settings apart: ``mass_t=40`` and ``scenario.mass_t=40`` are the scenario's, ``gamma=0.9`` a recipe's.
+    """Sort settings by owner: ``mass_t=40`` and ``scenario.mass_t=40`` are the scenario's, ``gamma=0.9`` a recipe's.
 
-    ``of_agents``: which of ``harm_count=total`` and ``measures=A,B`` may stand among them. Raises ``UnknownName`` with
-    a suggestion for a key that nobody has, ``InvalidInput`` for an unknown count.
+    ``of_agents`` lists which of ``harm_count=total`` and ``measures=A,B`` are allowed. Raises ``UnknownName`` with a
+    suggestion for an unknown key, ``InvalidInput`` for an unknown harm count.
     """
     known = {
         "scenario": {*Scenario.model_fields} - _NO_SETTING,

@@ -1,4 +1,4 @@
-"""The learners of a run as they were trained together: ``team.json`` says which policy drives which vehicle."""
+"""The learners of a run as a team: ``team.json`` says which policy drives which vehicle."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ethbrake_marl.training.run_folder import RunDirectory
 
 
 def bundle_of(scheme: Scheme, vehicle: str) -> str:
-    """Folder, inside the run's folder, of the policy that drives a learner."""
+    """Return the folder, relative to the run's folder, of the policy that drives a learner."""
     return f"policy/{vehicle}" if scheme == "independent" else "policy"
 
 
@@ -58,7 +58,7 @@ class TeamFile(FileModel):
 
 
 def read_team(file: Path) -> TeamFile:
-    """Read ``team.json``; raises ``CorruptBundle`` naming what is wrong."""
+    """Read ``team.json``; raise ``CorruptBundle`` naming what is wrong with it."""
     data = read_plain(file, 1 << 20)
     try:
         document = Document(str(file), parse_strict_json(data), {})
@@ -71,7 +71,7 @@ def read_team(file: Path) -> TeamFile:
 
 
 def has_policy_each(run: RunDirectory) -> bool:
-    """Whether each learner of the run has a policy of its own, so that no single one drives them all."""
+    """Return whether the learners of the run have different policies, so that no single policy drives them all."""
     return os.path.lexists(run.team) and len(set(read_team(run.team).drivers.values())) > 1
 
 
@@ -81,10 +81,10 @@ def load_team(
     name: str = "team",
     vehicles: Collection[int] | None = None,
 ) -> Team:
-    """Load the policies of a run to drive ``vehicles`` (None: the learners of ``scenario``) as they were trained.
+    """Load the policies of a run to drive ``vehicles`` (None: the learners of ``scenario``) as in training.
 
-    Learners of the run that are not among ``vehicles`` are left out. Raises ``InvalidInput`` where the folder holds no
-    team, or the team has another line length or lacks one of the vehicles; ``CorruptBundle`` for a damaged team.
+    Other learners of the run are omitted. Raises ``InvalidInput`` if the folder holds no team, or if the team has
+    another line length or lacks one of the vehicles; ``CorruptBundle`` for a damaged team.
     """
     path, scenario = Path(folder), scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     file = RunDirectory(path).team

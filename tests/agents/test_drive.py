@@ -11,8 +11,10 @@ from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
 from ethbrake_marl.agents.foreign import policy_agent
 from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import AgentSpec, agent_entries, agent_names, make_agent, parse_spec, register_agent
+from ethbrake_marl.agents.registry import agent_entries, agent_names, register_agent
+from ethbrake_marl.agents.spec import AgentSpec, parse_spec
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.errors import AlreadyExists, InvalidInput

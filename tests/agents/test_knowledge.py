@@ -10,8 +10,10 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import script_agents
+from ethbrake_marl.agents.making import find_entry
 from ethbrake_marl.agents.protocol import Knowledge, Source
-from ethbrake_marl.agents.registry import agent_entries, find_entry, parse_spec
+from ethbrake_marl.agents.registry import agent_entries
+from ethbrake_marl.agents.spec import parse_spec
 from ethbrake_marl.engine.memory import Memory, ask_script, begin_script
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.evaluation.lineup import make_lineup

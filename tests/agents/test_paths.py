@@ -5,7 +5,7 @@ import shutil
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import parse_spec, split_names, split_specs
+from ethbrake_marl.agents.spec import parse_spec, split_names, split_specs
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.policies.shipped import shipped_policies
 

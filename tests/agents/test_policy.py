@@ -168,7 +168,7 @@ def test_model_trained_on_rows_with_something_appended__drives_as_there(appended
     model = stable.PPO("MlpPolicy", rows, n_steps=8, batch_size=16, n_epochs=1, seed=1)
     told = {"scenario": scenario, "appended": appended}  # a model that has its environment needs none of it
     agents = {1: eb.policy_agent(model.policy, **told), 2: eb.policy_agent(model)}
-    assert agents[1].knows == (eb.agents.registry.Source.STATE if appended == "state" else "messages")
+    assert agents[1].knows == (eb.agents.protocol.Source.STATE if appended == "state" else "messages")
     team = drive(scenario.sample(4, 3, channel="training").worlds, eb.Team(agents, "theirs"), scenario)
     rows.seed(3)  # the model has set its own
     seen, over, harm = rows.reset(), np.zeros(4, bool), np.full(4, np.nan)

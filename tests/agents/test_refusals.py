@@ -12,8 +12,9 @@ from stable_baselines3 import PPO
 import ethbrake_marl as eb
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
 from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Knowledge, Team
-from ethbrake_marl.agents.registry import make_agent, register_agent
+from ethbrake_marl.agents.registry import register_agent
 from ethbrake_marl.errors import AgentFailed, AlreadyExists, UnknownName
 from ethbrake_marl.game.observations import observe
 from tests.fixtures.asked import Asked

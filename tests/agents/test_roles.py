@@ -41,7 +41,7 @@ def theirs(argument, settings):
 def _their_agents(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("roles"))
-        patch.setattr(registry._AGENTS, "loaded", {})
+        patch.setattr(registry.AGENTS, "loaded", {})
         eb.register_agent("theirs", theirs, takes_policy=True)
         make_policy(eb.ObservationSpec(), {"name": "paper-random"}).save("mine")
         for vehicle in ("vehicle_2", "vehicle_3"):

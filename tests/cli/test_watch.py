@@ -15,8 +15,9 @@ from scipy.stats import ttest_ind
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents import registry
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import Entry, make_agent
+from ethbrake_marl.agents.registry import Entry
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.comparison import compare_results
@@ -98,7 +99,7 @@ def test_evaluate__one_agent_that_cannot_drive_is_refused_before_another_works(e
 def test_lineup__a_team_goes_behind_the_step_shield_and_no_other(monkeypatch) -> None:
     scenario, team = load_scenario("cooperation-3-pair"), Team.of(make_agent("coast"), [1, 2])
     monkeypatch.setitem(
-        registry._AGENTS.loaded, "team", Entry("team", "team@RUN", "", (), lambda argument, settings: team)
+        registry.AGENTS.loaded, "team", Entry("team", "team@RUN", "", (), lambda argument, settings: team)
     )
     assert sorted(make_lineup(["team@run+step"], scenario)["team@run+step"].drivers) == [1, 2]
     with pytest.raises(InvalidInput, match=r"'team@run\+episode': is a team, and \+episode is for one driven vehicle"):

@@ -16,9 +16,9 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import ethbrake_marl as eb
 from ethbrake_marl.envs.gymnasium import EthBrakeEnv
-from ethbrake_marl.envs.motion import Viewer
 from ethbrake_marl.envs.pettingzoo import env, parallel_env
 from ethbrake_marl.envs.rendering import HEIGHT, WIDTH
+from ethbrake_marl.envs.viewer import Viewer
 from tests.contract.interfaces import FIVE, LEVELS, PAPER, REST, SCENARIOS, line
 
 pytestmark = pytest.mark.filterwarnings(

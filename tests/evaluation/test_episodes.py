@@ -7,8 +7,8 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.motion import EpisodeMotion, follow_episodes, state_at
 from ethbrake_marl.evaluation.record import record_episode

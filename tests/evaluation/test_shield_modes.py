@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.evaluation.shield_modes import ShieldModes, compare_modes
 from ethbrake_marl.evaluation.statistics import mean, paired_difference
@@ -38,7 +38,7 @@ def test_rows__are_what_driving_each_mode_gives(rows: ShieldModes) -> None:
     assert rows[0].against_episode == paired_difference(harms[0], harms[1])
     assert rows[1].against_episode is None and rows[1].replaced is None
     shield = driven[2].guarded.shield
-    assert rows[2].replaced == shield.interventions.sum() / shield.running.steps.sum() > 0.1
+    assert rows[2].replaced == shield.interventions.sum() / shield.memory.running.steps.sum() > 0.1
     for row in rows[2:]:  # what the interventions were good for
         told = row.to_json()
         assert sum(row.verdicts) == pytest.approx(1.0) and told["needed"] == row.verdicts[0] > 0.9
@@ -91,12 +91,12 @@ def test_team__rows_are_what_driving_behind_each_shield_gives(team_rows: ShieldM
         harm, borne = ledger.world_harm("total"), ledger.vehicle_harm("total")
         assert row.harm == mean(harm) and row.against_none == paired_difference(harm, alone)
         assert row.bound is not None and row.bound.value == shield.predicted_harm.mean() and row.above_bound == 0
-        decisions = shield.running.steps.sum()
+        decisions = shield.memory.running.steps.sum()
         own = [sum(entry.vehicle == i for entry in shield.log) / decisions for i in (1, 2)]
         assert [each.replaced for each in row.vehicles] == [None, *own]
         assert row.replaced == pytest.approx(sum(own) / 2) and min(own) > 0.1
         assert [each.harm for each in row.vehicles] == pytest.approx(borne.mean(axis=0))
-        more = (borne > shield.baseline_shares).mean(axis=0)
+        more = (borne > shield.memory.baseline_shares).mean(axis=0)
         assert [each.above_baseline for each in row.vehicles] == pytest.approx(more, abs=0.02)
         assert (max(more) > 0.0) == (cap is None)
     assert all(row.against_episode is None for row in team_rows)

@@ -93,8 +93,8 @@ def test_scenario__worlds_are_what_they_were(name: str) -> None:
 def decisions_hash(shield: StepShield, worlds: int) -> str:
     """A hash of all that is decided about random proposals, some of them beyond the range or no number."""
     shield.begin(shield.scenario.sample(worlds, 3).worlds, np.arange(worlds))
-    rng, digest = np.random.default_rng(0), hashlib.sha256(shield.first_bound.tobytes())
-    while not shield.running.finished.all():
+    rng, digest = np.random.default_rng(0), hashlib.sha256(shield.memory.first_bound.tobytes())
+    while not shield.memory.running.finished.all():
         proposed = np.where(rng.random(worlds) < 0.05, np.nan, rng.uniform(-1.2, 1.2, worlds))
         decision = shield.decide(proposed)
         for column in (decision.applied, decision.reason, decision.bound, decision.margin, decision.intervened):

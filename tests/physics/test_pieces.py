@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.evaluation import trial
 from ethbrake_marl.physics.advance import advance

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import agent_entries, make_agent
+from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.agents.registry import agent_entries
 from ethbrake_marl.errors import UnknownName
 from tests.refused import refused
 

@@ -1,6 +1,6 @@
-"""The coupled search of one world, compiled: an even look, a closer one, borders, minima, one step back.
+"""The coupled search in one world, compiled: even grid, finer grid, borders, local minima, one safety step.
 
-``coupled`` says what is searched for, docs/baselines.md why in these steps.
+``coupled`` says what is searched for; docs/baselines.md gives the reasons for these steps.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.rows import FLAG
 from ethbrake_marl.physics.state import Floats, Ints
 
-GRID = 161  # first look: evenly spaced decelerations from 0 to the capacity
+GRID = 161  # first step: number of evenly spaced decelerations from 0 to the capacity
 
-CELLS = 24  # cells of the grid that are looked into, at most
+CELLS = 24  # largest number of grid cells that are refined
 
-INSIDE = 16  # samples inside such a cell
+INSIDE = 16  # samples inside a refined cell
 
-BORDERS = 6  # borders between two courses of impacts that are located, at most
+BORDERS = 6  # largest number of borders between numbers of impacts that are located
 
-MINIMA = 6  # local minima of all samples that are followed
+MINIMA = 6  # number of local minima that are refined
 
-_JUMP = 1e-6  # a change of harm (m2/s2) between decelerations 1e-9 m/s2 apart that only a jump explains
+_JUMP = 1e-6  # change of harm (m2/s2) within 1e-9 m/s2 that only a jump explains
 
 _LOOKED = GRID + CANDIDATES + CELLS * INSIDE
 
@@ -49,32 +49,32 @@ _MOST = _NARROWED + MINIMA
 
 _FEW = 6
 
-# Bounds that are no literals, for each of which all physics would be compiled once more:
+# Loop bounds, not as literals: numba would compile all physics again for each literal.
 _ZERO, _ONE, _FIVE, _GRID_END, _CANDIDATES_END = (cast(int, np.int64(k)) for k in (0, 1, 5, GRID, CANDIDATES))
 
 _SHARES = np.linspace(0.0, 1.0, GRID)
 
 _SHARES_INSIDE = np.arange(1, INSIDE + 1) / (INSIDE + 1)
 
-_FIFTHS = np.arange(1, 5) / 5  # new points between the ends of a border
+_FIFTHS = np.arange(1, 5) / 5  # new samples between the two sides of a border
 
 
 class Room(NamedTuple):
-    """What a search works in, the same for every world of a batch."""
+    """Workspace of a search, reused for every world of a batch."""
 
-    one: Samples  # the grid, later what was looked at
-    two: Samples  # what was looked at, at the end with borders and minima
+    one: Samples  # the grid; later all samples so far
+    two: Samples  # all samples so far; at the end with borders and minima
     new: Samples
     few: Samples
     values: Floats
-    cells: Ints  # [CELLS] places in a list of samples
+    cells: Ints  # [CELLS] indices into a list of samples
     borders: Ints  # [BORDERS]
     minima: Ints  # [MINIMA]
 
 
 @compiled
 def make_room() -> Room:
-    """Room for the search of any world."""
+    """Allocate the workspace for searches."""
     return Room(
         make_samples(_MOST), make_samples(_MOST), make_samples(_MOST), make_samples(_FEW), np.empty(_MOST),
         np.empty(CELLS, np.int64), np.empty(BORDERS, np.int64), np.empty(MINIMA, np.int64),
@@ -83,9 +83,9 @@ def make_room() -> Room:
 
 @compiled(apart=True, bare=True)
 def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, out: Floats) -> int:
-    """The best deceleration of a line, its harm and that of the other count into ``out`` [3]; DONE, or what went wrong.
+    """Find a line's best deceleration; write it, its harm and its harm under the other count to ``out`` [3].
 
-    ``breakpoints`` [CANDIDATES] are looked at beside the grid.
+    ``breakpoints`` [CANDIDATES] are simulated in addition to the grid. Returns DONE or the failed check.
     """
     status = share_start(line)
     if status == FLAG.DONE:
@@ -103,7 +103,7 @@ def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, ou
 
 @compiled(apart=True, bare=True)
 def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) -> int:
-    """Samples on the grid in ``room.one``, and with those at the breakpoints in ``room.two``."""
+    """Simulate the grid into ``room.one``, and the grid with the breakpoints into ``room.two``."""
     grid, new = room.one, room.few
     for k in range(GRID):
         grid.at[k] = capacity * _SHARES[k]
@@ -119,9 +119,9 @@ def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) ->
 
 @compiled(apart=True, bare=True)
 def look_inside(line: Line, room: Room) -> int:
-    """Samples inside the cells of the grid that hold a border, or may hide less harm than any sample so far.
+    """Refine the cells of the grid that contain a border, or may contain less harm than every sample so far.
 
-    Leaves ``_LOOKED`` samples in ``room.one``: where there are fewer cells, the last one stands for those left.
+    Leaves ``_LOOKED`` samples in ``room.one``; if there are fewer, the last one is repeated.
     """
     grid, looked, new, cells, bounds = room.one, room.two, room.new, room.cells, room.values
     best = least_harm(looked, GRID + CANDIDATES)
@@ -149,7 +149,7 @@ def look_inside(line: Line, room: Room) -> int:
 
 @compiled(bare=True)
 def _put_in_order(places: Ints, n: int) -> None:
-    """Put the first ``n`` in rising order."""
+    """Sort the first ``n`` places."""
     for k in range(1, n):
         place, to = places[k], k
         while to > 0 and places[to - 1] > place:
@@ -160,9 +160,10 @@ def _put_in_order(places: Ints, n: int) -> None:
 
 @compiled(apart=True, bare=True)
 def locate_borders(line: Line, room: Room) -> int:
-    """Both sides of the borders between courses of impacts that may hide less harm, 1e-9 m/s2 apart.
+    """Locate borders between numbers of impacts that may hide less harm: two samples each, 1e-9 m/s2 apart.
 
-    In between, harm is smooth, and what falls toward a border is least there. Leaves all samples in ``room.two``.
+    Between borders the harm is smooth, so harm that falls towards a border is least there. Leaves all samples in
+    ``room.two``.
     """
     looked, new, few, places, bounds = room.one, room.new, room.few, room.borders, room.values
     best = least_harm(looked, _LOOKED)
@@ -187,7 +188,7 @@ def locate_borders(line: Line, room: Room) -> int:
 
 @compiled(bare=True)
 def _cut(line: Line, few: Samples) -> int:
-    """Bring samples 0 and 5 on both sides of a border together, each time to a fifth."""
+    """Bring samples 0 and 5, on the two sides of a border, together: each round divides their distance by five."""
     while few.at[5] - few.at[0] > NARROWEST_MPS2:
         low, width = few.at[0], few.at[5] - few.at[0]
         for k in range(4):
@@ -200,14 +201,14 @@ def _cut(line: Line, few: Samples) -> int:
             lower = min(few.harm[k], few.harm[k + 1])
             if few.course[k] != few.course[k + 1] and lower < least:
                 border, least = k, lower
-        copy_sample(few, border + 1, few, 5)  # first: it may be sample 1 that moves to 0
+        copy_sample(few, border + 1, few, 5)  # copy this one first: sample 1 may move to 0
         copy_sample(few, border, few, 0)
     return FLAG.DONE
 
 
 @compiled(apart=True, bare=True)
 def narrow_minima(line: Line, room: Room) -> int:
-    """Follow the lowest local minima of the samples down to brackets of 1e-9 m/s2; adds where they end."""
+    """Refine the lowest local minima to brackets of 1e-9 m/s2, and add the refined samples."""
     found, minima, last = room.two, room.minima, _NARROWED - 1
     find_minima(found, _NARROWED, room.values, minima)
     for m in range(MINIMA):
@@ -223,9 +224,9 @@ def narrow_minima(line: Line, room: Room) -> int:
 
 @compiled(bare=True)
 def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, to: int) -> int:
-    """Bring ``low`` and ``high`` together around the least harm, which is that of ``found[to]``.
+    """Narrow the bracket ``low``, ``high`` around the least harm, which is sample ``found[to]``.
 
-    Both sides are cut in three each time. Where nothing is lower than the middle, that stays.
+    Both sides are divided in three in each round. If no new sample is lower, the middle stays.
     """
     while high - low > NARROWEST_MPS2:
         middle = found.at[to]
@@ -252,9 +253,9 @@ def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, t
 
 @compiled(apart=True, bare=True)
 def step_back(line: Line, around: Samples, best: float, capacity: float, out: Floats) -> int:
-    """Move a minimum that lies on the very edge of a jump 1e-9 m/s2 to its safe side.
+    """Move a minimum at the very edge of a jump 1e-9 m/s2 to its safe side.
 
-    Otherwise the last bits, which differ when the same motion is advanced step by step, would decide the harm.
+    Otherwise the last bits, which differ if the same motion is advanced step by step, would decide the harm.
     """
     for k in range(5):
         around.at[k] = min(max(best + NARROWEST_MPS2 * (k - 2.0), 0.0), capacity)

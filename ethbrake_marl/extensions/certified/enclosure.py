@@ -1,4 +1,8 @@
-"""Branch and bound: an upper bound on the harm of a plan over a box, refined where it is largest."""
+"""Upper bound on the harm of a plan over a box of worlds, by branch and bound.
+
+A *plan* holds one action for each decision up to the horizon. The box is halved again and again where its bound is
+largest. ``Q`` numbers describe a box, ``K`` of them are uncertain, ``L`` is the length of a plan.
+"""
 
 from __future__ import annotations
 
@@ -40,27 +44,27 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 
-# groups of the numbers of a box, N of each but P gaps
+# groups of a box's numbers: N numbers in each group, P in the last one
 BRAKING, DRIVING, LATENCY, MASS, BRAKE_RATE, RELEASE_RATE, SPEED, GAP = range(8)
 
-LONGEST_PIECE_S = 0.25  # before the first decision
+LONGEST_PIECE_S = 0.25  # longest piece of time before the first decision
 
 
 class Known(NamedTuple):
-    """What is certain about the worlds of a box."""
+    """Quantities that are the same in all worlds of a box."""
 
-    vehicle: int
+    vehicle: int  # index of the shielded vehicle
     constant: Floats  # [N] command of each other vehicle; NaN: full braking
-    limit: Floats  # [N]
+    limit: Floats  # [N] speed limits
     restitution: float
-    begin_s: float  # of the worlds
+    begin_s: float  # time at which the worlds begin
     time_step_s: float
     horizon_s: float
 
 
 @compiled(apart=True)
 def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
-    """The form of number ``which`` of a box whose uncertain ones are ``free`` [K]."""
+    """Return the affine form of number ``which`` of a box; ``free`` [K] lists the uncertain numbers."""
     out = np.zeros(free.shape[0] + 2)
     out[0] = 0.5 * (low_[which] + high_[which])
     half = 0.5 * (high_[which] - low_[which])
@@ -74,10 +78,19 @@ def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
 
 @compiled(apart=True)
 def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats) -> tuple[Cell, Floats]:
-    """The cell of a box [Q], its worlds at the alert, and how long after it the first piece of time begins (s).
+    """Return the cell of a box, and the time from the alert to its first piece of time (s) as an affine form.
 
-    The first decision falls at another time in each world where the shielded vehicle's latency is uncertain: time is
-    counted from it, and the first piece begins as long before it as the earliest one comes after the alert.
+    Time is counted from the first decision, because the first decision falls at a different time in each world where
+    the latency of the shielded vehicle is uncertain. The first piece starts before it by the shortest time that any
+    world needs from the alert to the first decision.
+
+    Args:
+        low_: least values of the box, [Q].
+        high_: largest values, [Q].
+        free: the uncertain numbers, [K].
+        known: the certain quantities.
+        plan: actions of the shielded vehicle, [L].
+
     """
     N, W = known.limit.shape[0], free.shape[0] + 2
     P, v = N - 1, known.vehicle
@@ -105,7 +118,7 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
     times, action = pieces(known, onset, earliest, plan)
     first[0] -= earliest
     build = np.zeros(N, np.bool_)
-    for i in range(N):  # others only brake, or only drive
+    for i in range(N):  # another vehicle only brakes or only drives, so only one of its rates matters
         down, up = low_[BRAKE_RATE * N + i] < math.inf, low_[RELEASE_RATE * N + i] < math.inf
         build[i] = (up and (i == v or known.constant[i] > 0.0)) or (down and not known.constant[i] >= 0.0)
     J, moving = times.shape[0] if build.any() else 0, bool(build.any())
@@ -126,9 +139,12 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
 
 @compiled(apart=True)
 def build_up(cell: Cell, i: int, late: Floats, rates: Floats) -> None:
-    """The forces of a vehicle in ``late`` and in every piece; 0 at the alert. ``rates`` [2, W] of braking, release."""
+    """Fill in the forces of vehicle ``i`` before the first piece of time (``late``) and in every piece.
+
+    The force is 0 at the alert. ``rates`` [2, W] are the rates of building up and of releasing the brakes.
+    """
     forces, own, force, wanted = cell.forces, i == cell.vehicle, np.zeros_like(late), np.zeros_like(late)
-    last, there = 0.0, True  # action, and whether the force is that of it
+    last, there = 0.0, True  # last action; whether the force has reached it
     for j in range(cell.times.shape[0]):
         begin, end = cell.times[j - 1], cell.times[j]
         duration = between(end - begin, end - begin, late.shape[0])
@@ -169,11 +185,12 @@ def ramp(
     force: Floats, wanted: Floats, duration: Floats, longest: float, rates: Floats, rise: Floats, gain: Floats,
     swing: Floats,
 ) -> bool:  # fmt: skip
-    """A force that moves towards another one for a while: ``force`` becomes that at its end.
+    """Move ``force`` towards ``wanted`` for ``duration``, in place, and add its effect on speed and distance.
 
-    With a difference d at the start and e at the end, and the time m for which it moves, it adds ``m (d + e) / 2`` to
-    the speed that ``wanted`` gives after t, and ``m t (d + e) / 2 - m^2 (d + 2 e) / 6`` to the way. ``swing`` [2]
-    becomes by how much it may differ from its mean. Returns whether it is there at the end in every world.
+    For a difference d to ``wanted`` at the start and e at the end, and a time m during which the force changes, the
+    speed changes by ``m (d + e) / 2`` more than under ``wanted`` alone in the duration t, and the distance by
+    ``m t (d + e) / 2 - m^2 (d + 2 e) / 6``. ``swing`` [2] receives the largest deviation from the mean. Returns whether
+    the force has reached ``wanted`` at the end in every world.
     """
     start, there = difference(force, wanted), True
     force[:] = wanted
@@ -204,7 +221,11 @@ def ramp(
 
 @compiled(apart=True)
 def wait(cell: Cell, late: Floats) -> bool:
-    """Move a cell's worlds on by ``late`` (s), each by its own; False where that may not be all that happens."""
+    """Move the worlds of a cell from the alert to the first piece of time, which takes ``late`` (s) in each world.
+
+    Returns False if the motion until then may be more than undisturbed motion: a contact, a stop, the speed limit, or a
+    command that takes effect on the way.
+    """
     if high(late) <= 1e-12:
         return True
     if low(late) < -1e-12:
@@ -235,11 +256,14 @@ def wait(cell: Cell, late: Floats) -> bool:
 
 @compiled(apart=True)
 def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
-    """Acceleration of a vehicle until ``late`` after the alert; False where it may begin within that time."""
+    """Return the acceleration of another vehicle from the alert until ``late``, and whether it is certain.
+
+    It is not certain where the command may take effect within that time.
+    """
     pull = np.zeros_like(late)
     if i == cell.vehicle:
         return pull, True
-    acts = cell.onset[i].copy()  # after the alert
+    acts = cell.onset[i].copy()  # becomes the time from the alert
     add(acts, 1.0, late)
     acts[0] -= cell.times[0]
     if high(acts) > 1e-12:
@@ -252,7 +276,7 @@ def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
 
 @compiled(apart=True)
 def pieces(known: Known, onset: Floats, earliest: float, plan: Floats) -> tuple[Floats, Floats]:
-    """Where commands may change, s after the first decision, and the shielded vehicle's action between."""
+    """Return the limits of the pieces of time (s after the first decision), and the action in each of them."""
     N = onset.shape[0]
     before = earliest - known.begin_s
     first = math.ceil(before / LONGEST_PIECE_S) if before > 0.0 else 0
@@ -285,9 +309,13 @@ def bound_of(
     low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, stack: Stack, motion: Motion, out: Floats,
     most: float,
 ) -> float:  # fmt: skip
-    """Upper bound on the harm of a plan over one box, unless it is above ``most``."""
+    """Return an upper bound on the harm of a plan over one box.
+
+    If the result is above ``most`` it is no bound, only larger than ``most``. ``out`` receives the affine form that
+    reaches it.
+    """
     cell, late = cell_of(low_, high_, free, known, plan)
-    # of all worlds whose first piece of time begins ``late`` after the alert
+    # rough bound for all worlds, whose first piece begins ``late`` after the alert
     N, P, width = cell.speed.shape[0], cell.gap.shape[0], cell.speed.shape[1]
     path = Path(np.zeros((N + P + 1, width)), np.zeros((P, TOUCH_WIDTH)), np.zeros(2 * P + 1, np.int64))
     for i in range(N):
@@ -308,10 +336,11 @@ def bound_of(
 def bound_box(
     low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, enough: float, cells: int, only_enough: bool
 ) -> tuple[float, int]:
-    """Upper bound on the harm of a plan [L] over a box [Q], and the cells looked at.
+    """Return an upper bound on the harm of a plan [L] over a box [Q], and the number of cells that were examined.
 
-    The box is halved where the bound is largest, until that is at most ``enough`` or ``cells`` were looked at. With
-    ``only_enough`` a part is given up once its harm is above ``enough``: a larger result is then no bound.
+    The box is halved where the bound is largest until the bound is at most ``enough`` or ``cells`` were examined. With
+    ``only_enough`` the search in a part stops once its harm is above ``enough``; a result above ``enough`` is then no
+    bound.
     """
     N, K, Q = known.limit.shape[0], free.shape[0], low_.shape[0]
     stack, motion = new_stack(N, K + 2), new_motion(N, K + 2)
@@ -339,13 +368,13 @@ def bound_box(
 
 MOST_VEHICLES = 3
 
-CELLS_AT_ALERT, CELLS = 200, 40  # looked at for the bound at the alert, and for one later certificate
+CELLS_AT_ALERT, CELLS = 200, 40  # most cells to examine: for the bound at the alert, and for one later certificate
 
-NEAR = 1.02  # times the largest harm in a corner: a bound this good is not refined any further
+NEAR = 1.02  # a bound below this multiple of the largest harm in a corner is not refined further
 
-NEARLY_NOTHING = 0.1  # m2/s2, likewise
+NEARLY_NOTHING = 0.1  # m2/s2; added to that limit
 
-CORNERS, INTERIOR = "corners", "interior"  # which worlds of a box robust mode certifies
+CORNERS, INTERIOR = "corners", "interior"  # worlds that mode robust certifies: the corners of a box, or the whole box
 
 CERTAINTIES = (CORNERS, INTERIOR)
 
@@ -353,24 +382,24 @@ SCRIPTS = ("full_brake", "coast", "constant")
 
 
 class Boxes(NamedTuple):
-    """The boxes of n worlds: each uncertain number from ``low`` to ``high``."""
+    """The boxes of ``n`` worlds: each number of a world lies between ``low`` and ``high``."""
 
-    low: Floats  # [n, Q] braking, driving, latency, mass, rates, speed of each vehicle, then the gaps
+    low: Floats  # [n, Q] capacities, latency, mass, rates and speed of each vehicle, then the gaps
     high: Floats  # [n, Q]
-    limit: Floats  # [n, N] m/s
+    limit: Floats  # [n, N] speed limits, m/s
     restitution: Floats  # [n]
-    begin_s: Floats  # [n]
-    constant: Floats  # [n, N] m/s2; NaN: full braking
-    vehicle: int
+    begin_s: Floats  # [n] time at which the worlds begin
+    constant: Floats  # [n, N] command of each other vehicle, m/s2; NaN: full braking
+    vehicle: int  # index of the shielded vehicle
     time_step_s: float
     horizon_s: float
 
     @staticmethod
     def check_possible(robust: str, scenario: Scenario, harm_count: HarmCount, others: Mapping[int, Script]) -> None:
-        """Raise ``InvalidInput`` for a setting that interior mode cannot certify, whatever its worlds.
+        """Raise ``InvalidInput`` for a setting that ``robust="interior"`` cannot certify in any world.
 
-        That is: total harm, more than three vehicles, an obstacle ahead, or others that do anything else than brake
-        fully, coast, or hold one deceleration.
+        These are total harm, more than three vehicles, an obstacle ahead, and other vehicles that do anything else than
+        brake fully, coast, or hold one deceleration.
         """
         if robust != INTERIOR:
             return
@@ -393,11 +422,11 @@ class Boxes(NamedTuple):
     def of(
         cls, possible: Worlds, problem: ProfileProblem, n: int, scenario: Scenario, others: Mapping[int, Script]
     ) -> Boxes:
-        """The boxes of n worlds at the alert, their members being ``possible`` [n * M], as in the ``problem``.
+        """Return the boxes of ``n`` worlds at the alert; ``possible`` [n * M] holds the M members of each world.
 
-        Raises ``InvalidInput`` for worlds that interior mode cannot certify: with an obstacle ahead, or in which
-        another vehicle's command is not the same in the whole box. ``check_possible`` says what no world of a scenario
-        changes.
+        Raises ``InvalidInput`` for worlds that interior mode cannot certify: an obstacle ahead, a braking profile in
+        pieces, brakes that began to build up before the alert, or another vehicle whose command differs within the box.
+        ``check_possible`` covers what does not depend on the worlds.
         """
         v, N, vehicle, members = possible.vehicles, possible.N, int(problem.vehicles[0]), possible.n // n
         if possible.obstacle_ahead.any():
@@ -431,12 +460,15 @@ class Boxes(NamedTuple):
         )  # fmt: skip
 
     def take(self, rows: Ints) -> Boxes:
-        """The boxes of some worlds."""
+        """Return the boxes of some worlds."""
         arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._fields[:6]}
         return self._replace(**arrays)
 
     def placed(self, old: Boxes | None, rows: Ints) -> Boxes:
-        """The boxes of a batch in which these ones begin in these rows: all of them, or some of the ``old`` ones."""
+        """Return the boxes of a batch after new episodes begin in ``rows`` with these boxes.
+
+        If ``rows`` covers the whole batch these boxes replace ``old``; else they replace only its ``rows``.
+        """
         if old is None or len(rows) >= len(old.low):
             return self.take(np.argsort(rows))
         arrays: dict[str, Any] = {name: getattr(old, name).copy() for name in self._fields[:6]}
@@ -445,16 +477,20 @@ class Boxes(NamedTuple):
         return self._replace(**arrays)
 
     def at_alert(self, plans: Floats, harm: Floats) -> Floats:
-        """Upper bound on the harm of each plan [n, L], ``harm`` being its largest in a corner, [n] m2/s2."""
+        """Return an upper bound on the harm of each plan [n, L] at the alert, [n] m2/s2.
+
+        ``harm`` [n] is the largest harm of the plan in a corner of the box.
+        """
         return self.bound(np.arange(len(plans)), plans, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)
 
     def bound(
         self, rows: Ints, plans: Floats, enough: Floats, cells: int = CELLS, *, only_enough: bool = False
     ) -> Floats:
-        """Upper bound on the harm of each plan [m, L], from the alert on, over all worlds of a box [m], m2/s2.
+        """Return an upper bound on the harm of each plan [m, L] over all worlds of its box, [m] m2/s2.
 
-        A bound at most ``enough`` [m] is not refined any further, and no more than ``cells`` parts of a box are looked
-        at. With ``only_enough`` what is above ``enough`` is no bound: it says that none at most that was found.
+        The harm counts from the alert on. ``rows`` [m] are the boxes. A bound of at most ``enough`` [m] is not refined,
+        and at most ``cells`` parts of a box are examined. With ``only_enough`` a result above ``enough`` is no bound:
+        it only says that no bound of at most ``enough`` was established.
         """
         bounds = np.empty(len(rows))
         for j, k in enumerate(rows.tolist()):
@@ -476,7 +512,7 @@ def _refusal(what: str) -> InvalidInput:
 
 
 def checked_robust(robust: object, where: str) -> str:
-    """``corners`` or ``interior``; raises ``UnknownName`` for anything else."""
+    """Return ``robust`` if it is ``corners`` or ``interior``; raise ``UnknownName`` otherwise."""
     if robust not in CERTAINTIES:
         raise unknown_name(f"{where}: robust", robust, CERTAINTIES)
     return str(robust)

@@ -1,10 +1,10 @@
-"""The registry entries of this extension: the shield ``+robust``, and ``:believed`` behind agents and shields."""
+"""Registry entries of this extension: the shield ``+robust``, and the variant ``:believed`` of agents and shields."""
 
 from __future__ import annotations
 
 from ethbrake_marl.agents.e_v2x_bm.coupled import make_e_v2x_bm
 from ethbrake_marl.agents.protocol import Agent, Driver, Source, Team
-from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.enclosure import CORNERS, checked_robust
 from ethbrake_marl.extensions.certified.estimating_agents import Believing, BelievingHybrid
@@ -16,7 +16,7 @@ from ethbrake_marl.shield.factories import shield_episodes
 
 
 def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """``+robust`` or ``+robust:interior``, against the uncertainty of the settings."""
+    """Make the shield ``+robust`` or ``+robust:interior`` against the uncertainty of the settings."""
     where = f"agent {settings.spec!r}"
     robust, uncertainty = checked_robust(argument or CORNERS, where), settings.uncertainty
     return ShieldedDriver(
@@ -26,7 +26,7 @@ def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings
 
 
 def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """``+robust:believed`` or ``+robust:interior:believed``, against all that was not received."""
+    """Make ``+robust:believed`` or ``+robust:interior:believed``: robust against everything that was not received."""
     where = f"agent {settings.spec!r}"
     return ShieldedDriver(
         policy, settings.needed_scenario(), mode="robust", harm_count=settings.harm_count, where=where,
@@ -35,7 +35,7 @@ def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: 
 
 
 def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: AgentSettings) -> Driver:
-    """``+step:believed``: every action certified in the estimated world."""
+    """Make ``+step:believed``: every action is certified in the estimated world."""
     scenario = settings.needed_scenario()
     if isinstance(policy, Team) or len(scenario.learners) > 1:
         raise InvalidInput(f"agent {settings.spec!r}: :believed shields one learner, not several; take +step")
@@ -43,7 +43,7 @@ def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: Ag
 
 
 def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """``+episode:believed`` or ``+episode:pairwise:believed``: Algorithm 1 compares in the estimated world."""
+    """Make ``+episode:believed`` or ``+episode:pairwise:believed``: Algorithm 1 compares in the estimated world."""
     hybrid = shield_episodes(policy, argument, settings)
     if isinstance(policy, Believing):
         raise InvalidInput(f"agent {settings.spec!r}: {policy.name} decides on what was received itself; take +step")
@@ -51,7 +51,7 @@ def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: 
 
 
 def make_estimating_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
-    """``e_v2x_bm:believed`` or ``e_v2x_bm:pairwise:believed``: the least harm in the estimated world."""
+    """Make ``e_v2x_bm:believed`` or ``e_v2x_bm:pairwise:believed``: E-V2X-BM in the estimated world."""
     return Believing(make_e_v2x_bm(argument, settings), settings.needed_scenario())
 
 

@@ -1,6 +1,6 @@
-"""The comparison of levels: harm of each, what each step is worth, who pays, the distance to the joint optimum.
+"""Compare levels of cooperation: harm per level, value of each step, who pays, distance to the joint optimum.
 
-Intervals hold for other training seeds and other worlds: both are drawn anew (``evaluation.statistics``).
+Confidence intervals cover other training seeds and other worlds: both are resampled (``evaluation.seeds``).
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ from ethbrake_marl.shield.episodes import Shielded
 
 
 def compare(measured: Sequence[Measured], searched: int) -> Json:
-    """Plain data for JSON: ``levels``, ``steps`` of the ladder, ``channels``; see docs/ablate-cooperation.md.
+    """Return the comparison as plain data for JSON; docs/ablate-cooperation.md describes it.
 
-    ``undertrained`` has a sentence for each level in which everybody braking fully does better than what was trained.
+    Keys: ``levels``, ``steps`` of the ladder (each level against the one before), ``channels`` (levels that differ only
+    in ``v2x``), and ``undertrained``: a sentence for each level whose trained policies do worse than full braking.
 
-    The joint optimum is known in the first ``searched`` worlds; what stands beside it is of these worlds too. Each
-    algorithm has a ladder of its own; levels in which nobody learns are in all of them.
+    The joint optimum was searched in the first ``searched`` worlds, so figures compared with it cover the same worlds.
+    Each algorithm has its own ladder; levels without learners belong to all ladders.
     """
     algorithms = [m.algorithm for m in measured if m.algorithm is not None]
     steps, channels = [], []
@@ -51,9 +52,9 @@ def _undertrained(one: Measured, goal: Goal) -> str:
 
 
 def _level(one: Measured, searched: int) -> Json:
-    """What one level reached under one algorithm; harm (m2/s2) in all worlds, and in the ``searched`` ones.
+    """Return the results of one level with one algorithm: harm (m2/s2) in all worlds, and in the ``searched`` worlds.
 
-    There also the joint optimum, and the share of its reduction that is realised.
+    The ``searched`` part also has the joint optimum and the share of the possible reduction.
     """
     scenario = one.level.scenario
     found: Json = {
@@ -93,7 +94,7 @@ def _level(one: Measured, searched: int) -> Json:
 
 
 def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: int) -> Json:
-    """The same teams in the same worlds behind the shield that guards this count, beside what they do without it."""
+    """Return the results of the same teams in the same worlds behind the shield that guards this count."""
     before, after = one.reached.vehicle[harm_count], shielded.vehicle_harm
     actions = shielded.decisions * shielded.replaced.shape[2]
     return {
@@ -114,11 +115,11 @@ def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: 
 
 
 def _change(before: Measured, after: Measured, algorithm: str) -> Json:
-    """From one level to another on the same worlds: positive is more harm."""
+    """Return the change from one level to another on the same worlds; positive means more harm."""
     found: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
     for harm_count in HARM_COUNTS:
         pairs = zip(_columns(after.reached, harm_count), _columns(before.reached, harm_count), strict=True)
-        # seed k against seed k, or against the only one
+        # compares seed k with seed k, or with the only seed
         old, new = before.reached.vehicle[harm_count], after.reached.vehicle[harm_count]
         worse = new > old + TOLERANCE
         found[harm_count] = {
@@ -131,5 +132,5 @@ def _change(before: Measured, after: Measured, algorithm: str) -> Json:
 
 
 def _columns(harms: Harms, harm_count: HarmCount) -> list[Floats]:
-    """[seeds, worlds] of each vehicle."""
+    """Return the harm of each vehicle, each [seeds, worlds]."""
     return [harms.vehicle[harm_count][:, :, i] for i in range(harms.vehicle[harm_count].shape[2])]

@@ -1,8 +1,8 @@
-"""The joint optimum of every level: the least harm known that its learners can do together, world by world.
+"""Joint optimum of every level: the least known harm that its learners can achieve together, world by world.
 
-It depends on the worlds, on who learns, and on the scripts of the others; not on who knows what, nor on objectives.
-So levels that differ in these only ask one question, which is searched once, and what is known of one level is known
-of every other whose learners can do the same.
+It depends on the worlds, on the learners and on the scripts of the others; it does not depend on information or
+objectives. Levels that differ only in these share one search problem, which is searched once. A result of one level
+also counts for every other level whose learners can do the same.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from ethbrake_marl.training.training import Training
 
 @dataclass(frozen=True, slots=True)
 class LevelOptimum:
-    """What is known of one level: its search, and what its teams (of all recipes and seeds) do in the same worlds."""
+    """What is known about the optimum of one level: its search, and its trained teams (of all recipes and seeds)."""
 
     level: Level
     worlds: Worlds
@@ -43,7 +43,7 @@ class LevelOptimum:
 
 
 def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample, list[Level]]]:
-    """Each question once: the first level that asks it, its worlds to be searched, and all levels that ask it."""
+    """Return each distinct search problem: the first level with it, the worlds to search, and all levels with it."""
     found: dict[bytes, tuple[Level, Sample, list[Level]]] = {}
     rows = np.arange(plan.search_episodes)
     for level, sample in zip(plan.levels, samples, strict=True):
@@ -55,7 +55,7 @@ def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample
 
 
 def search_all(plan: Plan, samples: Sequence[Sample], jobs: int, tell: OnProgress) -> dict[str, BestHarmTable]:
-    """The search of every level with learners, by its name; parts that were found earlier are kept."""
+    """Return the search results by level name, for every level with learners. Parts that exist already are reused."""
     found: dict[str, BestHarmTable] = {}
     for level, part, alike in questions(plan, samples):
         table = search_list(
@@ -75,7 +75,10 @@ def _tell(tell: OnProgress, name: str, done: int, total: int) -> None:
 
 
 def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmCount, Floats]:
-    """The least harm [n] of each count in all ``answers`` (its own is among them) that these learners can give too."""
+    """Return the least harm [n] of each count over all ``answers`` that the learners of ``own`` can achieve too.
+
+    ``answers`` includes ``own``.
+    """
     best = {harm_count: np.full(own.worlds.n, np.inf) for harm_count in HARM_COUNTS}
     for other in answers:
         rows = np.flatnonzero(_can_imitate(own, other))
@@ -87,10 +90,11 @@ def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmC
 
 
 def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
-    """In which worlds the learners of ``own`` can do what those of ``other`` do, [n].
+    """Return the worlds [n] in which the learners of ``own`` can do whatever the learners of ``other`` do.
 
-    They are the same vehicles or more, all others follow the same scripts, latencies are equal, and the decisions of
-    ``other`` fall on theirs. What an obstacle ahead does to it is found by driving, so ``other`` may lack one.
+    This needs: the same learners or more, the same scripts for all others, equal latencies, and decisions of ``other``
+    that fall on decisions of ``own``. ``other`` may lack an obstacle, because its result is driven again with the
+    obstacle.
     """
     mine, theirs = own.level.scenario, other.level.scenario
     same_scripts = all(theirs.scripts.get(i) == script for i, script in mine.scripts.items())
@@ -105,7 +109,7 @@ def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
 
 
 def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[HarmCount, Floats]]:
-    """Harm of both counts that the search and every team of ``other`` do in some worlds of ``own``."""
+    """Yield the harm of both counts that the search and every team of ``other`` cause in worlds ``rows`` of ``own``."""
     scenario, task = other.level.scenario, Task(other.level.scenario, other.level.scenario.learners)
     worlds = replace(other.worlds, obstacle_gap_m=own.worlds.obstacle_gap_m).take(rows)
     for best in other.searched.best.values():
@@ -119,17 +123,17 @@ def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[
 
 @dataclass(frozen=True, slots=True)
 class Harms:
-    """What several trainings (or one script) did, on the same worlds."""
+    """Harm by several trainings (or by one script) on the same worlds."""
 
     world: dict[HarmCount, Floats]  # [seeds, worlds] harm of all vehicles (m2/s2)
-    vehicle: dict[HarmCount, Floats]  # [seeds, worlds, N] harm of each
+    vehicle: dict[HarmCount, Floats]  # [seeds, worlds, N] harm of each vehicle (m2/s2)
     collided: Bools  # [seeds, worlds]
-    policies: tuple[Mapping[str, str], ...] = ()  # of each seed: vehicle -> SHA-256 of its policy's manifest
-    ledgers: tuple[Ledger, ...] = ()  # of each seed
+    policies: tuple[Mapping[str, str], ...] = ()  # for each seed: vehicle -> SHA-256 of its policy's manifest
+    ledgers: tuple[Ledger, ...] = ()  # one ledger for each seed
 
 
 class Goal(NamedTuple):
-    """What the trainings of a level make small: mean over seeds, worlds and learners; of full braking, too."""
+    """What the trainings of a level minimise, as a mean over seeds, worlds and learners, also for full braking."""
 
     name: str
     reached: float
@@ -137,7 +141,7 @@ class Goal(NamedTuple):
 
     @classmethod
     def of(cls, training: Training, reached: Harms, full_brake: Harms) -> Goal:
-        """The goal that the training's reward counts: the harm of the line, or the objective of each learner."""
+        """Return the goal of a training's reward: the harm of the line, or each learner's objective."""
         reward, scenario = training.recipe.reward, training.scenario
         objectives = reward.settled(scenario.objective, scenario.vehicles)[1]
 
@@ -151,29 +155,30 @@ class Goal(NamedTuple):
 
     @property
     def missed(self) -> bool:
-        """Whether full braking of everybody does better than what was trained."""
+        """Whether full braking by everybody does better than the trained policies."""
         return self.reached > self.full_brake + TOLERANCE
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """One level under one algorithm."""
+    """Results of one level with one training algorithm: harm, best known harm, shielded results and goal."""
 
     level: Level
-    algorithm: str | None  # None: nobody learns
-    reached: Harms
-    full_brake: Harms  # of all vehicles, whatever their roles
-    best: dict[HarmCount, Floats] | None  # [1, search_episodes] joint optimum, best known; None: nobody to control
-    identity: Mapping[str, Any] = field(default_factory=dict)  # of worlds and scenario, and what computed it
-    shielded: dict[HarmCount, Shielded] | None = None  # [seeds, worlds] behind the shield that guards that count
-    goal: Goal | None = None  # None: nobody learns
+    algorithm: str | None  # None: the level has no learner
+    reached: Harms  # harm by the trained policies (or by the scripts)
+    full_brake: Harms  # harm if all vehicles brake fully, whatever their roles
+    best: dict[HarmCount, Floats] | None  # [1, search_episodes] best known harm; None: the level has no learner
+    identity: Mapping[str, Any] = field(default_factory=dict)  # identity of worlds, scenario and software
+    shielded: dict[HarmCount, Shielded] | None = None  # [seeds, worlds] results behind the shield of each count
+    goal: Goal | None = None  # None: the level has no learner
 
 
 def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[Measured]:
-    """Let everything that was trained drive the common worlds, and search the joint optima (parts found are kept).
+    """Let all trained policies drive the common worlds, and search the joint optima. Existing parts are reused.
 
-    Level by level in the plan's order, algorithm by algorithm. What some policy does better than the search becomes
-    the best known of that world. Raises what loading teams and ``common_worlds`` raise, before any long work.
+    Returns the results level by level in the plan's order, algorithm by algorithm. Where a policy does better than the
+    search, its harm becomes the best known harm of that world. Raises the exceptions of loading teams and of
+    ``common_worlds`` before any long work.
     """
     say = tell or (lambda progress: None)
     teams: dict[tuple[str, str], list[Team]] = {}
@@ -218,7 +223,7 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
 
 
 def _drive(scenario: Scenario, sample: Sample, drivers: Sequence[Driver], tell: OnProgress) -> Harms:
-    """Harms of several drivers of one level on the same worlds."""
+    """Return the harm by several drivers of one level on the same worlds."""
     outcomes = []
     for driver in drivers:
         result = evaluate(sample, {driver.name: driver}, scenario=scenario).complete()

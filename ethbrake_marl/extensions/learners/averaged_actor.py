@@ -23,22 +23,22 @@ from ethbrake_marl.training.networks import ACTIVATIONS, sb3_names, tensors_of
 
 
 class Deterministic(BasePolicy):
-    """A policy without noise: its actions are its ``means``, cut at -1 and 1."""
+    """Policy without noise: its actions are its ``means``, clipped to [-1, 1]."""
 
     def means(self, observation: Float32s) -> Float32s:
-        """Outputs [rows] of the weights that learn for observations [rows, F], before they are cut."""
+        """Return the outputs [rows] of the learning weights for observations [rows, F], before clipping."""
         raise NotImplementedError
 
     def expect(self, observation: Float32s) -> Floats:
-        """Expected size of the gradient, [rows]."""
+        """Return the expected size of the gradient, [rows]."""
         raise NotImplementedError
 
     def act(self, observation: Float32s) -> Float32s:
-        """Actions [rows] in [-1, 1]."""
+        """Return the actions [rows], in [-1, 1]."""
         return np.clip(self.means(observation), -1.0, 1.0)
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
-        """Copy the weights that drive under the names of a policy bundle with this network."""
+        """Return copies of the driving weights, named as in a policy bundle with this network."""
         return tensors_of(self, network)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> Tensor:
@@ -47,9 +47,9 @@ class Deterministic(BasePolicy):
 
 
 class AveragedActor(Deterministic):
-    """An actor that learns (``learning``), and the running average of its weights, which drives.
+    """Actor with weights that learn (``learning``) and the running average of these weights, which drives.
 
-    The average has the names of Stable-Baselines3's PPO.
+    The average has the parameter names of Stable-Baselines3's PPO.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class AveragedActor(Deterministic):
                 nn.init.zeros_(layer.bias)
         nn.init.orthogonal_(self.action_net.weight, 0.01)
         nn.init.constant_(self.action_net.bias, shape.initial_action or 0.0)
-        # a bundle has it; the actor itself never explores
+        # a policy bundle needs this parameter; the actor itself never explores
         self.log_std = nn.Parameter(torch.full((1,), -3.0), requires_grad=False)
         last = nn.Linear(hidden[-1], 1)
         self.learning = nn.Sequential(*create_mlp(inputs, -1, hidden, activation), last)
@@ -82,7 +82,7 @@ class AveragedActor(Deterministic):
             learns.copy_(mean)
 
     def take_over(self, tensors: Mapping[str, Float32s]) -> None:
-        """Take over the tensors of a bundle."""
+        """Load the tensors of a policy bundle into both sets of weights."""
         state = self.state_dict()
         for name, theirs in sb3_names(self._spec).items():
             state[theirs].copy_(torch.from_numpy(tensors[name]))
@@ -98,6 +98,6 @@ class AveragedActor(Deterministic):
         return self.scout.expect(observation)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Actions [rows, 1] of the average."""
+        """Return the actions [rows, 1] of the averaged weights."""
         means: Tensor = self.action_net(self.mlp_extractor["policy_net"](observation))
         return means.clamp(-1.0, 1.0)

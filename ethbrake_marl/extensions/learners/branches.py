@@ -1,7 +1,7 @@
-"""Branches of running episodes: the same moment, played on to the end in more than one way.
+"""Branches of running episodes: the same moment, played to the end in more than one way.
 
-A learner's action is moved by an offset for a few steps; then the policy goes on in closed loop. Two branches differ
-by the offset alone. Everything else in them is the same, to the bit.
+In a branch, an offset is added to one learner's actions for a few steps; then the policy continues in closed loop. Two
+branches of a moment differ only by the offset. Everything else in them is the same, bit for bit.
 """
 
 from __future__ import annotations
@@ -20,40 +20,40 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Bools, Floats, Ints
 from ethbrake_marl.policies.network_spec import Float32s
 
-ROUNDING_MPS2 = 1e-5  # a command that differs by less is the same: networks round by the size of their batch
+ROUNDING_MPS2 = 1e-5  # commands closer than this are equal: a network's rounding depends on its batch size
 
 Act = Callable[[Observations], Float32s]  # observations [rows, F] -> actions [rows] in [-1, 1]
 
-Decide = Callable[[Observations, Ints, int], Floats]  # what is seen [m, L, F] in rows [m], steps made -> actions [m, L]
+Decide = Callable[[Observations, Ints, int], Floats]  # (observations [m, L, F], rows [m], steps so far) -> [m, L]
 
 
 class Offsets(NamedTuple):
-    """How one learner's actions in each row differ from those of its policy."""
+    """For each row, the learner whose actions are moved, by how much, and for how many steps."""
 
-    learner: Ints  # [n] place among the learners
-    size: Floats  # [n] added to its action, which stays in [-1, 1]
-    steps: Ints  # [n] for so many steps, at least 1
+    learner: Ints  # [n] index of the learner among the learners
+    size: Floats  # [n] offset of its action; the sum is clipped to [-1, 1]
+    steps: Ints  # [n] number of steps with the offset
 
 
 def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) -> tuple[Floats, Floats]:
-    """Play every row to the end of its episode. Return what its moved learner gains, and how far it was moved.
+    """Play every row to the end of its episode. Return the moved learner's return, and the sum of its offsets.
 
     Args:
-        engine: branches, which this changes.
-        act: drives all learners, from their observations alone.
-        offsets: the learner whose actions are moved in each row, how far, and for how many steps.
+        engine: branches to play; changed in place.
+        act: policy of all learners, from observations alone.
+        offsets: for each row the learner whose actions are moved, how far, and for how many steps.
         gamma: discount of one time step.
 
     Returns the return [n] of the moved learner from now on (NaN for a row that could not be advanced), and the sum of
-    its offsets [n], each cut so that the action stays in [-1, 1]. If the reward is harm alone, a row ends as soon as
-    nothing can change any more.
+    its offsets [n] after clipping actions to [-1, 1]. If the reward is harm alone, a row ends as soon as nothing can
+    change any more.
 
     """
     moved, most = np.zeros(engine.n), int(offsets.steps.max(initial=0))
 
     def decide(seen: Observations, rows: Ints, number: int) -> Floats:
         wanted = act(seen.reshape(-1, seen.shape[2])).astype(np.float64).reshape(seen.shape[:2])
-        some = np.flatnonzero(number < offsets.steps[rows])  # whose offset still lasts
+        some = np.flatnonzero(number < offsets.steps[rows])  # rows whose offset still applies
         lasting = rows[some]
         before = wanted[some, offsets.learner[lasting]]
         after = np.clip(before + offsets.size[lasting], -1.0, 1.0)
@@ -66,9 +66,9 @@ def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) ->
 
 
 def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) -> Floats:
-    """Play every row to the end of its episode, and for ``at_least`` so many steps. Return each learner's gain [n, L].
+    """Play every row to the end of its episode, but at least ``at_least`` steps. Return each learner's return, [n, L].
 
-    ``decide`` returns the learners' actions. The rest is as for ``play_to_the_end``.
+    ``decide`` returns the learners' actions. See ``play_to_the_end`` for the other arguments.
     """
     vehicles = np.array(engine.learners, np.int64)
     gained, actions = np.zeros((engine.n, len(vehicles))), np.zeros((engine.n, len(vehicles)))
@@ -90,7 +90,7 @@ def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) 
 
 
 def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
-    """Play every row to its end by ``act``. Return the observations at each decision [m, L, F], and the states [m]."""
+    """Play every row to its end with ``act``. Return the observations at each decision, [m, L, F], and the states."""
     seen_then, moments = [], []
 
     def decide(seen: Observations, rows: Ints, number: int) -> Floats:
@@ -103,12 +103,13 @@ def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
 
 
 def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
-    """Whether everything in these ``rows`` stands as it stood ``before`` [rows], and will stay so.
+    """Return the ``rows`` in which everything stands as it stood ``before``, and will keep standing.
 
-    A policy that observes the same does the same. Rows count only if no latency or news can change the observation.
+    A policy with the same observation acts the same. So a row counts only if no latency or message can change the
+    observation.
     """
     if engine.packed.has_messages or engine.in_pieces:
-        return np.zeros(len(rows), np.bool_)  # what is still on its way may change what it sees, or what holds
+        return np.zeros(len(rows), np.bool_)  # messages under way may change the observation; a profile, the braking
     (state, params), stands = engine.packed, np.empty(len(rows), np.bool_)
     find_standing(state, before, params, rows, stands)
     return stands
@@ -116,7 +117,7 @@ def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
 
 @compiled
 def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, stands: Bools) -> None:
-    """Fill ``stands`` [m] for ``rows`` [m] of ``state``, which stood as ``before`` [m]."""
+    """Fill ``stands`` [m] for ``rows`` [m] of ``state``; ``before`` [m] holds the rows one step earlier."""
     column = columns(state)
     by_link = params.shape[1] > column.own_latency
     for m in range(rows.shape[0]):
@@ -135,12 +136,12 @@ def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, sta
 
 
 def other_count(count: HarmCount) -> HarmCount:
-    """The harm count that is not ``count``."""
+    """Return the harm count that is not ``count``."""
     return "total" if count == "first" else "first"
 
 
 def moving_rows(moments: State) -> Bools:
-    """Whether some vehicle moves, for each row. A row in which everything stands teaches nothing."""
+    """Return the rows in which some vehicle moves. A row in which everything stands teaches nothing."""
     column = moments.packed.column
     moving: Bools = (moments.motion[:, column.speed : column.command] != 0.0).any(axis=1)
     return moving

@@ -1,4 +1,4 @@
-"""The gating network of a mixture of experts: weights that learn, and their average, which decides."""
+"""Gating network of a mixture of experts: weights that learn, and their average, which decides."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from ethbrake_marl.training.networks import ACTIVATIONS
 
 
 class AveragedGate(nn.Module):
-    """A gating network that learns (``learning``), and the running ``average`` of its weights, which decides.
+    """Gating network that learns (``learning``), and the running ``average`` of its weights, which decides.
 
-    It remembers the last decisions at which experts were compared: the observation, and how much more than the best
-    expert each of them costs.
+    A memory holds the last decisions at which experts were compared: the observation, and the extra cost of each expert
+    over the best one.
     """
 
-    seen: Tensor  # [M, F]
-    more: Tensor  # [M, K]
-    compared: Tensor  # [1] decisions so far; new ones replace the oldest
+    seen: Tensor  # [M, F] observations in memory
+    more: Tensor  # [M, K] extra cost of each expert
+    compared: Tensor  # [1] number of decisions added so far; new ones replace the oldest
 
     def __init__(self, inputs: int, rate: Schedule, recipe: CounterfactualRecipe) -> None:
         super().__init__()
         plan = recipe.modes
         assert plan is not None
         layers = create_mlp(inputs, plan.networks, list(plan.gate), ACTIVATIONS[recipe.network.activation])
-        nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]  # until it learns, the first network acts
+        nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]  # until the gate learns, the first expert acts
         nn.init.zeros_(layers[-1].bias)  # type: ignore[arg-type]
         self.average = nn.Sequential(*layers)
         self.learning = copy.deepcopy(self.average)
@@ -56,7 +56,7 @@ class AveragedGate(nn.Module):
         return self.seen[some], self.more[some]
 
     def choose(self, observation: Float32s) -> NDArray[np.int64]:
-        """Number of the expert that acts [rows] on observations [rows, F]."""
+        """Return the index of the expert that acts [rows] on observations [rows, F]."""
         with torch.no_grad():
             chosen: NDArray[np.int64] = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen

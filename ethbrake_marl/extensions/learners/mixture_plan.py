@@ -9,12 +9,12 @@ from ethbrake_marl.training.recipe import Fraction, Layers, NonNegative, Positiv
 
 
 class Shares(FileModel):
-    """Share of all updates that each stage has, 1 in all."""
+    """Share of all updates that each stage of training has; the stages sum to 1."""
 
-    alone: Fraction  # the first network, in all worlds
-    further: Fraction  # each of the others in the worlds of its own mode, one after the other
-    gate: Fraction  # the gate between them
-    together: Fraction  # all networks and the gate, each network where the gate chooses it
+    alone: Fraction  # the first expert, in all worlds
+    further: Fraction  # the further experts, one after the other, each in its own worlds
+    gate: Fraction  # the gating network
+    together: Fraction  # all experts and the gate; each expert at decisions at which the gate chooses it
 
     @model_validator(mode="after")
     def _everything(self) -> Shares:
@@ -25,7 +25,7 @@ class Shares(FileModel):
 
 
 class ModesPlan(FileModel):
-    """How many experts, how the worlds of each further expert are chosen, and how the gating network learns."""
+    """Number of experts, choice of the worlds of each further expert, and training of the gating network."""
 
     networks: int = Field(ge=2, le=16, description="how many")
     gate: Layers = Field(description="hidden layers of the gate")

@@ -1,4 +1,7 @@
-"""Worlds in which random templates do better than every expert so far, and the templates to imitate there."""
+"""Worlds in which random templates do better than all experts so far, and the templates to imitate in them.
+
+A *template* is a random braking profile from the search.
+"""
 
 from __future__ import annotations
 
@@ -20,27 +23,27 @@ from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.policies.network_spec import Float32s
 
-NO_DIFFERENCE = 1e-2  # of returns: two networks that differ by less do the same
+NO_DIFFERENCE = 1e-2  # returns closer than this are equal
 
 
 class Explored(NamedTuple):
-    """Worlds of the training, and the best that the experts do in them."""
+    """Worlds of the training, and the best results of the experts in them."""
 
-    alert: Worlds
-    start: State  # at the first decision
-    gained: Floats  # [n] the highest return
-    harm: Floats  # [n] the least harm (m2/s2)
+    alert: Worlds  # worlds at the alert
+    start: State  # state at the first decision
+    gained: Floats  # [n] highest return of an expert
+    harm: Floats  # [n] least harm of an expert (m2/s2)
 
 
 class Shown(NamedTuple):
-    """Observations and actions of templates, to be imitated."""
+    """Observations and actions of templates, to imitate."""
 
     seen: Float32s  # [m, F]
     action: Float32s  # [m]
 
 
 def explore(engine: Engine, plan: ModesPlan, acts: Sequence[Act], gamma: float) -> Explored:
-    """Let every expert drive the first worlds of the training from start to end."""
+    """Let every expert drive the first worlds of the training from start to end. Return the best results."""
     alert, start = engine.first_moments(plan.worlds)
     gained, harm = np.full(plan.worlds, -np.inf), np.full(plan.worlds, np.inf)
     for act in acts:
@@ -52,7 +55,7 @@ def explore(engine: Engine, plan: ModesPlan, acts: Sequence[Act], gamma: float) 
 def drive_from(
     engine: Engine, start: State, act: Act, gamma: float, count: HarmCount | None = None
 ) -> tuple[Floats, Floats]:
-    """Return of the first learner [n] (NaN for a row that could not be advanced), and harm of the world [n] (m2/s2).
+    """Return the first learner's return [n] (NaN for a row that could not be advanced), and the harm [n] (m2/s2).
 
     The harm has the reward's count unless ``count`` is given.
     """
@@ -63,7 +66,7 @@ def drive_from(
 
 
 def show_templates(engine: Engine, plan: ModesPlan, found: Explored, gamma: float, seed: int) -> Shown:
-    """Actions of the best template in each world where it gains more than every expert, by ``plan.gain``."""
+    """Return the actions of the best template in each world where it gains more than every expert by ``plan.gain``."""
     (vehicle,) = engine.learners
     problem = profile_problem(
         found.alert,
@@ -97,9 +100,9 @@ def show_templates(engine: Engine, plan: ModesPlan, found: Explored, gamma: floa
 
 
 def own_worlds(engine: Engine, plan: ModesPlan, found: Explored, act: Act, gamma: float) -> State:
-    """Starts of the worlds in which ``act`` is at most ``plan.margin`` worse than the experts before it.
+    """Return the starting states of the worlds in which ``act`` is at most ``plan.margin`` worse than earlier experts.
 
-    Worlds in which it makes no difference, or the experts before it do no harm, are left out: they teach nothing.
+    Worlds in which it makes no difference, or in which earlier experts do no harm, teach nothing and are left out.
     """
     gained, _ = drive_from(engine, found.start, act, gamma)
     more = gained - found.gained
@@ -108,4 +111,4 @@ def own_worlds(engine: Engine, plan: ModesPlan, found: Explored, act: Act, gamma
 
 
 class NoOtherMode(EthBrakeError, ValueError):
-    """No template does better than the experts so far: there is nothing for a further expert to learn."""
+    """Raised if no template does better than the experts so far: a further expert has nothing to learn."""

@@ -1,4 +1,4 @@
-"""Adam, one step down a loss, and a running average of weights."""
+"""Adam, one gradient step, and a running average of weights."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch.optim import Optimizer
 
 
 class Adam(torch.optim.Adam):
-    """torch's Adam, to the bit, without its decorators, which import torch's compiler (1 to 3 CPU-s)."""
+    """Adam of torch, bit for bit, without its decorators, which import torch's compiler (1 to 3 s of CPU)."""
 
 
 for _name in ("step", "add_param_group", "zero_grad", "state_dict", "load_state_dict"):
@@ -19,12 +19,12 @@ for _name in ("step", "add_param_group", "zero_grad", "state_dict", "load_state_
 
 
 def adam(rate: float, *networks: nn.Module | None) -> Adam:
-    """An optimiser for all weights of these networks."""
+    """Return an optimiser for all weights of these networks."""
     return Adam([weight for each in networks if each is not None for weight in each.parameters()], lr=rate, eps=1e-5)
 
 
 def descend(optimizer: Optimizer, *losses: Tensor) -> None:
-    """One step down the sum of these losses."""
+    """Take one gradient step down the sum of these losses."""
     optimizer.zero_grad()
     for loss in losses:
         loss.backward()  # type: ignore[no-untyped-call]
@@ -33,6 +33,6 @@ def descend(optimizer: Optimizer, *losses: Tensor) -> None:
 
 @torch.no_grad()
 def follow(average: Iterable[Tensor], learning: nn.Module, keep: float) -> None:
-    """Move the average of weights towards the weights that learn. It keeps a share ``keep`` of itself."""
+    """Move the averaged weights towards the learning weights. The average keeps the share ``keep`` of itself."""
     for mean, learns in zip(average, learning.parameters(), strict=True):
         mean.lerp_(learns, 1.0 - keep)

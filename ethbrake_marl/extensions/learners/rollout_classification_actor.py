@@ -1,4 +1,4 @@
-"""An actor that scores actions, and the memory of what actions cost."""
+"""Actor that scores actions, with a memory of what actions cost."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ethbrake_marl.training.networks import ACTIVATIONS, copy_of, tensors_of_lay
 
 
 class _TorchActor(Actor):
-    """``Actor`` with torch's products: three times as fast, with other last bits."""
+    """``Actor`` with torch's matrix products: three times as fast, with different last bits."""
 
     @torch.no_grad()
     def _forward(self, layers: Layers, x: Float32s) -> Float32s:
@@ -40,17 +40,17 @@ class _TorchActor(Actor):
 
 
 class ChoosingActor(Deterministic):
-    """An actor that scores actions, and a memory of what actions cost.
+    """Actor that scores actions, with a memory of what actions cost.
 
-    The weights ``learning`` learn; their running ``average`` drives. The memory holds the last decisions at which
-    actions were tried, and how much more than the best one each action costs.
+    ``learning`` are the weights that learn; their running ``average`` drives. The memory holds the last decisions at
+    which actions were tried, with the extra cost of each tried action over the best one.
     """
 
-    seen: Tensor  # [M, F]
-    tried: Tensor  # [M, C] numbers of actions; the first one was taken
-    more: Tensor  # [M, C]
-    known: Tensor  # [1] decisions so far; the newest take the places of the oldest
-    usual: Tensor  # [members] average cost of the best action tried in each scenario of a mixture; 0: not known
+    seen: Tensor  # [M, F] observations in memory
+    tried: Tensor  # [M, C] numbers of the tried actions; the first one was taken
+    more: Tensor  # [M, C] extra cost of each tried action
+    known: Tensor  # [1] number of decisions added so far; new ones replace the oldest
+    usual: Tensor  # [members] mean cost of the best tried action in each scenario of a mixture; 0: not measured yet
 
     def __init__(
         self,
@@ -63,10 +63,10 @@ class ChoosingActor(Deterministic):
     ) -> None:
         super().__init__(observation_space, action_space)
         inputs, shape, room = flatdim(observation_space), recipe.network, (recipe.memory, 1 + recipe.others)
-        self.first, scores = len(among), len(among) + shape.choices  # the number of the first action behind policies
+        self.first, scores = len(among), len(among) + shape.choices  # numbers below ``first`` stand for policies
         layers = create_mlp(inputs, scores, list(shape.policy), ACTIVATIONS[shape.activation])
-        nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]  # until it learns, it takes the first: a policy's
-        nn.init.zeros_(layers[-1].bias)  # type: ignore[arg-type]  # action, or full braking
+        nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]  # until it learns, all scores are equal and it
+        nn.init.zeros_(layers[-1].bias)  # type: ignore[arg-type]  # takes number 0: a policy, or full braking
         self.average = nn.Sequential(*layers)
         self.learning = copy.deepcopy(self.average)
         self.optimizer = adam(rate(1.0), self.learning)
@@ -85,7 +85,7 @@ class ChoosingActor(Deterministic):
 
     @torch.no_grad()
     def choose(self, observation: Float32s) -> Ints:
-        """Numbers of the actions to take [rows] for observations [rows, F]."""
+        """Return the numbers of the actions to take [rows] for observations [rows, F]."""
         chosen: Ints = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen
 
@@ -94,7 +94,7 @@ class ChoosingActor(Deterministic):
         return found
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Actions [rows, 1] of the average."""
+        """Return the actions [rows, 1] of the averaged weights."""
         return torch.from_numpy(self.act(observation.numpy()))[:, None]
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
@@ -109,7 +109,7 @@ class ChoosingActor(Deterministic):
         self.known += len(seen)
 
     def draw(self, batches: int, count: int, focus: float) -> Iterator[tuple[Tensor, Tensor]]:
-        """Draw remembered decisions for each step, and how much each counts; ``focus`` as in ``draw_rows``."""
+        """Yield remembered decisions for each gradient step, with their importance; ``focus`` as in ``draw_rows``."""
         known = min(int(self.known), len(self.seen))
         if focus == 0.0 or batches == 0:
             for _ in range(batches):
@@ -121,10 +121,10 @@ class ChoosingActor(Deterministic):
             yield torch.from_numpy(rows[part]), torch.from_numpy(importance[part])
 
     def loss(self, some: Tensor, importance: Tensor, guide: float) -> Tensor:
-        """Expected cost, in some remembered decisions, of choosing at random by a softmax of the scores.
+        """Return the expected cost at remembered decisions if actions are drawn by a softmax of the scores.
 
-        It has no slope if the chances are nearly 0 or 1. So ``guide`` times a convex loss is added, which lowers the
-        score of every action but the best, more for an action that costs more.
+        Its gradient vanishes if the probabilities are nearly 0 or 1. So ``guide`` times a convex loss is added, which
+        lowers the score of every action except the best, and more for a costlier action.
         """
         more = self.more[some]
         scores = self.learning(self.seen[some]).gather(1, self.tried[some])

@@ -22,14 +22,14 @@ from ethbrake_marl.training.recipes import BATCH_SIZE, NETWORK
 
 
 class ChoosingShape(Shape):
-    """Hidden layers of an actor that scores a number of actions, evenly from -1 to 1."""
+    """Hidden layers of an actor that scores a number of actions, spread evenly from -1 to 1."""
 
     policy: Layers = Field(description=ACTOR_LAYERS)
     activation: Activation = "relu"
     choices: int = Field(ge=2, le=4096, description="how many actions, evenly from -1 to 1, the network scores")
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """The actor, which takes the action with the highest score."""
+        """Return the spec of the actor, which takes the action with the highest score."""
         return super().spec(observation_size, output="choice", choices=self.choices, **more)
 
 
@@ -37,11 +37,11 @@ PolicyName = Annotated[str, Field(pattern=r"^[a-z]+@.+$", max_length=4096)]
 
 
 class OptionsRecipe(TrainingRecipe):
-    """Try ``tried`` of the ``n_envs x n_steps`` decisions of a round with several actions each; learn to choose.
+    """Recipe that tries several actions at ``tried`` of the ``n_envs x n_steps`` decisions of a round.
 
-    The policy chooses between ``network.choices`` actions, evenly from -1 to 1, and the policies ``among``. At each
-    decision it tries the action that it takes, one below and one above it in each of the distances ``near``, the
-    actions ``fixed``, and ``drawn`` ones: policies, or actions if there are no policies.
+    The policy learns to choose between ``network.choices`` actions, spread evenly from -1 to 1, and the policies
+    ``among``. At each such decision it tries: the action that it takes; one below and one above it for each distance of
+    ``near``; the actions ``fixed``; and ``drawn`` random ones (policies if there are any, else actions).
     """
 
     most_decisions = 2**22
@@ -116,20 +116,20 @@ class OptionsRecipe(TrainingRecipe):
 
     @property
     def others(self) -> int:
-        """Number of actions tried beside the one that the policy takes."""
+        """Number of actions that are tried in addition to the action that the policy takes."""
         return 2 * len(self.near) + len(self.fixed) + self.drawn
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """The actor, with the policies that it may choose."""
+        """Return the spec of the actor, with the policies that it may choose."""
         several = {"observation_size": observation_size, "value_hidden": ()}
         among = tuple(each.manifest.network.model_copy(update=several) for each in self.policies)
         return self.network.spec(observation_size, among=among)
 
     @cached_property
     def policies(self) -> tuple[Policy, ...]:
-        """The policies ``among``, read once; raises ``InvalidInput`` naming one that cannot be used.
+        """Policies of ``among``, read once. A policy that itself chooses among policies is replaced by those.
 
-        A policy that itself chooses among policies is replaced by those.
+        Raises ``InvalidInput`` with the name of a policy that cannot be used.
         """
         found: list[Policy] = []
         for name in self.among:

@@ -1,7 +1,8 @@
-"""A scout learns which decisions matter, so that most branches are spent on those.
+"""A scout: a small network that learns which decisions matter, so that most branches are spent on those.
 
-A branch of a decision that changes nothing costs as much as any other, and its gradient is 0. So decisions are drawn
-with unequal chances. A decision that was more likely to be drawn counts less: the average is the same.
+A branch costs the same at every decision, but its gradient is 0 where the action changes nothing. So decisions are
+drawn with unequal probabilities. Decisions that are drawn more often get a smaller weight, so the expectation is the
+same (importance sampling).
 """
 
 from __future__ import annotations
@@ -15,42 +16,46 @@ from torch import Tensor, nn
 from ethbrake_marl.physics.state import Floats, Ints
 from ethbrake_marl.policies.network_spec import Float32s
 
-WIDTH = 64  # of its hidden layer
+WIDTH = 64  # units of the hidden layer
 
 
 class Scout(nn.Module):
-    """A small network that expects, from an observation, how large the measured difference will be."""
+    """Small network that predicts, from an observation, the size of the measured difference."""
 
     def __init__(self, inputs: int) -> None:
         super().__init__()
         self.layers = nn.Sequential(nn.Linear(inputs, WIDTH), nn.ReLU(), nn.Linear(WIDTH, 1))
         last = self.layers[-1]
         assert isinstance(last, nn.Linear)
-        nn.init.zeros_(last.weight)  # until it learns, it expects the same everywhere
+        nn.init.zeros_(last.weight)  # until it learns, its prediction is the same everywhere
         nn.init.zeros_(last.bias)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Logarithm of the expected size [rows] for observations [rows, F], at most 20."""
+        """Return the logarithm of the expected size [rows] for observations [rows, F], at most 20."""
         found: Tensor = self.layers(observation)[:, 0].clamp(max=20.0)
         return found
 
     def expect(self, observation: Float32s) -> Floats:
-        """Expected size [rows], above 0."""
+        """Return the expected size [rows], above 0."""
         with torch.no_grad():
             found: Floats = np.exp(self(torch.from_numpy(observation)).numpy().astype(np.float64))
         return found
 
     def loss(self, observation: Tensor, size: Tensor, importance: Tensor) -> Tensor:
-        """Loss that is smallest at the mean of the sizes [rows]. Large sizes weigh less than in a squared error."""
+        """Return a loss with its minimum at the mean of the sizes [rows].
+
+        Large sizes weigh less than in a squared error.
+        """
         logarithm = self(observation)
         found: Tensor = (importance * (logarithm.exp() - size * logarithm)).mean()
         return found
 
 
 def draw_rows(expected: Floats, count: int, focus: float) -> tuple[Ints, Float32s]:
-    """Draw ``count`` rows with replacement: a share ``focus`` in proportion to ``expected`` [n] > 0, the rest evenly.
+    """Draw ``count`` rows with replacement.
 
-    Returns the rows, and how much each counts: 1 / (chance of the row x number of rows), which is 1 on average.
+    The share ``focus`` is drawn in proportion to ``expected`` [n] > 0, the rest uniformly. Returns the rows and their
+    importance, 1 / (probability of the row x number of rows), which is 1 on average.
     """
     n = len(expected)
     chance = (1.0 - focus) / n + focus * (expected / expected.sum())
@@ -61,7 +66,7 @@ def draw_rows(expected: Floats, count: int, focus: float) -> tuple[Ints, Float32
 def choose_rows(
     observed: Float32s, rows: Ints, count: int, focus: float, expect: Callable[[Float32s], Floats] | None
 ) -> tuple[Ints, Float32s]:
-    """Draw ``count`` of ``rows``: evenly and each once, or mostly those of which ``expect`` expects much."""
+    """Draw ``count`` of ``rows``: uniformly without replacement, or by ``draw_rows`` if ``focus`` is above 0."""
     if focus == 0.0 or expect is None or len(rows) == 0:
         some = rows[torch.randperm(len(rows))[:count].numpy()]
         return some, np.ones(len(some), np.float32)

@@ -1,4 +1,4 @@
-"""Take over the weights of a trained policy that observes less."""
+"""Take over the weights of a trained policy that observes fewer features."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from ethbrake_marl.training.training import Training
 
 
 def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]]:
-    """The actor's tensors of ``policy``, with weights of 0 for features that only the training observes.
+    """Return the actor's tensors of ``policy``, with weights of 0 for features that it does not observe.
 
-    Raises ``InvalidInput`` if the training does not observe all that the policy does, or has another network.
+    Raises ``InvalidInput`` if the training lacks a feature of the policy, or has another network.
     """
     recipe, wanted = training.recipe, training.recipe.network_spec(training.observation.size)
     found = policy.manifest.network
@@ -29,9 +29,9 @@ def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]
 
 
 def padded(policy: Policy, training: Training, key: str) -> dict[str, NDArray[np.float32]]:
-    """All tensors of ``policy`` but the critic's, with weights of 0 for features that only the training observes.
+    """Return all tensors of ``policy`` except the critic's, with weights of 0 for features that it does not observe.
 
-    Raises ``InvalidInput``, naming the recipe's ``key``, if the training does not observe all that the policy does.
+    Raises ``InvalidInput``, naming the recipe's ``key``, if the training lacks a feature of the policy.
     """
     names = [feature.name for feature in training.observation.features]
     known = policy.manifest.observation.features

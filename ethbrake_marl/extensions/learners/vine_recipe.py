@@ -26,7 +26,7 @@ _RIGHT_START = "must be ppo@, counterfactual@ or universal@ and a policy, for in
 
 
 class ActorShape(Shape):
-    """Hidden layers of the actor, where there is no critic."""
+    """Hidden layers of an actor without a critic."""
 
     policy: Layers = Field(description=ACTOR_LAYERS)
     activation: Activation = "relu"
@@ -36,10 +36,10 @@ class ActorShape(Shape):
 
 
 class CounterfactualRecipe(TrainingRecipe):
-    """Try ``counterfactuals`` of the ``n_envs x n_steps`` decisions of a round in two ways; learn from the differences.
+    """Recipe that tries ``counterfactuals`` of the ``n_envs x n_steps`` decisions of a round in two ways.
 
-    ``start`` names a trained policy to go on from; without ``start`` the weights are random. ``ppo@shipped`` is the
-    policy that ships for the scenario. Where none ships, the weights are random.
+    The policy learns from the differences. ``start`` names a trained policy to continue from; without it the weights
+    are random. ``ppo@shipped`` is the policy that ships for the scenario; if none ships, the weights are random.
     """
 
     most_decisions = 2**22
@@ -96,13 +96,13 @@ class CounterfactualRecipe(TrainingRecipe):
         return self
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """The actor alone, or several and a gate."""
+        """Return the spec of the actor, or of several actors and a gate."""
         modes = self.modes
         several = {} if modes is None else {"networks": modes.networks, "gate_hidden": modes.gate}
         return self.network.spec(observation_size, **several)
 
     def policy_to_start_from(self, scenario: Scenario) -> str | None:
-        """The policy whose weights are taken over, for instance ``ppo@shipped/ppo``; None: random weights."""
+        """Return the policy to start from, for instance ``ppo@shipped/ppo``; None: random weights."""
         kind, _, path = (self.start or "").partition("@")
         if path != SHIPPED:
             return self.start
@@ -111,12 +111,12 @@ class CounterfactualRecipe(TrainingRecipe):
         return None
 
     def begins(self, scenario: Scenario) -> str:
-        """The policy to start from, or random weights, and why."""
+        """Return a phrase on the initial weights: the policy to start from, or random weights and the reason."""
         why = "" if self.start is None else f", as {self.start} has none for scenario {scenario.name!r}"
         return self.policy_to_start_from(scenario) or f"random weights{why}"
 
     def check_learners(self, learners: int) -> None:
-        """Several networks are for one learner: a mode of several would have to be chosen by all of them at once."""
+        """Raise ``InvalidInput`` for several networks with several learners; the gate serves one learner only."""
         if self.modes is not None and learners != 1:
             raise InvalidInput(f"recipe {self.name!r}: modes: are for one learner, not for {learners}; leave modes out")
 

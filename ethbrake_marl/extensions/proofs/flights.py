@@ -1,7 +1,8 @@
-"""Compiled: how much faster than the common speed of two touching vehicles one of them can be, and what that costs.
+"""Bounds on how much faster than their common speed one of two vehicles in contact can be, and what that costs.
 
-``share`` is the partner's share of both masses; ``press`` the acceleration with which they close under the best
-command (m/s2), ``reach`` how much of it a command can hold back. docs/avoidability.md has the proofs.
+A *flight* is a time in which the two are apart. ``share`` is the partner's share of both masses. ``press`` is the
+acceleration with which they close under the best command (m/s2); ``reach`` is how much of it a command can hold back.
+``opening`` is the speed with which they separate. docs/avoidability.md has the proofs.
 """
 
 from __future__ import annotations
@@ -13,10 +14,11 @@ from ethbrake_marl.physics.jit import compiled
 
 @compiled
 def flight_lead(share: float, press: float, reach: float, opening: float, flight: float) -> float:
-    """How far ahead of the common speed a flight of this length can bring the controlled vehicle, less what it costs.
+    """Return the speed lead that a flight of this length gives the controlled vehicle, less its cost. [m/s]
 
-    ``share (press L - o) - G``, where G is the least loss of command, at most ``reach`` a second, that keeps the two
-    apart for L: ``G L - G^2 / 2 reach >= press L^2 / 2 - o L``. -inf where nothing keeps them apart. [m/s]
+    A flight is a time in which the two vehicles are apart. For length L and opening speed o the lead over the common
+    speed is ``share (press L - o) - G``. G is the least loss of command, at most ``reach`` per second, that keeps the
+    two apart for L: ``G L - G^2 / 2 reach >= press L^2 / 2 - o L``. Returns -inf if nothing keeps them apart.
     """
     relative = share * (press * flight - opening)
     if press * flight <= 2.0 * opening:
@@ -31,7 +33,7 @@ def flight_lead(share: float, press: float, reach: float, opening: float, flight
 
 @compiled
 def best_flight(share: float, press: float, reach: float, opening: float) -> float:
-    """The length of the flight of the largest ``flight_lead``; inf if it rises for ever."""
+    """Return the length of the flight with the largest ``flight_lead``; infinite if the lead keeps rising."""
     if press <= 0.0:
         return math.inf
     if share <= 0.5:
@@ -50,9 +52,9 @@ def best_flight(share: float, press: float, reach: float, opening: float) -> flo
 def lead(
     share: float, press: float, reach: float, opening: float, shortest: float, longest: float, lost: float
 ) -> float:
-    """Largest ``flight_lead`` of lengths from ``shortest`` to ``longest``, of which ``lost`` is lost in any case.
+    """Return the largest ``flight_lead`` of lengths from ``shortest`` to ``longest``, if ``lost`` is lost in any case.
 
-    Of all openings up to ``opening``: where flights are cut short, a smaller one may lead further.
+    The maximum is over all openings up to ``opening``: a smaller one may lead further if flights are cut short.
     """
     if press > 0.0:
         opening = min(opening, 0.5 * press * longest)
@@ -69,7 +71,10 @@ def lead(
 
 @compiled
 def decays(share: float, press: float, reach: float, bounce: float) -> bool:
-    """Whether no loss of command pays that makes a later bounce larger; ``reach`` then bounds what flights gain."""
+    """Return whether a loss of command to make a later bounce larger never pays.
+
+    If so, ``reach`` bounds the gain of flights.
+    """
     if share <= 0.5:
         return True
     if reach == math.inf or press <= 0.0:
@@ -84,10 +89,10 @@ def largest_lead(
     share: float, press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float,
     since: float, until: float,
 ) -> float:  # fmt: skip
-    """How much faster than the common speed, without loss, it can be between ``since`` and ``until``. [m/s]
+    """Return the largest lead over the common speed (without loss) between ``since`` and ``until``. [m/s]
 
-    The last flight before the rear meeting began with the first impact, after the window from ``late`` to ``end`` in
-    which ``lost`` is lost, or within it. ``reach`` is inf where ``press`` is not constant.
+    ``lost`` is lost in the window from ``late`` to ``end``. The last flight before the meeting with the rear vehicle
+    began with the first impact, within the window, or after it. ``reach`` is infinite if ``press`` is not constant.
     """
     if since < end:
         lost, end = 0.0, late
@@ -111,10 +116,11 @@ def largest_lead(
 def widest_flight(
     share: float, slack: float, press: float, drive: float, bounce: float, closing: float, back: float, time: float
 ) -> float:
-    """Most of ``sqrt(p^2 + 2 press s)`` in every flight from a partner that brakes harder by ``slack``; inf if unknown.
+    """Return the largest ``sqrt(p^2 + 2 press s)`` in any flight from a partner that brakes harder by ``slack``. [m/s]
 
-    p is the speed with which the two part, s their gap. The first impact had ``closing`` and left the vehicle with
-    speed ``-back``. All within ``time``; ``drive`` is the most that a command accelerates. [m/s]
+    p is the speed with which the two separate, s their gap. The first impact had closing speed ``closing`` and left the
+    vehicle with speed ``-back``. Covers flights within ``time``; ``drive`` is the largest acceleration by a command.
+    Returns infinity if no bound is known.
     """
     if not slack > 0.0 or not bounce * bounce * press < slack:
         return math.inf

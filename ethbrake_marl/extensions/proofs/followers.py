@@ -1,11 +1,12 @@
-"""Compiled: the harm at the other pair that must follow a first meeting, whatever the controlled vehicle does then.
+"""Harm at the other pair that must follow a first meeting, whatever the controlled vehicle does then.
 
-A first meeting at ``time`` with ``closing`` leaves a state that is known exactly. From it on, the centre of mass of
-the two moves on a path that no command improves but the extreme one, and the controlled vehicle is faster (slower)
-than the centre only while it comes back to its partner. ``lead`` bounds that. docs/avoidability.md has the proofs.
+A first meeting at a given time with closing speed ``closing`` leaves an exactly known state. From then on, no command
+beats the extreme one for the path of the two vehicles' centre of mass, and the controlled vehicle is faster (slower)
+than the centre only until it returns to its partner; ``flights.largest_lead`` bounds by how much. docs/avoidability.md
+has the proofs.
 
-A cell of meetings lies between ``early`` and ``late``; its state is taken at ``early``. From ``late`` to ``end`` the
-command of the decision before is still in force, which lacks at least ``lack`` of the extreme one (m/s2).
+The meetings of a cell lie between ``early`` and ``late``; the state is taken at ``early``. From ``late`` to ``end`` the
+command of the earlier decision is still in force; it falls short of the extreme command by at least ``lack`` (m/s2).
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ from ethbrake_marl.extensions.proofs.plans import fill_braking, fill_drive_then_
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats
 
-STRUCK_M = 1e-6  # nearer than this a leader counts as touching the obstacle
+STRUCK_M = 1e-6  # below this distance a leader counts as in contact with the obstacle
 
-HELD_M = 1e-6  # more room than rounding can make of the gap to the leader
+HELD_M = 1e-6  # allowance for rounding in the gap to the leader
 
-LEADS = (0.02, 0.05, 0.1, 0.2, 0.4)  # s before the latest meeting at which the time is divided, to bound both parts
+LEADS = (0.02, 0.05, 0.1, 0.2, 0.4)  # s before the latest meeting; the time is divided there to bound both parts
 
 
 @compiled
@@ -30,7 +31,11 @@ def least_of_line(
     start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, since: float,
     until: float,
 ) -> float:  # fmt: skip
-    """Least value of ``start + slope t + bend (t - turn)+ + other_bend (t - other_turn)+`` from since to until."""
+    """Return the least value of a piecewise linear function from ``since`` to ``until``.
+
+    The function is ``start + slope t + bend (t - turn)+ + other_bend (t - other_turn)+``, where ()+ is the positive
+    part.
+    """
     least = math.inf
     for time in (since, until, min(max(turn, since), until), min(max(other_turn, since), until)):
         value = start + slope * time + bend * max(time - turn, 0.0) + other_bend * max(time - other_turn, 0.0)
@@ -43,9 +48,9 @@ def least_closing(
     start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, share: float,
     press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float, until: float,
 ) -> float:  # fmt: skip
-    """Least closing speed of a second meeting at most ``until``: that of the common speed, less the lead.
+    """Return the least closing speed of a second meeting until ``until``: that of the common speed, less the lead.
 
-    The time is divided at one of a few moments: what was lost in the window counts only after it.
+    The time is divided at one of a few moments, because a loss in the window counts only after it.
     """
     best = least_of_line(start, slope, turn, bend, other_turn, other_bend, 0.0, until)
     best -= largest_lead(share, press, reach, bounce, opening, lost, late, end, 0.0, until)
@@ -65,9 +70,10 @@ def least_closing(
 def pushed_by_leader(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Least closing speed at the rear, from the centre of mass of leader and controlled vehicle; 0: not proven.
+    """Return the least closing speed at the rear pair, from the centre of mass of leader and controlled vehicle.
 
-    A leader that stands keeps its place, so a later meeting is the same one later: only what holds for all counts.
+    Returns 0 if nothing is proven. A standing leader stays in place, so a later first contact with it differs only in
+    time; the window with the loss is then not used.
     """
     share, rest, press = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.U_F] + at[LINE.A_L]
     v_l, way_l = leader(at, early)
@@ -87,7 +93,7 @@ def pushed_by_leader(
         return 0.0
     reach = (
         at[LINE.U_F] + at[LINE.A_F] if until * at[LINE.A_L] <= v_l else math.inf
-    )  # the leader moves, however soft the impact
+    )  # finite if the leader still moves until then, however soft the impact
     if v_l <= 0.0:
         slowest = max(v_r - at[LINE.A_R] * max(until - onset, 0.0), 0.0)
         least = least_of_line(slowest - speed, -push, 0.0, 0.0, stand, -share * at[LINE.A_L], 0.0, until)
@@ -100,7 +106,10 @@ def pushed_by_leader(
 
 @compiled(apart=True)
 def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: Floats, other: Floats) -> float:
-    """Least closing speed at the rear of one that cannot fall far behind a leader of harder brakes; 0: not proven."""
+    """Return the least closing speed at the rear pair behind a leader that brakes harder.
+
+    The controlled vehicle then stays near the leader. Returns 0 if nothing is proven.
+    """
     share, rest, bounce = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.RESTITUTION]
     v_l, way_l = leader(at, early)
     v_r, way_r = follower(at, early)
@@ -139,9 +148,10 @@ def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: 
 def after_front(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Least squared closing speed at the rear after the leader was met from ``early`` on with at most ``closing``.
+    """Return the least squared closing speed at the rear pair after a first contact with the leader.
 
-    What is known of the centre of mass does not hold where an obstacle may throw both back.
+    The contact closes with at most ``closing``. The arguments from the centre of mass do not hold if an obstacle may
+    throw both vehicles back; they are then left out.
     """
     share, rest = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE]
     v_l, way_l = leader(at, early)
@@ -166,9 +176,10 @@ def after_front(
 
 @compiled
 def obstacle_harm(at: Floats, late: float, closing: float) -> float:
-    """Least squared speed at which the leader, met by ``late``, meets the obstacle ahead: only its own brakes slow it.
+    """Return the least squared speed at which the leader, met by ``late``, hits the obstacle.
 
-    None is certain where it stands at the obstacle already: all three are one cluster then.
+    Only the leader's own brakes slow it. Returns 0 if it already stands at the obstacle, because all three are then one
+    cluster.
     """
     if not STRUCK_M < at[LINE.OBSTACLE] - at[LINE.V_L] * at[LINE.V_L] / (2.0 * at[LINE.A_L]) < math.inf:
         return 0.0
@@ -185,9 +196,10 @@ def obstacle_harm(at: Floats, late: float, closing: float) -> float:
 def braking_after(
     gap: float, least_gap: float, v_l: float, a_l: float, v_f: float, a_f: float, plan: Floats, other: Floats
 ) -> float:
-    """Least squared closing speed with the leader of one that brakes at most with ``a_f``; 0 if none is certain.
+    """Return the least squared closing speed with the leader of a vehicle that brakes with at most ``a_f``.
 
-    Its gap is at most ``gap``, and at least ``least_gap`` where it matters: behind a leader that brakes harder.
+    Returns 0 if none is certain. The gap is at most ``gap``, and at least ``least_gap``, which matters behind a leader
+    that brakes harder.
     """
     fill_braking(plan, 0.0, a_l)
     fill_braking(other, 0.0, a_f)
@@ -203,7 +215,10 @@ def pushed_by_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, gap: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Least closing speed at the front, from the centre of mass of both other vehicles; for ``a_f >= a_r``."""
+    """Return the least closing speed at the front pair after the controlled vehicle met the rear one.
+
+    The bound follows from the centre of mass of these two vehicles. Needs ``a_f >= a_r``.
+    """
     share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
     v_l = leader(at, early)[0]
     bounce = at[LINE.RESTITUTION]
@@ -226,7 +241,10 @@ def pushed_by_rear(
 
 @compiled(apart=True)
 def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: Floats, other: Floats) -> float:
-    """Least closing speed at the front of one that stays ahead of both; for ``a_f >= a_r``. 0 where it may rise."""
+    """Return the least closing speed at the front pair after the controlled vehicle met the rear one.
+
+    The controlled vehicle stays ahead of the rear one. Needs ``a_f >= a_r``. Returns 0 if the closing speed may rise.
+    """
     share, v_l = at[LINE.REAR_SHARE], leader(at, early)[0]
     pooled = (1.0 - share) * at[LINE.A_F] + share * at[LINE.A_R]
     mean = 0.5 * (at[LINE.A_F] + pooled)

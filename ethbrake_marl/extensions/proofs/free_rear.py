@@ -1,8 +1,9 @@
-"""Compiled: the least harm over all first meetings with a rear vehicle that may do as it likes.
+"""Least harm over all first meetings with a rear vehicle that may act freely.
 
-It is never behind, nor slower than, its full braking, but it may come earlier. So a meeting is a time, how much
-*further* it has come than by full braking, and a closing speed. Cells of these are halved until their bounds come
-close to the least meeting tried. docs/avoidability.md, "Teams", has the proof.
+The rear vehicle is never behind, nor slower than, its own full braking, but it may arrive earlier. So a meeting is
+described by its time, how much *further* the rear vehicle has come than by full braking, and the closing speed. Cells
+of these are halved until their bounds are close to the best meeting tried. docs/avoidability.md, "Teams", has the
+proof.
 """
 
 from __future__ import annotations
@@ -28,18 +29,21 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.motion import solo_motion
 from ethbrake_marl.physics.state import Floats
 
-SINCE, POWER, FLOOR, BEST, SEARCH = range(5)  # of a search: see gained; the front pair's own bound; the least meeting
+# Columns of a search: SINCE and POWER are arguments of ``gained``; FLOOR is the front pair's own bound; BEST is the
+# least harm of a meeting so far.
+SINCE, POWER, FLOOR, BEST, SEARCH = range(5)
 
-SEARCHED = 400  # divisions after which the least meeting stays as loosely bounded as it is
+SEARCHED = 400  # largest number of divisions
 
-_SHORT_S = 1e-3
+_SHORT_S = 1e-3  # least time to divide by
 
 
 @compiled
 def gained(near: float, time: float, since: float, power: float) -> float:
-    """How much faster than by full braking the rear vehicle is, at least, if it has come ``near`` further by ``time``.
+    """Return by how much, at least, the rear vehicle is faster than by full braking, if it is ``near`` further.
 
-    It holds back from ``since`` on, at most ``power`` a second (infinite where others push it).
+    ``time`` is the time of the comparison. The rear vehicle holds back its brakes from ``since`` on, by at most
+    ``power`` (m/s2; infinite if others push it).
     """
     if near <= 0.0 or time <= since:
         return 0.0
@@ -51,7 +55,10 @@ def gained(near: float, time: float, since: float, power: float) -> float:
 
 @compiled
 def behind_full_braking(at: Floats, early: float, late: float) -> float:
-    """Gap behind, at least, where both brake fully: the controlled one until ``early``, the rear one until ``late``."""
+    """Return the least gap to the rear vehicle under full braking.
+
+    The controlled vehicle brakes until ``early``, the rear vehicle until ``late``.
+    """
     return float(
         at[LINE.GAP_R] + solo_motion(at[LINE.V_F], -at[LINE.A_F], 0.0, math.inf, early)[1] - follower(at, late)[1]
     )
@@ -59,9 +66,12 @@ def behind_full_braking(at: Floats, early: float, late: float) -> float:
 
 @compiled
 def soft_behind(at: Floats, early: float, late: float, near: float, far: float, since: float, power: float) -> float:
-    """Least closing speed of the meetings behind in a cell."""
+    """Return the least closing speed of the first contacts with the rear vehicle in a cell.
+
+    A cell is a range of times and of distances by which the rear vehicle has come further than by full braking.
+    """
     faster = gained(near, late, since, power)
-    # of one that comes as much further, by the fastest way to be there: brake, then drive; negative where it is faster
+    # the fastest way of the controlled vehicle to that place is to brake, then to drive
     brake = braking_to_rear(at, late, far + faster * (late - early))
     closing = follower(at, late)[0] - braked_then_driven(at, brake, late)[1]
     return max(closing + faster, 0.0)
@@ -72,10 +82,12 @@ def after_behind(
     at: Floats, early: float, late: float, near: float, far: float, hard: float, faster: float, moved: Floats,
     plan: Floats, other: Floats,
 ) -> float:  # fmt: skip
-    """Least squared closing speed at the front after the meetings behind of a cell, of at most ``hard``.
+    """Return the least squared closing speed at the front pair after the rear vehicle was met first.
 
-    The state is one at ``early`` that is, at every later time of the cell, no further and no faster than that of any
-    meeting there: ``near`` to ``far`` further than by full braking, and ``faster``.
+    The first contacts are those of a cell: at times from ``early`` to ``late``, with the rear vehicle ``near`` to
+    ``far`` further, and faster by ``faster``, than by full braking, and with closing speeds of at most ``hard``. The
+    bound starts from a state at ``early`` that is at every later time no further and no faster than after any of these
+    contacts.
     """
     further = near - faster * (late - early)
     v_l, way_l = leader(at, early)
@@ -104,7 +116,10 @@ def put_behind(
     at: Floats, early: float, late: float, near: float, far: float, soft: float, hard: float, search: Floats,
     count: int, moved: Floats, plan: Floats, other: Floats, heap: Floats,
 ) -> int:  # fmt: skip
-    """Put a cell of meetings behind on the heap if it may hold less harm than the best; the new number of cells."""
+    """Add a cell of first contacts with the rear vehicle to the heap if it may beat the best.
+
+    Returns the number of cells.
+    """
     since, power, floor = search[SINCE], search[POWER], search[FLOOR]
     room = at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, late)[1] - follower(at, early)[1]
     span = max(late - since, 0.0)
@@ -127,7 +142,10 @@ def put_behind(
 def try_behind(
     at: Floats, time: float, near: float, far: float, search: Floats, moved: Floats, plan: Floats, other: Floats
 ) -> None:
-    """Lower the best to the bound of the gentlest meeting behind at ``time`` that is about ``near`` further."""
+    """Lower the best to the harm of the gentlest first contact with the rear vehicle at ``time``.
+
+    The rear vehicle is then about ``near`` further than by full braking.
+    """
     near = max(near, behind_full_braking(at, time, time))
     if near > far or near > at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, time)[1] - follower(at, time)[1]:
         return
@@ -141,7 +159,10 @@ def try_behind(
 def divide_behind(
     at: Floats, search: Floats, count: int, moved: Floats, plan: Floats, other: Floats, heap: Floats
 ) -> int:
-    """Replace the first cell of the heap by its halves; the new number of cells."""
+    """Replace the first cell of the heap by its halves; return the new number of cells.
+
+    A cell is a range of times, distances and closing speeds of first contacts with the rear vehicle.
+    """
     early, late, near, far = heap[0, EARLY], heap[0, LATE], heap[0, NEAR], heap[0, FAR]
     soft, hard = heap[0, SOFT], min(heap[0, HARD], math.sqrt(search[BEST]))
     count = drop_first(heap, count)
@@ -169,7 +190,10 @@ def divide_behind(
 def meetings_behind(
     at: Floats, last: float, search: Floats, moved: Floats, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Lower bound of the harm, if below the best, of all meetings behind that come first, until ``last``."""
+    """Return a lower bound on the harm of all first contacts with the rear vehicle until ``last``.
+
+    The result is at most the least harm found before (``search[BEST]``).
+    """
     since, hard, count = min(search[SINCE], last), math.sqrt(search[BEST]), 0
     if since > 0.0:
         count = put_behind(at, 0.0, since, 0.0, 0.0, 0.0, hard, search, count, moved, plan, other, heap)

@@ -1,4 +1,8 @@
-"""``lower_bound``: a proven lower bound on the harm of every world, whatever the controlled vehicle does."""
+"""``lower_bound``: a proven lower bound on the harm of every world, whatever the controlled vehicle does.
+
+A *meeting* is a first contact of the controlled vehicle with a neighbour. In the compiled functions ``at`` is one world
+(columns of ``line.LINE``), and ``plan``, ``other`` and ``heap`` are working memory.
+"""
 
 from __future__ import annotations
 
@@ -50,14 +54,17 @@ from ethbrake_marl.physics.jit import by_parts, compiled
 from ethbrake_marl.physics.motion import solo_motion
 from ethbrake_marl.physics.state import Bools, Floats, Worlds
 
-_GRAZE_S = 1e-3  # more than rounding can move a graze
+_GRAZE_S = 1e-3  # allowance for rounding in the time of a contact without closing speed
 
-_PARTS = 8  # into which the times of soft meetings are divided
+_PARTS = 8  # number of parts into which the times of soft meetings are divided
 
 
 @compiled
 def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
-    """Least squared closing speed at the rear pair's first contact, that under full drive; and its latest time."""
+    """Return the least squared closing speed at the rear pair's first contact, and its latest time.
+
+    Both belong to full drive of the controlled vehicle.
+    """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], math.inf, at[LINE.A_F])
     fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
     _, time, squared = walk(
@@ -68,7 +75,7 @@ def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
 
 @compiled(apart=True)
 def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
-    """Whether the other neighbour has not come before the gentlest meeting at ``time``."""
+    """Return whether the other neighbour has not arrived before the gentlest first contact at ``time``."""
     if kind == FRONT_FIRST:
         return stays_ahead(at, gentlest_front(at, time)[1], time, plan, other)
     return stays_behind(at, braking_to_rear(at, time, 0.0), time, plan, other)
@@ -76,7 +83,7 @@ def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) ->
 
 @compiled(apart=True)
 def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, other: Floats) -> float:
-    """The latest time, at most ``last``, of a meeting with one neighbour before which the other one has not come.
+    """Return the latest time, at most ``last``, of a first contact with one neighbour before the other one has arrived.
 
     At ``first`` there is room. The later the meeting, the shorter the drive (the braking) before it, and the less room
     behind (ahead).
@@ -94,9 +101,9 @@ def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, o
 
 @compiled(apart=True)
 def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple[float, float, bool]:
-    """When the leader, met at ``first`` at the earliest, is met at the latest; when it is met first at the latest.
+    """Return the latest first contact with the leader, and the latest one at which the leader is met first.
 
-    And whether it may be met first however late and softly.
+    Also returns whether the leader may be met first arbitrarily late and softly. ``first`` is the earliest meeting.
     """
     touches = spare_gap(at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F]) >= 0.0
     last = meet_front(at, 0.0, plan, other)
@@ -112,15 +119,15 @@ def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple
 def front_first(
     at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Least harm, if below ``best``, where the leader is met first or all three meet at once.
+    """Return the least harm, if below ``best``, where the leader is met first or all three meet at once.
 
-    At once: the outer two close with W, of which the front pair has at least the least at that time. Only if the leader
-    can be met as late as that.
+    If all three meet at once, leader and rear vehicle close with W; the front pair's part of W is at least the least
+    closing speed at that time. This case counts only if the leader can be met that late.
     """
     first = meet_front(at, math.inf, plan, other)
     if (
         first == math.inf and at[LINE.GAP_L] <= TOUCHING_M
-    ):  # it stands at the leader, and stays: both are struck at once
+    ):  # it stands in contact with the leader, so both are hit at once
         return min(best, rear_bound(at, plan, other)[0])
     if first == math.inf or not stays_ahead(at, first, first, plan, other):
         return best
@@ -149,7 +156,7 @@ def front_first(
 def soft_harm(
     kind: int, at: Floats, early: float, late: float, floor: float, best: float, plan: Floats, other: Floats
 ) -> float:
-    """Least harm, if below ``best``, of the meetings with one neighbour from ``early`` to ``late``, however soft."""
+    """Return the least harm, if below ``best``, of first contacts from ``early`` to ``late`` with any closing speed."""
     soft = 0.0
     while soft * soft < best:
         hard = soft + 0.02 * (1.0 + soft)
@@ -165,7 +172,7 @@ def soft_harm(
 def rear_first(
     at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Least harm, if below ``best``, where the rear vehicle is met first."""
+    """Return the least harm, if below ``best``, where the rear vehicle is met first."""
     high = max(at[LINE.V_F] / at[LINE.A_F], at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R])
     first = meet_rear(at, high, plan, other)
     if first == math.inf or not stays_behind(at, first, first, plan, other):
@@ -195,10 +202,10 @@ def rear_first(
 
 @compiled(apart=True)
 def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
-    """A time after which no first meeting with the rear vehicle comes, however soft; all stand at ``rest``.
+    """Return a time after which no first contact with the rear vehicle is possible; everything stands at ``rest``.
 
-    It has then passed neither the leader nor the controlled vehicle; where it brakes harder than this one, by b, it was
-    faster by ``b t`` a time t before the meeting, from its onset on.
+    By then the rear vehicle has passed neither the leader nor the controlled vehicle. If it brakes harder than the
+    controlled vehicle by b, it was faster by ``b t`` at time t before the meeting, from its onset on.
     """
     fill_braking(plan, 0.0, at[LINE.A_L])
     fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
@@ -216,7 +223,7 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def last_rest(at: Floats) -> tuple[float, float]:
-    """By when what follows from braking is over, whoever is met; and when the rear vehicle stands by full braking."""
+    """Return when everything that follows from braking is over, and when the rear vehicle stands by full braking."""
     stand = at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
     way = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, stand)[1]
     room = at[LINE.GAP_L] + at[LINE.V_L] * at[LINE.V_L] / (2.0 * at[LINE.A_L]) + at[LINE.GAP_R] - way
@@ -228,14 +235,14 @@ def last_rest(at: Floats) -> tuple[float, float]:
 def combined_bound(
     at: Floats, until: float, front: float, rear: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Least harm of a world in which contact is unavoidable, whoever is met first; 0 if that may be after ``until``.
+    """Return the least harm of a world with unavoidable contact, whoever is met first.
 
-    ``front`` and ``rear`` are the pairs' own bounds.
+    Returns 0 if the harm may come after ``until``. ``front`` and ``rear`` are the bounds of the two pairs alone.
     """
     if not last_rest(at)[0] < until:
         return 0.0
     step, least = at[LINE.TIME_STEP], 0.0
-    for time_step in (0.0, step):  # what holds for any command holds for one that changes at decisions only
+    for time_step in (0.0, step):  # a bound for all commands also holds for commands that change at decisions only
         at[LINE.TIME_STEP] = time_step
         best = front_first(at, rear, LARGE, front + rear, plan, other, heap)
         best = rear_first(at, front, best, front + rear, plan, other, heap)
@@ -249,15 +256,15 @@ def combined_bound(
 def bound_worlds(
     states: Floats, until: Floats, has_front: Bools, has_rear: Bools, unavoidable: Bools, out: Floats
 ) -> None:
-    """Bounds of worlds ``states`` [n, WIDTH] into ``out`` [n, BOUNDS].
+    """Write the bounds of worlds ``states`` [n, WIDTH] to ``out`` [n, BOUNDS].
 
-    Each pair's where it exists, both together where contact is unavoidable.
+    These are the bound of each pair that exists, and the combined bound where contact is unavoidable.
     """
     plan, other, heap = empty_plan(), empty_plan(), np.empty((CELLS, NEAR))
     for k in range(states.shape[0]):
         front, rear = 0.0, 0.0
         if has_front[k]:
-            # least squared closing speed at the front pair's first contact, whoever pushes; and its latest time
+            # least squared closing speed at the front pair's first contact, and the latest time of that contact
             at = states[k]
             fill_braking(plan, 0.0, at[LINE.A_L])
             fill_braking(other, 0.0, at[LINE.A_F])
@@ -286,19 +293,19 @@ def lower_bound(
     scripts: Mapping[int, str] | None = None,
     time_step_s: float | None = None,
 ) -> LowerBound:
-    """Proven lower bound on the harm from now to ``horizon_s`` (absolute), over all commands of ``vehicle``.
+    """Return a proven lower bound on the harm from now to ``horizon_s`` (absolute), over all commands of ``vehicle``.
 
     ``harm = early + max(front_pair + rear_pair, combined)``, each part rounded outward (``rounding``). The combined
-    bound is 0 where contact can be avoided. What may come only after the horizon counts as 0, and so does the next
-    impact of a pair that was hit before where ``harm_count`` is "first".
+    bound is 0 where contact can be avoided. Harm that may come only after the horizon counts as 0. With ``harm_count``
+    "first", the next impact of a pair that was hit before counts as 0 too.
 
-    With ``time_step_s`` it is proven only for commands that change at decisions, the first one when the vehicle may
-    act, one every ``time_step_s`` after it: what every agent drives. That is sharper, and takes ten times as long.
+    With ``time_step_s`` the bound is proven only for commands that change at decisions: the first one when the vehicle
+    may act, then one every ``time_step_s``, as for every agent. That is sharper, and takes ten times as long.
 
-    Where brakes build up it holds for any command at any time, is looser, and says nothing of contact: ``contact`` is
-    None if that is so in any of the worlds.
+    With brake build-up the bound holds for any command at any time and is looser. It has no verdict on contact:
+    ``contact`` is None if brakes build up in any of the worlds.
 
-    Covers the same lines as ``avoidability``, and raises ``InvalidInput`` for others, for an unknown ``harm_count``, a
+    Covers the same lines as ``avoidability``. Raises ``InvalidInput`` for other lines, for an unknown ``harm_count``, a
     time step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before the vehicle may act.
     """
     check_asked("lower_bound", harm_count, horizon_s, time_step_s)
@@ -317,7 +324,7 @@ def lower_bound(
         return LowerBound(harm, early, front, rear, combined, None)
     if slow.any():
         check_covered(worlds, vehicle, scripts)
-        verdict, reason = None, np.full(worlds.n, 2)  # it may be: the bound itself finds out
+        verdict, reason = None, np.full(worlds.n, 2)  # assume unavoidable contact: the bound itself finds out
     else:
         verdict = avoidability(worlds, vehicle, scripts=scripts)
         reason = verdict.reason
@@ -325,13 +332,13 @@ def lower_bound(
     none = np.zeros(worlds.n, dtype=np.bool_)
     has_front = counts[:, vehicle - 1] if vehicle > 0 else none
     has_rear = counts[:, vehicle] if vehicle < worlds.N - 1 else none
-    struck = at_onset.obstacle_hit & (harm_count == "first")  # whoever is pushed there is not charged for it again
+    struck = at_onset.obstacle_hit & (harm_count == "first")  # a further impact with the obstacle is not counted
     unavoidable = has_front & has_rear & (reason >= 2) & ~struck
     out = np.empty((worlds.n, BOUNDS))
     given: tuple[Any, ...] = (has_front, has_rear, unavoidable, out)
     kernel: Callable[..., None] = bound_worlds
     if slow.any():
-        # a neighbour that still drives, told otherwise before, is not yet left alone
+        # the bound does not cover a neighbour that still drives because of an earlier command
         left_alone = np.delete(at_onset.command_mps2, vehicle, axis=1).max(axis=1) <= 0.0
         given = (has_front, has_rear & left_alone, unavoidable & left_alone, out)
         given, kernel = (ramped_states(at_onset, vehicle, horizon_s - start), *given), bound_ramped

@@ -1,7 +1,8 @@
 """Two vehicles on plans of piecewise constant acceleration: how close they come, and where they first meet.
 
-A plan is an array [2, PIECES]: row ENDS holds the end of each piece (seconds from now, the last one infinite), row
-ACCELERATIONS its acceleration (m/s2). Braking ends at rest and then holds. No time step: each piece is closed form.
+A *plan* is an array [2, PIECES]: row ENDS holds the end of each piece (seconds from now, the last one infinite), row
+ACCELERATIONS its acceleration (m/s2). A vehicle that brakes to rest stays at rest. There is no time step: each piece
+has a closed form.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ PIECES = 4
 
 @compiled
 def empty_plan() -> Floats:
-    """Memory of a plan."""
+    """Return uninitialised memory for a plan."""
     return np.empty((2, PIECES))
 
 
@@ -29,7 +30,7 @@ def empty_plan() -> Floats:
 def fill_plan(
     plan: Floats, end_0: float, u_0: float, end_1: float, u_1: float, end_2: float, u_2: float, u_3: float
 ) -> None:
-    """Acceleration ``u_0`` until ``end_0``, then ``u_1`` until ``end_1``, ``u_2`` until ``end_2``, ``u_3`` for ever."""
+    """Set a plan: ``u_0`` until ``end_0``, then ``u_1`` until ``end_1``, ``u_2`` until ``end_2``, then ``u_3``."""
     plan[ENDS, 0], plan[ENDS, 1], plan[ENDS, 2], plan[ENDS, 3] = end_0, end_1, end_2, math.inf
     plan[ACCELERATIONS, 0], plan[ACCELERATIONS, 1] = u_0, u_1
     plan[ACCELERATIONS, 2], plan[ACCELERATIONS, 3] = u_2, u_3
@@ -37,13 +38,13 @@ def fill_plan(
 
 @compiled
 def fill_braking(plan: Floats, onset: float, braking: float) -> None:
-    """Coast until ``onset``, then brake to rest."""
+    """Set a plan: coast until ``onset``, then brake to rest."""
     fill_plan(plan, onset, 0.0, onset, 0.0, onset, 0.0, -braking)
 
 
 @compiled
 def fill_window(plan: Floats, u: float, late: float, end: float, change: float, turn: float, step: float) -> None:
-    """Acceleration ``u``, from ``turn`` on ``step`` more, and from ``late`` to ``end`` also ``change`` more."""
+    """Set a plan: ``u``, plus ``step`` from ``turn`` on, plus ``change`` from ``late`` to ``end``."""
     first, second, third = min(turn, late), min(max(turn, late), end), max(turn, end)
     u_1 = u + step if turn < late else u + change
     u_2 = u + step + change if turn < end else u
@@ -52,27 +53,27 @@ def fill_window(plan: Floats, u: float, late: float, end: float, change: float, 
 
 @compiled
 def time_to_limit(v: float, u: float, limit: float) -> float:
-    """How long ``u`` accelerates from ``v`` to the speed limit; 0 at or beyond it, or without drive. [s]"""
+    """Return how long ``u`` accelerates from ``v`` to the speed limit; 0 at the limit or without drive. [s]"""
     return (limit - v) / u if u > 0.0 and v < limit else 0.0
 
 
 @compiled
 def fill_drive_then_brake(plan: Floats, v: float, u: float, limit: float, drive: float, braking: float) -> None:
-    """Drive for ``drive`` (at most to the speed limit), then brake to rest."""
+    """Set a plan: drive for ``drive`` (at most to the speed limit), then brake to rest."""
     cap = min(time_to_limit(v, u, limit), drive)
     fill_plan(plan, cap, u, drive, 0.0, drive, 0.0, -braking)
 
 
 @compiled
 def fill_brake_then_drive(plan: Floats, v: float, u: float, limit: float, brake: float, braking: float) -> None:
-    """Brake for ``brake`` (at most to rest), then drive to the speed limit and stay there."""
+    """Set a plan: brake for ``brake`` (at most to rest), then drive to the speed limit and stay there."""
     cap = brake + time_to_limit(max(v - braking * brake, 0.0), u, limit)
     fill_plan(plan, brake, -braking, cap, u, cap, 0.0, 0.0)
 
 
 @compiled
 def piece_at(plan: Floats, now: float, v: float) -> tuple[float, float, bool]:
-    """Acceleration in force at ``now`` and speed ``v``, until when, and whether it ends at rest."""
+    """Return the acceleration in force at ``now`` for speed ``v``, until when it lasts, and whether it ends at rest."""
     k = 0
     while now >= plan[ENDS, k]:
         k += 1
@@ -90,10 +91,11 @@ def piece_at(plan: Floats, now: float, v: float) -> tuple[float, float, bool]:
 def walk(
     gap: float, v_front: float, front: Floats, v_rear: float, rear: Floats, until: float
 ) -> tuple[float, float, float]:
-    """Follow a pair to ``until``: smallest gap [m]; time [s] and squared closing speed of the first meeting, or inf, 0.
+    """Follow a pair to ``until``. Return its smallest gap, and time and squared closing speed of its first meeting.
 
-    The two pass through each other, so a negative smallest gap is the depth of the overlap. A graze, after which they
-    part again, is no meeting; a touch that would turn into an overlap is one, with closing speed 0. Speeds >= 0.
+    Units are m and s. Time is infinite and speed 0 if they do not meet. The two pass through each other, so a negative
+    smallest gap is the depth of the overlap. If the gap reaches 0 and opens again, that is no meeting; if it would
+    become an overlap, it is a meeting with closing speed 0. Needs speeds >= 0.
     """
     lowest, now, met_at, squared = gap, 0.0, math.inf, 0.0
     while now < until:

@@ -1,4 +1,4 @@
-"""The lower bound where brakes build up at finite rates. Compiled."""
+"""The lower bound with brakes that build up at finite rates."""
 
 from __future__ import annotations
 
@@ -36,7 +36,11 @@ from ethbrake_marl.physics.state import Bools, Floats, Worlds
 def combined_ramped(
     at: Floats, until: float, front: float, rear: float, contact_s: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Least harm, whoever is met first, where both extremes show contact by ``contact_s``, or the outer two do."""
+    """Return the least combined harm, whoever is met first, with brake build-up.
+
+    Contact is certain by ``contact_s``, or by the time at which the outer two vehicles would meet. Returns 0 if nothing
+    is proven.
+    """
     if min(at[LINE.GAP_L], at[LINE.GAP_R]) <= TOUCHING_M:
         return 0.0
     fill_leader(at, plan)
@@ -68,7 +72,10 @@ def combined_ramped(
 
 @compiled
 def bound_ramped(states: Floats, has_front: Bools, has_rear: Bools, both: Bools, out: Floats) -> None:
-    """``bound_worlds`` where brakes build up; ``both``: whether the pairs are to be bounded together too, [n]."""
+    """Write the bounds as ``bound_worlds`` does, for brakes that build up.
+
+    ``both`` [n] selects the worlds for the combined bound.
+    """
     plan, other, heap = empty_legs(), empty_legs(), np.empty((CELLS, NEAR))
     for k in range(states.shape[0]):
         at, contact_s = states[k], math.inf
@@ -87,9 +94,9 @@ def bound_ramped(states: Floats, has_front: Bools, has_rear: Bools, both: Bools,
 
 
 def ramped_states(worlds: Worlds, i: int, until: Floats) -> Floats:
-    """``onset_states`` of worlds in which brakes build up; what they prove must happen within ``until`` [n] s.
+    """Return ``onset_states`` of worlds with brake build-up. The bounds cover only harm within ``until`` [n] s.
 
-    A controlled vehicle that brakes or drives already is taken to have no rates.
+    A controlled vehicle that already brakes or drives is treated as if its rates were infinite.
     """
     v, at = worlds.vehicles, onset_states(worlds, i, None)
     moved = worlds.command_mps2[:, i] != 0.0

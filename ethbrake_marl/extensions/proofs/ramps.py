@@ -1,9 +1,9 @@
-"""Two vehicles whose forces change at finite rates: where they first meet, and how gently at least. Compiled.
+"""Two vehicles whose forces change at finite rates: where they first meet, and the least closing speed there.
 
-A plan is an array [3, LEGS]: row ENDS holds the end of each leg (s from now, the last one infinite), row FORCES the
-acceleration in force at its start (m/s2), row JERKS how fast that changes (m/s3). A vehicle at rest holds until its
-force is above 0, one at its speed limit until it is below. No time step: a gap is one cubic after the other.
-docs/proofs/lower-bound-cases.md has the proof, under "Brakes that build up".
+A *plan* is an array [3, LEGS]: row ENDS holds the end of each leg (s from now, the last one infinite), row FORCES the
+acceleration in force at its start (m/s2), row JERKS its rate of change (m/s3). A vehicle at rest stays until its force
+is above 0; a vehicle at its speed limit keeps that speed until its force is below 0. There is no time step: the gap is
+a sequence of cubics. docs/proofs/lower-bound-cases.md has the proof, under "Brakes that build up".
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ _MEETING_HALVINGS = 30
 
 @compiled
 def empty_legs() -> Floats:
-    """Memory of a plan."""
+    """Return uninitialised memory for a plan."""
     return np.empty((3, LEGS))
 
 
 @compiled
 def put_leg(plan: Floats, k: int, end: float, force: float, jerk: float) -> None:
-    """Leg ``k``, the last one so far: all later ones never begin."""
+    """Set leg ``k`` of a plan: its end, its initial force and its jerk."""
     plan[ENDS, k], plan[FORCES, k], plan[JERKS, k] = end, force, jerk
 
 
 @compiled
 def fill_build_up(plan: Floats, since: float, force: float, wanted: float, rate: float) -> None:
-    """``force`` until ``since``, from then on towards ``wanted`` at this rate, which may be infinite."""
+    """Set a plan: ``force`` until ``since``, then towards ``wanted`` at this rate, which may be infinite."""
     rise = abs(wanted - force) / rate
     put_leg(plan, 0, since, force, 0.0)
     put_leg(plan, 1, since + rise, force, (wanted - force) / rise if rise > 0.0 else 0.0)
@@ -50,10 +50,11 @@ def fill_switch(
     plan: Floats, sign: float, force: float, high: float, rise: float, low: float, fall: float, switch: float,
     time: float, final: float,
 ) -> None:  # fmt: skip
-    """From ``force`` up to ``high`` until ``switch``, then down to ``-low``, but so as to be at ``final`` at ``time``.
+    """Set a plan: from ``force`` up to ``high`` until ``switch``, then down to ``-low``.
 
-    Rates are ``rise`` and ``fall``. All forces are given, and come out, times ``sign``. A ``switch`` from -1 to 0, for
-    an infinite ``rise``, is one at once from a part of the way up.
+    Before ``time`` the force turns up again, so that it is ``final`` at ``time`` (-inf: no such condition). The rates
+    are ``rise`` and ``fall``. Forces in the arguments are times ``sign``. A ``switch`` from -1 to 0, for an infinite
+    ``rise``, means to start at once from a part of the way up.
     """
     full = (high - force) / rise
     top = high if switch >= full else force + rise * switch
@@ -75,7 +76,10 @@ def fill_switch(
 
 @compiled
 def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, float, float, float]:
-    """Acceleration and jerk at ``now`` and speed ``v``, until when, and the speed that is reached then, else NaN."""
+    """Return acceleration and jerk at ``now`` for speed ``v``, when they end, and the speed reached then.
+
+    That speed is NaN if the leg ends otherwise than at rest or at the speed limit.
+    """
     k = 0
     while now >= plan[ENDS, k]:
         k += 1
@@ -87,7 +91,7 @@ def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, flo
         free = now - u / jerk if u * jerk < 0.0 else math.inf
         if free > now:
             return 0.0, 0.0, min(end, free), v
-        u = 0.0  # it is free just now, but for rounding
+        u = 0.0  # the vehicle becomes free at this moment, up to rounding
     reached = math.nan
     stands = now + first_return(v, u, jerk)
     if v <= 0.0 and stands <= now:
@@ -103,13 +107,13 @@ def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, flo
 
 @compiled
 def speed_after(v: float, u: float, jerk: float, step: float, reached: float) -> float:
-    """Speed at the end of a leg, or of the part of it that is ``step`` long (``reached`` is NaN then)."""
+    """Return the speed at the end of a leg, or of its first ``step`` seconds (``reached`` is then NaN)."""
     return max(v + (u + 0.5 * jerk * step) * step, 0.0) if math.isnan(reached) else reached
 
 
 @compiled(apart=True)
 def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, float]:
-    """Speed and way at ``until`` of one that starts at 0 with ``v``."""
+    """Return speed and distance at ``until`` of a vehicle that starts with speed ``v``."""
     now, way = 0.0, 0.0
     while now < until:
         u, jerk, end, reached = leg_at(plan, now, v, limit)
@@ -123,19 +127,22 @@ def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, f
 
 @compiled
 def force_of(plan: Floats, now: float) -> float:
-    """Force of a plan, at rest as well."""
+    """Return the force of a plan at ``now``, also if the vehicle is at rest."""
     return leg_at(plan, now, 1.0, math.inf)[0]
 
 
 @compiled(apart=True)
 def least_on_cubic(constant: float, pressing: float, jerk: float, since: float, until: float) -> float:
-    """Least value of ``constant / t + pressing t / 2 + jerk t^2 / 3`` from ``since`` to ``until``; -inf at 0, if so."""
+    """Return the least ``constant / t + pressing t / 2 + jerk t^2 / 3`` for t from ``since`` to ``until``.
+
+    -inf if the function falls without bound towards t = 0.
+    """
     if since <= 0.0 and constant <= 0.0:
         return -math.inf
     least = constant / until + (0.5 * pressing + jerk * until / 3.0) * until
     turn = -0.5 * pressing / jerk if jerk != 0.0 else since
     turn = min(max(turn, since), until)
-    for low, high in ((since, turn), (turn, until)):  # on each the sign of the slope changes once at most
+    for low, high in ((since, turn), (turn, until)):  # the sign of the slope changes at most once on each part
         if low > 0.0:
             least = min(least, constant / low + (0.5 * pressing + jerk * low / 3.0) * low)
         if (0.5 * pressing + 2.0 / 3.0 * jerk * high) * high * high <= constant or low >= high:
@@ -155,10 +162,11 @@ def meeting(
     gap: float, slack: float, v_front: float, front: Floats, front_limit: float, v_rear: float, rear: Floats,
     rear_limit: float, since: float, until: float,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """When two first meet after ``since``, with which closing speed w, and the least forced one; inf, 0, 0: never.
+    """Return when two vehicles first meet after ``since``, their closing speed w, and the least forced closing speed.
 
-    That is the least of ``w + (gap - slack) / t`` until then, t counted from ``since``: of a run that is never behind
-    these extremes, ``slack`` nearer than they at ``since``, and ever faster by more.
+    Returns inf, 0, 0 if they never meet. The last value is the least of ``w + (gap - slack) / t`` until then, t counted
+    from ``since``. It bounds every motion of the pair that is never behind these two, is ``slack`` nearer at ``since``,
+    and is faster by a growing amount.
     """
     now, least = since, math.inf
     while now < until:

@@ -1,4 +1,4 @@
-"""Harm over the constant deceleration of one vehicle in one world: predicted, realised and best known."""
+"""Harm against the constant deceleration of one vehicle in one world: predicted, simulated and best known."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from ethbrake_marl.physics.forecast import forecast
 from ethbrake_marl.physics.state import Floats, Worlds, make_worlds
 from ethbrake_marl.scenario.task import Task
 
-POINTS = 2001  # evenly spaced decelerations; the breakpoints of the closed form come on top
+POINTS = 2001  # number of evenly spaced decelerations; the breakpoints of the closed form are added
 
-_LONG_S = 1e4  # whoever still coasts has met or will never meet
+_LONG_S = 1e4  # long enough for every meeting to have happened
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """A constant deceleration that E-V2X-BM takes in the world, and the harm that it minimises there (m2/s2)."""
+    """Constant deceleration that E-V2X-BM chooses in the world, and its minimal harm there (m2/s2)."""
 
     deceleration_mps2: float
     harm: float
@@ -40,28 +40,28 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class DecelerationCurve:
-    """Harm (m2/s2) of one world at K constant decelerations of one vehicle, in rising order."""
+    """Harm (m2/s2) in one world at K constant decelerations of one vehicle, in rising order."""
 
-    task: Task  # its one vehicle has the deceleration
-    world: Worlds  # n = 1, at the alert
+    task: Task  # scenario, and the one vehicle that has the deceleration
+    world: Worlds  # the world, n = 1, at the alert
     deceleration_mps2: Floats  # [K] from 0 to the braking capacity
-    predicted: Floats  # [K] pairwise, in closed form
-    first_impact_harm: Floats  # [K] realised
-    total_harm: Floats  # [K] realised
-    regimes: dict[str, NDArray[np.str_]]  # per pair of the vehicle ("front pair", "rear pair"): [K] how it first meets
-    closed_form: Choice  # its harm is the predicted one
-    coupled: Mapping[HarmCount, Choice]  # minimising either count in the simulation
-    limits: Limits | Unproven  # what is known of the world over all time-varying commands
+    predicted: Floats  # [K] harm predicted by the pairwise closed form
+    first_impact_harm: Floats  # [K] simulated harm
+    total_harm: Floats  # [K] simulated harm
+    regimes: dict[str, NDArray[np.str_]]  # by pair ("front pair", "rear pair"): [K] how it first meets
+    closed_form: Choice  # choice of the closed form, with its predicted harm
+    coupled: Mapping[HarmCount, Choice]  # choice with the least simulated harm of each count
+    limits: Limits | Unproven  # best known harm and proven bound over all time-varying commands
 
     def harm(self, harm_count: HarmCount) -> Floats:
-        """The realised harm under a counting rule, [K] m2/s2."""
+        """Return the simulated harm of a count, [K] m2/s2."""
         return self.first_impact_harm if harm_count == "first" else self.total_harm
 
 
 def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> DecelerationCurve:
-    """The three harms of one world at evenly spaced decelerations of the vehicle, and at those of the closed form.
+    """Compute the three harms of one world at evenly spaced decelerations and at the breakpoints of the closed form.
 
-    The prediction lets all others brake fully; in the simulation they follow the scenario's scripts. Raises
+    The prediction assumes that all others brake fully; in the simulation they follow the scenario's scripts. Raises
     ``InvalidInput`` unless there is exactly one world, ``points`` is at least 2 and every script is fixed at the alert.
     """
     if world.n != 1:
@@ -96,10 +96,10 @@ def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> De
 
 
 def regimes_of(worlds: Worlds, pair: int, deceleration_mps2: Floats) -> NDArray[np.str_]:
-    """How one pair, alone, first meets under constant decelerations [n, N] from now (t = 0) on, [n].
+    """Return how one pair, alone, first meets under constant decelerations [n, N] from now (t = 0) on, [n].
 
-    ``A``, ``A'``, ``B`` or ``C`` as in docs/proofs/constant-deceleration.md, ``early``: before the pair's leader
-    brakes, or ``none``.
+    Values: ``A``, ``A'``, ``B`` or ``C`` as in docs/proofs/constant-deceleration.md; ``early``: before the front
+    vehicle of the pair brakes; ``none``.
     """
     own = slice(pair, pair + 2)
     v = worlds.vehicles
@@ -108,7 +108,7 @@ def regimes_of(worlds: Worlds, pair: int, deceleration_mps2: Floats) -> NDArray[
         driving_capacity_mps2=0.0, latency_s=v.latency_s[:, own], mass_t=1.0, restitution=0.0,
         speed_limit_mps=v.speed_limit_mps[:, own],
     )  # fmt: skip
-    with np.errstate(divide="ignore", invalid="ignore"):  # when each would stand; inf without braking
+    with np.errstate(divide="ignore", invalid="ignore"):  # standstill time; infinite without braking
         speed = worlds.speeds_mps[:, own]
         stop_s = np.where(speed > 0.0, v.latency_s[:, own] + speed / deceleration_mps2[:, own], 0.0)
     rows = advance(alone, -deceleration_mps2[:, own], until_s=_LONG_S, record=True)[1].rows
@@ -127,7 +127,7 @@ _COUNTS: tuple[tuple[HarmCount, str, str, str], ...] = (
     ("total", "total harm", COLOURS[0], "--"),
 )
 
-_REGIMES = {  # name of how a pair first meets: its colour and meaning
+_REGIMES = {  # colour and meaning of each regime
     "early": ("#d7c2e8", "before the front vehicle brakes"),
     "A": ("#8f8f8f", "A: rear vehicle still coasts"),
     "A'": ("#5f5f5f", "A': rear vehicle coasts, front one stands"),
@@ -137,10 +137,10 @@ _REGIMES = {  # name of how a pair first meets: its colour and meaning
 
 
 def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
-    """Predicted and realised harm of one world over the constant deceleration of one vehicle.
+    """Draw predicted and simulated harm of one world against the constant deceleration of one vehicle.
 
-    Above: the three curves, the decelerations that E-V2X-BM takes (closed form and coupled, both counts), and as level
-    lines the best known harm of any profile, where it is known. Below: how each pair alone first meets.
+    Top: the three curves, the decelerations that E-V2X-BM chooses (closed form, and coupled for both counts), and level
+    lines at the best known harm of any profile, if known. Bottom: how each pair alone first meets.
     """
     scenario, vehicle = curve.task.scenario, curve.task.vehicle
     figure = new_figure(8.0, 5.4)
@@ -172,7 +172,7 @@ def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
             label=f"a* = {best.deceleration_mps2:.3f} m/s², coupled, least {name}: {best.harm:.2f}",
         )  # fmt: skip
     limits = curve.limits
-    if not isinstance(limits, Unproven) and limits.known[0]:  # of any profile, over all time-varying commands
+    if not isinstance(limits, Unproven) and limits.known[0]:  # best known harm over all time-varying commands
         first, total = float(limits.first_impact_harm[0]), float(limits.total_harm[0])
         for (_, _, colour, dashes), harm in zip(_COUNTS, (first, total), strict=True):
             axes.axhline(harm, color=colour, linewidth=0.9, linestyle=dashes, alpha=0.7)

@@ -1,8 +1,8 @@
-"""Every HTML page: one file that loads nothing, opens from disk, and shows whatever it is told as text.
+"""HTML pages: one file that loads nothing, can be opened from disk, and shows every input as text.
 
-A page is a title, a sentence or two, and sections. What a section holds are strings, which become paragraphs, and
-parts: tables, figures, the player of episodes. Strings are never markup: they are escaped, and control and direction
-characters are written as in Python.
+A page is a title, a short lead, and sections. A section holds strings, which become paragraphs, and parts: tables,
+figures, the episode player. Strings are never markup: they are escaped, and control and direction characters are
+written as in Python.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from ethbrake_marl.files.sheet import Sheet
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_STAY = "\u00a0"  # a blank at which no line is broken
+_STAY = "\u00a0"  # no-break space
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A piece of a page, and what it needs there: names of style sheets and scripts of this folder."""
+    """A piece of a page, with the names of the style sheets and scripts of this folder that it needs."""
 
     html: Markup
     styles: tuple[str, ...] = ()
@@ -42,39 +42,42 @@ class Part:
 
     @classmethod
     def paragraph(cls, text: str, kind: str = "") -> Part:
-        """Text as a paragraph: ``quiet`` (conditions), ``note`` (what must not be overlooked), ``alarm``, or plain."""
+        """Return text as a paragraph.
+
+        ``kind``: ``quiet`` (conditions), ``note`` (important remark), ``alarm``, or empty.
+        """
         return cls(Markup('<p class="{}">{}</p>\n').format(kind, shown(text)))
 
     @classmethod
     def heading(cls, text: str) -> Part:
-        """A heading inside a section."""
+        """Return a heading inside a section."""
         return cls(Markup("<h3>{}</h3>\n").format(shown(text)))
 
     @classmethod
     def facts(cls, found: Mapping[str, object]) -> Part:
-        """Names and values, one below the other."""
+        """Return names and values, one below the other."""
         lines = [Markup("<dt>{}</dt><dd>{}</dd>").format(shown(name), _text(value)) for name, value in found.items()]
         return cls(Markup("<dl>\n{}\n</dl>\n").format(Markup("\n").join(lines)))
 
     @classmethod
     def remarks(cls, texts: Sequence[str]) -> Part:
-        """A list of what must not be overlooked, one line each; nothing without any."""
+        """Return a list of important remarks, one line each; nothing if there are none."""
         lines = [Markup("<li>{}</li>").format(shown(text)) for text in texts]
         return cls(Markup('<ul class="remarks">\n{}\n</ul>\n').format(Markup("\n").join(lines)) if lines else Markup())
 
     @classmethod
     def box(cls, title: str, meanings: Mapping[str, str]) -> Part:
-        """Words and what they mean, in a box."""
+        """Return words and their meanings, in a box."""
         return cls(Markup('<aside class="box"><strong>{}</strong>{}</aside>\n').format(title, cls.facts(meanings).html))
 
     @classmethod
     def beside(cls, parts: Sequence[Part]) -> Part:
-        """Parts of equal width side by side; on a narrow screen, one below the other."""
+        """Return parts of equal width side by side; on a narrow screen, one below the other."""
         return cls._around('<div class="beside">{}</div>\n', parts)
 
     @classmethod
     def opened(cls, title: str, parts: Sequence[Part]) -> Part:
-        """Parts that show when their title is chosen."""
+        """Return parts that are hidden until the reader clicks on their title."""
         return cls._around("<details><summary>{}</summary>\n{}</details>\n", parts, shown(title))
 
     @classmethod
@@ -85,7 +88,7 @@ class Part:
 
     @classmethod
     def data(cls, name: str, content: object, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = ()) -> Part:
-        """Plain data for a script of the page: JSON in which nothing can end the element or begin another."""
+        """Return plain data for a script of the page, as JSON that cannot end its element or begin another."""
         text = json.dumps(content, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
         for sign in "<>&":
             text = text.replace(sign, f"\\u{ord(sign):04x}")
@@ -94,12 +97,12 @@ class Part:
 
     @classmethod
     def template(cls, file: str, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = (), **values: object) -> Part:
-        """A template of this folder with these values; all of them are text but what is Markup already."""
+        """Return a template of this folder filled with these values. Values are text, unless they are Markup."""
         return cls(Markup(_environment().get_template(file).render(**values)), styles, scripts)
 
     @classmethod
     def table(cls, sheet: Sheet) -> Part:
-        """A table that scrolls by itself where it is wider than the page; a cell may be a ``Shown`` of Markup."""
+        """Return a table that scrolls if it is wider than the page. A cell may be a ``Shown`` of Markup."""
         return cls(Markup(sheet.html() + "\n"))
 
     @classmethod
@@ -113,17 +116,17 @@ class Part:
         known: str = "",
         where: object = "",
     ) -> Part:
-        """A figure, or the SVG of one of ours, with its title and, in words, what it shows.
+        """Return a figure, or the SVG of one of our figures, with a title and a description.
 
-        The caption is taken out of the SVG and stands below it as text of the page, which a phone can show.
+        The caption is removed from the SVG and becomes text of the page below it, which a phone can show.
 
         Args:
-            figure: in the colours of the page, light or dark.
-            title: above it.
-            description: in words, what it shows.
-            alone: in colours that must not change, such as those of a map; it then stands on white.
-            known: what its caption need not say, because the page does.
-            where: the file that the SVG was read from, for the error where that holds what no figure of ours does.
+            figure: the figure, or the bytes of its SVG. It takes the colours of the page, light or dark.
+            title: title above it.
+            description: what it shows, in words.
+            alone: keep the colours, as a map needs them, on a white background.
+            known: text of the caption that the page has already; it is left out.
+            where: file that the SVG was read from, for the error message about a foreign SVG.
 
         """
         from ethbrake_marl.extensions.report.svg import inline_svg
@@ -152,14 +155,15 @@ class Part:
         shown_first: Sequence[int] = (),
         folded: bool = False,
     ) -> Part:
-        """The player of these worlds, all driven by the same agents.
+        """Return the episode player of these worlds, in which all agents drove.
 
         Args:
-            worlds: at least one.
-            driven: indices (0 = front) of the vehicles that the agents drive; by agent where they drive others.
-            focus: the agent that is shown from the beginning, between the first and the last.
-            shown_first: numbers of the agents that are shown from the beginning, where those are others.
-            folded: traces show when their title is chosen.
+            worlds: at least one world.
+            driven: indices (0 = front) of the controlled vehicles; a mapping by agent if agents control different
+                vehicles.
+            focus: the agent that is shown at first, between the first and the last.
+            shown_first: numbers of the agents that are shown at first, if others.
+            folded: hide the traces until their title is clicked.
 
         """
         agents, one = list(worlds[0].motions), next(iter(worlds[0].motions.values())).world
@@ -182,7 +186,7 @@ class Part:
         content = {
             "vehicles": one.N,
             "agents": [shown(agent) for agent in agents],
-            # the first, the focus, and as many of the last as there is room for
+            # the first agent, the focus, and the last ones, up to three
             "shown": list(shown_first) or sorted(list(order)[:3]),
             "worlds": told,
         }
@@ -202,26 +206,26 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A section of a page: strings, which become paragraphs, and parts."""
+    """Section of a page: strings, which become paragraphs, and parts."""
 
     title: str
     body: Sequence[str | Part]
 
     @property
     def parts(self) -> list[Part]:
-        """The body, every string as a paragraph."""
+        """The body with every string as a paragraph."""
         return [Part.paragraph(each) if isinstance(each, str) else each for each in self.body]
 
 
 @dataclass(frozen=True)
 class Page:
-    """A whole page.
+    """A whole HTML page.
 
     Args:
-        title: of the page.
-        sections: in this order, each with an entry in the table of contents.
-        lead: what the page is about, in a sentence or two below its title.
-        opening: parts between these and the table of contents.
+        title: title of the page.
+        sections: sections in order; each has an entry in the table of contents.
+        lead: one or two sentences below the title that say what the page is about.
+        opening: parts between the lead and the table of contents.
 
     >>> from ethbrake_marl.extensions.report.page import Page, Part, Section
     >>> section = Section("Results", ["Text with <b> stays text.", Part.paragraph("small print")])
@@ -241,14 +245,14 @@ class Page:
 
     @cached_property
     def _code(self) -> tuple[str, str]:
-        """Its own styles and script: each file once, one after the other."""
+        """Styles and scripts of the page; each file is included once."""
         styles = dict.fromkeys(["page.css", *(name for part in self._parts for name in part.styles)])
         scripts = dict.fromkeys(name for part in self._parts for name in part.scripts)
         return "\n".join(map(read_file, styles)), "\n".join(map(read_file, scripts))
 
     @property
     def policy(self) -> str:
-        """Its content security policy: its own styles and script, pictures inside it, and nothing else."""
+        """Content security policy of the page: its own styles and scripts, embedded pictures, and nothing else."""
         styles, script = (
             f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" if text else "'none'"
             for text in self._code
@@ -260,7 +264,7 @@ class Page:
 
     @staticmethod
     def anchors(titles: Sequence[str]) -> list[str]:
-        """The name of each section of a page with these titles, for links: of letters and digits, no two alike."""
+        """Return a unique link name for each title, of letters, digits and hyphens."""
         found: list[str] = []
         for k, title in enumerate(titles):
             name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:40]
@@ -286,13 +290,13 @@ class Page:
 
 
 def shown(value: object) -> str:
-    """A value as the text that a page shows: no control or direction character, whoever wrote it."""
+    """Return a value as text for a page, with control and direction characters escaped."""
     return plain_text(str(value), keep=_STAY)
 
 
 @cache
 def read_file(name: str) -> str:
-    """A file of this folder, as text."""
+    """Return the text of a file of this folder."""
     return files(__package__).joinpath(name).read_text("utf-8")
 
 

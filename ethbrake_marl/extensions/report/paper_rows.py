@@ -1,4 +1,4 @@
-"""The rows of the paper's two tables, and which evaluations they are about."""
+"""Rows of the paper's two tables, and the check that an evaluation is about the same test."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ethbrake_marl.scenario.task import Task
 
 @dataclass(frozen=True, slots=True)
 class PaperRow:
-    """One row of a table of the paper, as printed; the paper reports a single harm and no intervals."""
+    """One row of a table of the paper, as printed. The paper reports a single harm and no intervals."""
 
     table: Literal["random test", "hybrid test"]
     agent: str  # the paper's name
@@ -24,7 +24,7 @@ class PaperRow:
     collisions: int
     collision_rate: float
     average_harm: float  # m2/s2
-    harm_decrease: float | None  # relative to Non-E, as printed
+    harm_decrease: float | None  # share of Non-E's harm that is saved, as printed
 
 
 PAPER_ROWS = (
@@ -59,17 +59,17 @@ PAPER_NOTE = (
     " tuned to these rows. docs/paper.md goes through the paper's equations, figures and tables one by one."
 )
 
-_SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the variant of which the note speaks
+_SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the variant that PAPER_NOTE mentions
 
 
 def is_papers_test(task: Task, seed: int | None) -> bool:
-    """Whether the paper's rows are about this: Vehicle 2 in a list of its random test, as shipped."""
+    """Return whether the paper's rows apply: Vehicle 2 in a list of the paper's random test, as shipped."""
     scenario = task.scenario
     return scenario.name in _SHOWN_WITH and seed is not None and task.vehicles == (1,) and is_as_shipped(scenario)
 
 
 def check_papers_test(task: Task, seed: int | None) -> None:
-    """Raise ``InvalidInput`` where the paper's rows are about something else."""
+    """Raise ``InvalidInput`` unless the paper's rows apply."""
     if not is_papers_test(task, seed):
         raise InvalidInput(
             f"paper: the paper's rows are about Vehicle 2 in a list of {' or '.join(_SHOWN_WITH)} as shipped, and these"
@@ -79,13 +79,13 @@ def check_papers_test(task: Task, seed: int | None) -> None:
 
 
 def summarise_beside_paper(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTable:
-    """``summarise``, with the rows of the paper's tables below; ``InvalidInput`` where they are about another test."""
+    """Return ``summarise`` with the rows of the paper's tables below; ``InvalidInput`` if they do not apply."""
     check_papers_test(evaluation.task, evaluation.seed)
     return with_paper_rows(summarise(evaluation, baseline=baseline))
 
 
 def with_paper_rows(table: SummaryTable) -> SummaryTable:
-    """The table with the rows of the paper's tables below it."""
+    """Return the table with the rows of the paper's tables below it."""
     return SummaryTable(table, _beside())
 
 

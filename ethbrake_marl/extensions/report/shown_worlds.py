@@ -1,4 +1,4 @@
-"""The worlds that a report shows: the worst, the typical, and some drawn at random; and every agent in each."""
+"""Choice of the worlds that a report shows: the worst, the typical, and some at random."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MOST_WORLDS = 50
 
 WORST = 10
 
-_EACH = 5  # of the other kinds
+_EACH = 5  # number of worlds of each other kind
 
 _RANDOM_SEED = 0
 
@@ -34,7 +34,10 @@ WORDS = {
 
 
 def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS) -> dict[int, Played]:
-    """Up to ``most`` worlds to look at, by row: where ``focus`` did worst, best against full braking, as usual."""
+    """Choose up to ``most`` worlds to show, by row.
+
+    They are worlds where ``focus`` did worst, best against full braking, and typically, and worlds at random.
+    """
     outcome = evaluation.outcome(focus)
     found: dict[int, Played] = {}
     total, first = outcome.total_harm, outcome.first_impact_harm
@@ -61,7 +64,7 @@ def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS)
 
 
 def worst_rows(evaluation: Evaluation, focus: str) -> Ints:
-    """The ten worlds of the largest regret in total harm, or of the largest total harm where no best is known."""
+    """Return the ten worlds with the largest regret in total harm, or the largest total harm if no best is known."""
     outcome, regrets = evaluation.outcome(focus), regrets_of(evaluation)
     value = outcome.total_harm if regrets is None else regrets.regret(outcome, "total")
     return _largest(value, value > 0.0)[:WORST]

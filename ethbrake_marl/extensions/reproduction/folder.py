@@ -1,4 +1,4 @@
-"""The folder of a reproduction: what was asked for, a page of everything, and a folder for each item."""
+"""The folder of a reproduction: its settings, and the types that describe its items and their results."""
 
 from __future__ import annotations
 
@@ -35,29 +35,29 @@ SETTINGS, RESULT = "reproduction.json", "result.json"
 
 FORMAT = {"format": "ethbrake-reproduction", "format_version": 2}
 
-LIMIT_BYTES = 16 << 20  # of a figure that is read again
+LIMIT_BYTES = 16 << 20  # largest size of a figure file that is read again
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reproduction:
-    """What a reproduction is asked for."""
+    """Settings of a reproduction."""
 
     mode: Mode
-    folder: Path  # of everything; its trainings are read from there
-    episodes: int = MOST_EPISODES  # the most worlds of any list; the paper has 10,000
+    folder: Path  # folder of all results, and of the trainings
+    episodes: int = MOST_EPISODES  # largest number of worlds of a list; the paper has 10,000
     tell: OnProgress = lambda progress: None
-    machine: str = ""  # in words
-    docs: Path | None = None  # a page of the results as Markdown
+    machine: str = ""  # description of the machine
+    docs: Path | None = None  # Markdown page of the results to write
 
     def __post_init__(self) -> None:
-        """Refuse a page whose name does not end in ``.md``, or that cannot be written."""
+        """Raise ``InvalidInput`` if the name of the Markdown page does not end in ``.md``, or it cannot be written."""
         if self.docs is not None:
             if self.docs.suffix != ".md":
                 raise InvalidInput(f"{self.docs}: must end in .md")
             check_target(self.docs, force=True)
 
     def seeds_of(self, wanted: Collection[str]) -> list[tuple[Group, str, list[Path]]]:
-        """Each recipe of these groups of trainings, in their order, with the folders of its seeds; none of --quick."""
+        """Return each recipe of these groups, in order, with the folders of its seeds; empty without --full."""
         return [
             (
                 group,
@@ -70,7 +70,7 @@ class Reproduction:
         ]
 
     def trained(self, wanted: Collection[str]) -> dict[str, list[Path]]:
-        """The recipes of these groups all of whose seeds are trained, as ``group/recipe``, with their folders."""
+        """Return the recipes of these groups whose seeds are all trained, as ``group/recipe``, with their folders."""
         return {
             f"{group.name}/{name}": paths
             for group, name, paths in self.seeds_of(wanted)
@@ -78,7 +78,10 @@ class Reproduction:
         }
 
     def seconds_left(self, wanted: Collection[str]) -> float:
-        """Seconds of one core that the trainings of these groups still take, begun ones reckoned whole."""
+        """Return the remaining seconds of one core for the trainings of these groups.
+
+        Unfinished trainings count in full.
+        """
         return sum(
             group.trained[name][0].decisions / group.trained[name][0].per_s
             for group, name, paths in self.seeds_of(wanted)
@@ -87,7 +90,7 @@ class Reproduction:
         )
 
     def train(self, wanted: Collection[str]) -> bool:
-        """Train what is left of these groups, in their order; False when Ctrl-C stopped it."""
+        """Run the remaining trainings of these groups, in order. Return False if Ctrl-C stopped them."""
         from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
 
         for group in groups().values():
@@ -99,7 +102,7 @@ class Reproduction:
         return True
 
     def cost(self, items: Sequence[Item]) -> str:
-        """What is left to do and about how long it takes, in one line."""
+        """Describe the remaining work and its approximate time in one line."""
         wanted = {group for item in items for group in item.trained} if self.mode == "full" else set()
         told = (
             f"to do: {count_of(len(items), 'item')}, at most about {sum(item.most_s for item in items)} s of one core"
@@ -110,7 +113,7 @@ class Reproduction:
 
 @model(frozen=True, config=WRITTEN)
 class Parameter:
-    """A quantity that shapes an item, and who says what it is."""
+    """A quantity that affects an item, and the origin of its value."""
 
     name: str
     value: str
@@ -118,13 +121,13 @@ class Parameter:
 
 
 def stated(name: str, value: str, where: str) -> Parameter:
-    """A quantity that the paper states there; an empty place makes it ours."""
+    """Return a parameter that the paper states at ``where``; if ``where`` is empty it is our default."""
     return Parameter(name, value, f"stated in the paper ({where})") if where else Parameter(name, value)
 
 
 @model(frozen=True, config=WRITTEN)
 class Table:
-    """A table as it is shown: each cell a value, and an interval where there is one."""
+    """A table as text: each cell has a value and, if there is one, an interval."""
 
     title: str
     head: Sequence[str]
@@ -134,28 +137,28 @@ class Table:
 
 @model(frozen=True, config=WRITTEN)
 class Drawn:
-    """A figure; ``text`` says in words what it shows."""
+    """A figure's file stem, title and description in words."""
 
-    stem: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,63}$")]  # of its files
+    stem: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,63}$")]  # stem of its files
     title: str
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """What became of an item."""
+    """Result of making an item, before it is written."""
 
     verdicts: Sequence[Verdict]
     parameters: Sequence[Parameter]
     tables: Sequence[Sheet] = ()
     figures: Mapping[Drawn, Figure] = field(default_factory=dict)
     data: Mapping[str, str] = field(default_factory=dict)  # stem of a CSV file -> its text
-    notes: Sequence[str] = ()  # computed sentences: what was run, what was not
+    notes: Sequence[str] = ()  # generated sentences on what was run and what was not
 
 
 @model(frozen=True, config=WRITTEN, kw_only=True)
 class Result:
-    """An item and what became of it, as its file holds it and pages show it."""
+    """An item and its result, as stored in its file and shown on pages."""
 
     name: str
     labels: Sequence[str]
@@ -176,7 +179,7 @@ class Result:
     notes: Sequence[str]
 
     def in_words(self) -> dict[str, Any]:
-        """As plain data, each cell of a table one text."""
+        """Return the result as plain data, with each cell of a table as one text."""
         tables = [
             {**asdict(table), "rows": [[cell.in_words for cell in row] for row in table.rows]} for table in self.tables
         ]
@@ -185,27 +188,27 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One figure or table of the paper, and what makes it again."""
+    """One figure or table of the paper, and the function that reproduces it."""
 
-    name: str  # on the command line, and of its folder
-    labels: tuple[str, ...]  # in the paper's source
+    name: str  # name on the command line and of its folder
+    labels: tuple[str, ...]  # labels in the paper's source
     title: str
-    what: str  # the paper's figure or table, in a sentence
+    what: str  # description of the paper's figure or table, one sentence
     make: Callable[[Reproduction], Made]
-    most_s: float  # processor seconds at the paper's numbers of worlds, and a little more
-    trained: tuple[str, ...] = ()  # the groups of trainings that it shows with ``--full``
-    play: Callable[[], Part] | None = None  # episodes to watch on its page
+    most_s: float  # upper estimate of processor seconds with the paper's numbers of worlds
+    trained: tuple[str, ...] = ()  # groups of trainings that it shows with ``--full``
+    play: Callable[[], Part] | None = None  # makes the player of episodes for its page
 
 
 def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A CSV file; an estimate takes three columns: value, low, high."""
+    """Return a CSV file as text. An estimate takes three columns: value, low, high."""
     parts = ([(e.value, *(e.interval or ("", ""))) if isinstance(e, Estimate) else (e,) for e in row] for row in rows)
     return csv_of([dict(zip(head, chain(*row), strict=True)) for row in parts], head)
 
 
 _SETTING = "sec:result, text to Fig:Harm-ivds"
 
-_QUANTITIES = (  # name, key of a scenario, unit, where the paper states it
+_QUANTITIES = (  # name, key of a scenario, unit, place where the paper states it
     ("braking capacities", "braking_capacity_mps2", "m/s²", _SETTING),
     ("driving capacities", "driving_capacity_mps2", "m/s²", _SETTING),
     ("masses", "mass_t", "t", _SETTING),
@@ -224,9 +227,9 @@ FIRST_IMPACTS = stated("harm", "each pair's first impact", "sec:result, Experime
 
 
 def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
-    """The quantities of a scenario, each with its origin.
+    """Return the quantities of a scenario, each with its origin.
 
-    ``places`` changes for a key where the paper states it; an empty text makes it ours.
+    ``places`` overrides the place where the paper states a key; an empty text marks our default.
     """
     content = scenario.model_dump(mode="json", exclude_none=True)
     found = [
@@ -239,7 +242,7 @@ def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
 
 
 def list_parameter(episodes: int, where: str = "") -> Parameter:
-    """How many worlds were drawn, and from which seed (which is ours: the paper says "a fixed random seed")."""
+    """Return the number of worlds and their seed. The seed is ours: the paper only says "a fixed random seed"."""
     return stated("worlds", f"{episodes:,}, the first of the list of seed {LIST_SEED}", where)
 
 
@@ -261,9 +264,9 @@ def json_text(content: Mapping[str, Any]) -> bytes:
 
 
 def checked_result(content: Mapping[str, Any], where: Path | str, name: str) -> Result:
-    """The result in the file of an item.
+    """Return the result in an item's file.
 
-    Raises ``InvalidInput`` where what pages show is not there or of another kind, or another item's.
+    Raises ``InvalidInput`` if an entry is missing or has another type than pages need, or if it is another item's.
     """
     try:
         result = TypeAdapter(Result).validate_json(json.dumps(content))

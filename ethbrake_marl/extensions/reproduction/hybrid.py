@@ -1,4 +1,4 @@
-"""The paper's hybrid around a policy that has not converged: ``Fig:hybrid illu`` and ``Table:hybrid``."""
+"""The paper's hybrid (``Fig:hybrid illu``, ``Table:hybrid``) and its random test (``Table:Random``)."""
 
 from __future__ import annotations
 
@@ -46,13 +46,16 @@ _ALONE, _REALISED, _AS_PRINTED = "policy alone", "hybrid, realised H*", "hybrid,
 
 
 def _drive_hybrid(name: str, settings: Reproduction, reading: Reading) -> Evaluation:
-    """The strategies on the worlds of a scenario."""
+    """Evaluate the strategies on the worlds of a scenario."""
     return _driven_hybrid(name, settings, reading, unconverged_policy(settings)[1])
 
 
-@lru_cache(maxsize=2 * len(READINGS))  # figure and table share what they drive
+@lru_cache(maxsize=2 * len(READINGS))  # figure and table share the evaluations
 def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: str) -> Evaluation:
-    """... with the policy that is told ``about``: a training that has ended since takes the place of a shipped one."""
+    """Evaluate the strategies with the unconverged policy that ``about`` describes.
+
+    ``about`` is part of the cache key, so that a training that ends meanwhile replaces a shipped policy.
+    """
     scenario, (policy, _) = reading.scenario(name), unconverged_policy(settings)
     agents: dict[str, Agent] = {
         **lineup(scenario, PAIRWISE, COUPLED),
@@ -64,9 +67,10 @@ def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: s
 
 
 def reproduce_illustration(settings: Reproduction) -> Made:
-    """Harm of E-V2X-BM, of a policy that has not converged, and of the hybrid, over the total distance.
+    """Reproduce the harm of E-V2X-BM, an unconverged policy and the hybrid over the total distance.
 
-    Judged is whether it "consistently selects the strategy that results in lower harm": in each world, in each group.
+    The paper's claim that the hybrid "consistently selects the strategy that results in lower harm" is judged in each
+    world and in each group.
     """
     found, verdicts = {}, []
     for reading in READINGS:
@@ -92,7 +96,7 @@ def reproduce_illustration(settings: Reproduction) -> Made:
 
 
 def reproduce_hybrid_table(settings: Reproduction) -> Made:
-    """The 5,000 episodes of the paper's table, with both speeds that it may mean."""
+    """Reproduce the paper's table of 5,000 episodes, with both readings of its initial speeds."""
     ours = {
         "E-V2X-BM": (NAMES[PAIRWISE], NAMES[COUPLED]),
         "Standalone DRL": (_ALONE,),
@@ -123,7 +127,7 @@ def reproduce_hybrid_table(settings: Reproduction) -> Made:
 
 
 def reproduce_random_table(settings: Reproduction) -> Made:
-    """Collisions, harm and its decrease of the four strategies in the random test (``Table:Random``)."""
+    """Reproduce collisions, harm and its decrease of the four strategies in the random test (``Table:Random``)."""
     episodes, besides = min(_RANDOM_WORLDS, settings.episodes), []
     ours: dict[str, tuple[str, ...]] = {
         "Non-E": (NAMES[FULL_BRAKE],),

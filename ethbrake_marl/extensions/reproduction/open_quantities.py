@@ -1,5 +1,6 @@
-"""Quantities that the paper leaves open: what it says of each, our default, alternatives, and how far the headline of
-the random test moves when one of them changes.
+"""Sensitivity of the random test to quantities that the paper leaves open.
+
+For each quantity: what the paper says, our default, alternatives, and how far the headline numbers move.
 """
 
 from __future__ import annotations
@@ -42,13 +43,13 @@ from ethbrake_marl.training.run_folder import RunDirectory
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alternative:
-    """Another reading of a quantity, and how it is put into the random test."""
+    """Another reading of a quantity, and how to apply it to the random test."""
 
     value: str
-    changes: Mapping[str, Any] = field(default_factory=dict)  # of the scenario
-    seed: int | None = None  # of the list
-    harm: Literal["first", "total", "sampled", "predicted"] = "first"  # what is counted
-    bound: Literal["coupled", "pairwise"] | None = None  # of the hybrid that drives in the place of PPO
+    changes: Mapping[str, Any] = field(default_factory=dict)  # changed keys of the scenario
+    seed: int | None = None  # seed of the list of worlds
+    harm: Literal["first", "total", "sampled", "predicted"] = "first"  # harm that is counted
+    bound: Literal["coupled", "pairwise"] | None = None  # H* of the hybrid that replaces PPO; None: PPO itself
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,10 +57,10 @@ class Gap:
     """A quantity that the paper leaves open, or that can be read in two ways."""
 
     name: str
-    paper: str  # what it says, with the label in its source
-    ours: str
+    paper: str  # statement of the paper, with the label in its source
+    ours: str  # our default
     alternatives: tuple[Alternative, ...] = ()
-    otherwise: str = ""  # why there are none
+    otherwise: str = ""  # reason for the lack of alternatives
 
 
 def _of(key: str, *values: float, unit: str = "") -> tuple[Alternative, ...]:
@@ -119,12 +120,12 @@ _SHOWN = tuple(NAMES[spec] for spec in _SPECS)
 class Headline:
     """Harm and collisions of each strategy in each world of a list."""
 
-    gaps_m: Floats  # [n, P] by which lists of the same worlds are known
-    harm: Mapping[str, Floats]
-    collided: Mapping[str, Bools]
+    gaps_m: Floats  # [n, P] gaps, to recognise lists of the same worlds
+    harm: Mapping[str, Floats]  # by strategy, [n] m2/s2
+    collided: Mapping[str, Bools]  # by strategy, [n]
 
     def change(self, base: Headline, strategy: str) -> Estimate:
-        """Harm minus that of ``base``: paired by world where the worlds are the same, else of two lists."""
+        """Return the harm minus that of ``base``: paired by world if the worlds are the same, else unpaired."""
         own, other = self.harm[strategy], base.harm[strategy]
         if np.array_equal(self.gaps_m, base.gaps_m):
             return paired_difference(own, other)
@@ -132,7 +133,7 @@ class Headline:
 
 
 def reproduce_gaps(settings: Reproduction) -> Made:
-    """The sensitivity table: every quantity, our default, alternatives, and how far the headline moves."""
+    """Make the sensitivity table: every quantity, our default, alternatives, and how far the headline numbers move."""
     episodes, scenario = min(2_000, settings.episodes), load_scenario(RANDOM)
     base = _measure(scenario, Alternative("default"), episodes)
     measured = [gap for gap in GAPS if gap.alternatives]
@@ -228,7 +229,10 @@ def reproduce_gaps(settings: Reproduction) -> Made:
 
 
 def _measure(scenario: Scenario, alternative: Alternative, episodes: int) -> Headline:
-    """The strategies in one alternative; a strategy that predicts no harm has its first-impact harm."""
+    """Evaluate the strategies in one alternative.
+
+    A strategy that predicts no harm counts with its first-impact harm.
+    """
     own = scenario.replace(**alternative.changes) if alternative.changes else scenario
     agents: dict[str, Agent] = lineup(own, *_SPECS)
     if alternative.bound is not None:

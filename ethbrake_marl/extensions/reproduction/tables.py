@@ -1,4 +1,4 @@
-"""Our rows beside those of the paper's tables: what agrees, what differs, and what no strategy can reach."""
+"""Compare our rows with the paper's tables: what agrees, what differs, and what no strategy can reach."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ _UNDERCUT = {_RATE: "worlds in which no command avoids an impact", _MEAN_HARM: "
 
 
 def collision_rate(collided: Bools) -> Estimate:
-    """Share of worlds with an impact."""
+    """Return the share of worlds with an impact."""
     return rate(int(collided.sum()), len(collided))
 
 
 @dataclass(frozen=True)
 class Beside:
-    """Our results in one reading, to stand beside the paper's rows."""
+    """Our results in one reading, for comparison with the paper's rows."""
 
     title: str
     evaluation: Evaluation
-    ours: Mapping[str, Sequence[str]]  # the paper's row -> our strategies, the first is the one compared
+    ours: Mapping[str, Sequence[str]]  # row of the paper -> our strategies; the first one is compared
 
     @cached_property
     def numbers(self) -> dict[str, dict[str, Estimate]]:
-        """Every quantity of every strategy, and of nobody in particular what is proven to be the least."""
+        """Every quantity of every strategy, and the proven minimum under ``NOBODY``."""
         found, braking = {}, self.evaluation.outcomes.get(NAMES[FULL_BRAKE])
         for name, outcome in self.evaluation.outcomes.items():
             harm, predicted = outcome.first_impact_harm, outcome.predicted_harm
@@ -60,7 +60,7 @@ class Beside:
         return found
 
     def candidates(self, row: str, quantity: str) -> Iterator[tuple[str, Estimate]]:
-        """Everything of ours that may be meant by a number of a row, the compared one first."""
+        """Yield our numbers to which a number in a row of the paper may correspond, the compared one first."""
         for name in self.ours[row]:
             if quantity in self.numbers[name]:
                 yield f"{name} ({self.title})", self.numbers[name][quantity]
@@ -72,14 +72,14 @@ class Beside:
 
 
 def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list[Verdict]:
-    """One verdict per reading, row and quantity."""
+    """Return one verdict per reading, row and quantity."""
     verdicts = []
     for beside in besides:
         least = beside.numbers.get(NOBODY, {})
         for row in printed:
             numbers = {_RATE: row.collision_rate, _MEAN_HARM: row.average_harm, _DECREASE: row.harm_decrease}
             for quantity, number in numbers.items():
-                if not number:  # the decrease of the baseline, or none is printed
+                if not number:  # 0 is the baseline's decrease; None is not printed
                     continue
                 (_, ours), *own = beside.candidates(row.agent, quantity)
                 others = [other.candidates(row.agent, quantity) for other in besides if other is not beside]
@@ -97,9 +97,9 @@ def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list
 
 
 def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdict:
-    """Whether a choice between two strategies, world by world, can avoid as many collisions as is printed.
+    """Judge whether a choice between two strategies, world by world, can avoid as many collisions as printed.
 
-    It avoids a collision only where one of the two does: at most as many as both together.
+    It avoids a collision only where one of the two strategies does, so at most as many as both together.
     """
     avoided = [row.episodes - row.collisions for row in (one, other, chosen)]
     together = avoided[0] + avoided[1]
@@ -112,7 +112,7 @@ def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdi
 
 
 def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
-    """Whether a printed harm decrease follows from the printed harms, to the printed digits."""
+    """Judge whether a printed harm decrease follows from the printed harms, to the printed digits."""
     follows = 1.0 - row.average_harm / baseline.average_harm
     printed = row.harm_decrease or 0.0
     told = (
@@ -123,7 +123,7 @@ def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
 
 
 def rows_table(beside: Beside) -> Sheet:
-    """Our rows of one reading, with what no strategy undercuts."""
+    """Return the table of our rows in one reading, with the proven minimum."""
     columns: dict[str, Column | str] = {
         _RATE: PERCENT, _MEAN_HARM: "First-impact harm", _TOTAL: "Total harm", _PREDICTED_HARM: "Predicted harm",
         _DECREASE: replace(PERCENT, heading="Harm decrease"),
@@ -143,7 +143,7 @@ def beside_printed(
     parameters: Sequence[Parameter],
     notes: Sequence[str] = (),
 ) -> Made:
-    """A table of the paper, and ours in each reading."""
+    """Make an item from a table of the paper and our rows in each reading."""
     columns: dict[str, list[str]] = {
         "Strategy": [row.agent for row in printed],
         "Collisions": [f"{row.collisions:,}" for row in printed],

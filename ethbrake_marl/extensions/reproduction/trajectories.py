@@ -47,11 +47,11 @@ _SCENARIOS = (1, 2)
 
 _CELLS = [(reading, number) for reading in READINGS for number in _SCENARIOS]
 
-Records = dict[tuple[Reading, int, str], EpisodeRecord]  # reading, scenario, strategy
+Records = dict[tuple[Reading, int, str], EpisodeRecord]  # by reading, scenario and strategy
 
 
 def reproduce_trajectories(settings: Reproduction) -> Made:
-    """Positions of the three vehicles in both scenarios, against the vehicle and against time."""
+    """Reproduce the positions of the three vehicles in both scenarios, on the road and over time."""
     records, figures, verdicts = _record_all(settings), {}, []
     for reading, stem in zip(READINGS, ("stated", "early"), strict=True):
         own = {f"{name}, Scenario {k}": records[reading, k, name] for name in _POLICIES for k in _SCENARIOS}
@@ -88,7 +88,7 @@ def reproduce_trajectories(settings: Reproduction) -> Made:
 
 
 def reproduce_accelerations(settings: Reproduction) -> Made:
-    """Commands of Vehicle 2 in both scenarios."""
+    """Reproduce the commands of Vehicle 2 in both scenarios."""
     records, verdicts = _record_all(settings), []
     driven = {key: _asked_of_vehicle_2(record) for key, record in records.items()}
     panels = {
@@ -142,7 +142,7 @@ def _record_all(settings: Reproduction) -> Records:
 
 @cache
 def play() -> Part:
-    """Both scenarios in both readings, PPO and SAC side by side, for the page."""
+    """Return the player for the page: both scenarios in both readings, PPO and SAC side by side."""
     found = []
     for reading, number in _CELLS:
         scenario = reading.scenario(f"paper-scenario-{number}")
@@ -168,7 +168,10 @@ def _parameters() -> list[Parameter]:
 
 
 def _both(records: Records, reading: Reading, number: int, what: str, column: int) -> tuple[Floats, Floats]:
-    """A column of PPO's and SAC's record at equal times until the later one ends; beyond its end it stays."""
+    """Return a column of PPO's and of SAC's record at equal times until the later one ends.
+
+    The record that ends first keeps its last value.
+    """
     pair = [records[reading, number, name] for name in _POLICIES]
     times = np.arange(0.0, float(max(record.time_s[-1] for record in pair)), 0.02)
     one, other = (np.interp(times, each.time_s, getattr(each, what)[:, column]) for each in pair)
@@ -176,13 +179,13 @@ def _both(records: Records, reading: Reading, number: int, what: str, column: in
 
 
 def _apart(records: Records, reading: Reading, what: str) -> list[float]:
-    """In each scenario, the root mean square difference between Vehicle 2 under PPO and under SAC."""
+    """Return for each scenario the root mean square difference between Vehicle 2 under PPO and under SAC."""
     pairs = (_both(records, reading, number, what, 1) for number in _SCENARIOS)
     return [float(np.sqrt(np.mean((one - other) ** 2))) for one, other in pairs]
 
 
 def _judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Reading, show: Column) -> list[Verdict]:
-    """Claims, each with the numbers that it follows from, the smaller and the larger: of one world, no intervals."""
+    """Judge claims about one world, without intervals. Each has a text, the smaller number and the larger number."""
     return [
         judge_statement(f"{claim} ({reading.name})", [Less(told, Estimate(smaller - larger, None))], show=show)
         for claim, (told, smaller, larger) in claims.items()
@@ -190,9 +193,9 @@ def _judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Re
 
 
 def _asked_of_vehicle_2(record: EpisodeRecord) -> tuple[float, float, float]:
-    """Its command at its first decision (m/s2), how far that goes up and down from then on (m/s2), and its braking.
+    """Return Vehicle 2's first command (m/s2), the sum of its changes of command (m/s2), and its share of braking.
 
-    That is the share of the time until its standstill in which it brakes.
+    The share of braking is over the time until its standstill.
     """
     acting = record.time_s >= float(record.initial.vehicles.latency_s[0, 1])
     command, moving = record.command_mps2[acting, 1], record.speeds_mps[acting, 1] > 0.0

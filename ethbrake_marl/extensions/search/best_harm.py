@@ -1,4 +1,7 @@
-"""The least harm known in each world, from a search over whole command profiles."""
+"""Best known harm of each world, from a search over whole command profiles.
+
+A *profile* holds the commands of the controlled vehicles over a whole episode, as phases of constant command.
+"""
 
 from __future__ import annotations
 
@@ -34,9 +37,9 @@ SEARCH_BUDGET = 100_000  # candidates per world and count
 
 CHUNK = 200  # worlds between two reports of progress
 
-CONSTANTS = 29  # even grid of constant commands from which every search also starts
+CONSTANTS = 29  # number of evenly spaced constant commands with which every search starts
 
-Progress = Callable[[int, int], None]  # worlds done, of how many
+Progress = Callable[[int, int], None]  # called with the number of worlds done and their total
 
 
 def best_harm(
@@ -54,8 +57,8 @@ def best_harm(
 
     ``vehicles`` are the controlled ones (default: the scenario's learners); all others follow their scripts. With both
     counts, each may take the other's result. The result is never worse than the best constant deceleration of a
-    controlled vehicle (other controlled ones braking fully), than the same search with one of them alone, or than what
-    is ``known`` (a table with these vehicles), from which the search then starts. It does not depend on ``threads``
+    controlled vehicle (with the other controlled ones braking fully), than the same search with one of them alone, or
+    than ``known`` (a table for these vehicles), with which the search then starts. It does not depend on ``threads``
     (default: every core) or on the batch. Raises ``InvalidInput`` for no vehicle, a script whose command is not fixed
     at the alert, no count, or a budget below 1.
     """
@@ -106,13 +109,13 @@ def search_list(
     chunks: Path | None = None,
     on_progress: Progress | None = None,
 ) -> BestHarmTable:
-    """``best_harm`` of a long list, ``CHUNK`` worlds at a time, resumable.
+    """Run ``best_harm`` on a long list, ``CHUNK`` worlds at a time, resumable.
 
-    With ``chunks``, a folder, each finished chunk is kept there as a file, and a later call with the same question
-    takes it from there. A file that answers another question is computed anew and replaced. A world that cannot be
-    advanced (a defect of the physics) is left out: no table holds it, and the header names it under ``LEFT_OUT``.
-    Raises ``InvalidInput``, as ``best_harm`` does, and if ``known`` holds no world of the list; ``PhysicsError`` if no
-    world is left.
+    With a folder ``chunks``, each finished chunk is stored there as a file, and a later call with the same question
+    reads it. A file that answers another question is computed again and replaced. A world that the physics cannot
+    advance (a defect) is left out: no table holds it, and the header lists it under ``LEFT_OUT``. Raises
+    ``InvalidInput`` as ``best_harm`` does, and if ``known`` holds no world of the list; ``PhysicsError`` if no world is
+    left.
     """
     parts: list[BestHarmTable] = []
     left_out: dict[int, str] = {}
@@ -147,7 +150,10 @@ def search_list(
 def _kept_or_searched(
     task: Task, every: Worlds, file: Path | None, options: dict[str, Any], rows: Ints
 ) -> BestHarmTable:
-    """A chunk of a list, its ``rows``: from its file where that answers the same question, else searched, and kept."""
+    """Return the table of a chunk, from its file if that answers the same question, else by search.
+
+    ``rows`` are the chunk's rows in the list. A new table is stored in the file.
+    """
     worlds = every.take(rows)
     known = options["known"]
     question = {"counts": list(options["counts"]), "budget": options["budget"], "search_seed": options["seed"]}
@@ -165,7 +171,7 @@ def _kept_or_searched(
 
 
 def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path) -> tuple[int, list[Path]]:
-    """Worlds that ``search_list`` would search, with both counts, not finding them kept; and what it finds damaged."""
+    """Return how many worlds ``search_list`` would still search with both counts, and the damaged chunk files."""
     left, damaged = 0, []
     identity = task_problem(sample.worlds, Task(scenario, scenario.learners)).identity
     question = {"counts": list(HARM_COUNTS), "budget": budget, "search_seed": 0}
@@ -181,12 +187,12 @@ def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path
 
 
 def chunk_file(chunks: Path, first: int) -> Path:
-    """Where the chunk that begins with world ``first`` is kept."""
+    """Return the file of the chunk that begins with world ``first``."""
     return chunks / f"{first:07d}.npz"
 
 
 def kept_chunk(file: Path, identity: UInt64s, question: Mapping[str, object]) -> BestHarmTable | None:
-    """A kept chunk, if it is there and answers this very question; raises ``CorruptBundle`` for a damaged one."""
+    """Return a stored chunk if it exists and answers this question. Raises ``CorruptBundle`` for a damaged one."""
     if not file.is_file():
         return None
     table = BestHarmTable.load(file)
@@ -195,7 +201,7 @@ def kept_chunk(file: Path, identity: UInt64s, question: Mapping[str, object]) ->
 
 
 def scripted_commands(worlds: Worlds, task: Task) -> Floats:
-    """The commands [n, N] of all vehicles but those of the task; full braking in the columns of these.
+    """Return the commands [n, N] of all vehicles except those of the task, whose columns hold full braking.
 
     Raises ``InvalidInput`` for a script whose command is not fixed at the alert.
     """
@@ -204,9 +210,9 @@ def scripted_commands(worlds: Worlds, task: Task) -> Floats:
 
 
 def task_problem(worlds: Worlds, task: Task) -> ProfileProblem:
-    """The problem of choosing the profiles of the task's vehicles in worlds at t = 0.
+    """Return the problem of choosing the profiles of the task's vehicles in worlds at t = 0.
 
-    Its ``identity`` tells a world from any other; that does not depend on the count.
+    Its ``identity`` distinguishes a world from any other; it does not depend on the count.
     """
     return _problem(worlds, task, scripted_commands(worlds, task), task.vehicles)
 
@@ -223,7 +229,7 @@ def _searched(
     worlds: Worlds, task: Task, others: Floats, given: Sequence[Profiles], deciders: Sequence[int],
     effort: dict[str, int],
 ) -> Found:  # fmt: skip
-    """The best profiles that start from constants, from ``given``, and from each vehicle's own best profile."""
+    """Return the best profiles of a search that starts with constants, ``given``, and each vehicle's own best."""
     problem = _problem(worlds, task, others, deciders)
     starts = [problem.constant(problem.even_grid(CONSTANTS)), *given]
     if len(task.vehicles) == 1:
@@ -246,7 +252,7 @@ def _searched(
 
 
 def _startable(profiles: Profiles) -> Profiles:
-    """Those with as few phases as a search can start from; the others hold their first command."""
+    """Replace profiles with too many phases for a search by their first command, held to the end."""
     ends, commands = Profiles.padded([profiles], MOST_PHASES)[0]
     last = ends[:, -1:]
     short = ends[:, MOST_PHASES - 1 : MOST_PHASES] == last
@@ -257,7 +263,7 @@ def _startable(profiles: Profiles) -> Profiles:
 
 
 def _joined(parts: list[Profiles], n: int) -> Profiles:
-    """Several given profiles of each world, [n * Q_j] each, as one list [n * Q] world by world."""
+    """Join several sets of profiles, [n * Q_j] each, into one list [n * Q], world by world."""
     parts = Profiles.padded(parts, MOST_PHASES)
     ends = np.concatenate([part.ends.reshape(n, -1, MOST_PHASES) for part in parts], axis=1)
     shape = (n, -1, MOST_PHASES, parts[0].commands_mps2.shape[2])
@@ -266,9 +272,12 @@ def _joined(parts: list[Profiles], n: int) -> Profiles:
 
 
 def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) -> Profiles:
-    """What ``agent`` commands the vehicle in every step of its episodes, as profiles; equal neighbours are joined."""
+    """Return the commands of ``agent`` in every step of its episodes as profiles.
+
+    Equal neighbouring steps are joined into one phase.
+    """
     commands = record_commands(agent, worlds, task.scenario, task.vehicle, int(last_step.max()))
-    # one phase per change
+    # one phase for each change of command
     steps = commands.shape[1]
     ends = [np.append(np.flatnonzero(row[1:] != row[:-1]) + 1, steps) for row in commands]
     width = max(len(each) for each in ends)
@@ -280,12 +289,12 @@ def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) 
 def fold_episodes(
     table: BestHarmTable, scenario: Scenario, worlds: Worlds, name: str, agents: Mapping[HarmCount, Agent]
 ) -> BestHarmTable:
-    """The table with the episodes of ``agents`` in it where they do less harm; its header says in how many worlds.
+    """Return the table after replacing values that the episodes of ``agents`` undercut; the header counts the worlds.
 
-    ``agents``: for each count, ``name`` made to minimise it. Each drives the scenario's learner through ``worlds``
-    (at t = 0; those that are known to end without harm are left out), and either count takes from either episode.
-    Harms are those of the profiles, driven again. Where an agent cannot drive a world to its end, the table stays
-    as it is. Raises ``InvalidInput`` if the scenario has not exactly one learner.
+    ``agents`` holds for each count the agent ``name``, made to minimise it. Each controls the scenario's learner in
+    ``worlds`` (at t = 0; worlds with known harm 0 are skipped), and each count may take either episode. The harm is
+    that of the profiles when driven again. Where an agent cannot drive a world to its end, the table stays unchanged.
+    Raises ``InvalidInput`` unless the scenario has exactly one learner.
     """
     learners = [scenario.vehicle_names[i] for i in scenario.learners]
     check_one_learner(scenario.name, learners, "agents whose episodes are kept drive exactly one")

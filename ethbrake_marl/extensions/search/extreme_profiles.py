@@ -1,9 +1,9 @@
-"""Profiles of full drive and full braking from which a search starts: drive, brake to the leader, drive; or the
-mirror.
+"""Starting profiles of full drive and full braking for a search.
 
-The proof of the lower bound says what the least harm looks like: the vehicle drives as hard as it can for a while,
-then brakes as hard as it can until it meets the leader; or it brakes, then drives until the rear one meets it. After
-that it goes the other way (docs/avoidability.md). A random search seldom finds such a narrow optimum.
+They drive, brake until they meet the leader, and drive again; or the mirror image with the rear vehicle. The proof of
+the lower bound shows that the least harm has this form: the vehicle drives fully for a while, then brakes fully until
+it meets the leader; or it brakes, then drives until the rear vehicle meets it. After the meeting it does the opposite
+(docs/avoidability.md). A random search seldom finds such a narrow optimum.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from ethbrake_marl.physics.episode import CLOCK, follow_whole
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Bools, Floats, Ints
 
-KEPT = 12  # profiles of each world
+KEPT = 12  # number of profiles of each world
 
-_LATEST_S = 2.0  # of the first change of command, at first
+_LATEST_S = 2.0  # latest first change of command in the first round
 
-_TIMES = 24  # of it that are tried in each round
+_TIMES = 24  # times of the first change that are tried in each round
 
-_ROUNDS = 3  # each closer around the best one
+_ROUNDS = 3  # rounds, each closer around the best time
 
-_PHASES = 5  # before the first change, its step, up to the second one, its step, after it
+_PHASES = 5  # before the first change, its step, until the second change, its step, after it
 
 
 def extreme_profiles(problem: ProfileProblem, states: Floats, has_front: Bools, has_rear: Bools) -> Profiles:
-    """The ``KEPT`` best such profiles of each world [n * KEPT], world by world, of the one controlled vehicle.
+    """Return the ``KEPT`` best extreme profiles of the one controlled vehicle, [n * KEPT], world by world.
 
-    ``states`` [n, WIDTH] is each world at the first decision (as of the bound). It tells only when the two would
-    meet, so a neighbour that does not brake fully makes the profiles less good, not wrong. A neighbour that is not
-    there [n] is not met.
+    ``states`` [n, WIDTH] is each world at the first decision, in the columns of the lower bound. It is only used to
+    find when two vehicles would meet, so a neighbour that does not brake fully makes the profiles less good, not wrong.
+    ``has_front`` and ``has_rear`` [n] say which neighbours exist.
     """
     n, last = problem.n, problem.last_step
     ends = np.repeat(last, KEPT * MOST_PHASES).reshape(n, KEPT, MOST_PHASES)
@@ -57,7 +57,7 @@ def extreme_profiles(problem: ProfileProblem, states: Floats, has_front: Bools, 
 def _fill_extremes(
     problem: ProfileProblem, states: Floats, has_front: Bools, has_rear: Bools, ends: Ints, commands: Floats
 ) -> None:
-    """Fill ``ends`` [n, KEPT, K] and ``commands`` [n, KEPT, K, 1]."""
+    """Fill ``ends`` [n, KEPT, K] and ``commands`` [n, KEPT, K, 1] with the best extreme profiles of each world."""
     no_random = np.zeros(states.shape[0], np.uint64)
     for k in range(states.shape[0]):
         world = make_search_world(problem, k, no_random)
@@ -75,7 +75,7 @@ def try_changes(
     world: SearchWorld, kind: int, at: Floats, start: Floats, low: float, high: float, ends: Ints, commands: Floats,
     values: Floats,
 ) -> float:  # fmt: skip
-    """Try first changes of command from ``low`` to ``high`` (s) and keep the best profiles; the best change."""
+    """Try first changes of command from ``low`` to ``high`` (s), keep the best profiles, and return the best change."""
     plan, other = empty_plan(), empty_plan()
     states = np.zeros((_PHASES + 1, start.shape[0]))
     copy_rows(start.reshape(1, -1), states, 1)
@@ -104,9 +104,11 @@ def try_changes(
 def fill_extreme(
     world: SearchWorld, kind: int, change: float, meeting: float, early: int, share: float, ends: Ints, commands: Floats
 ) -> None:
-    """One profile: from ``change`` to ``meeting`` (s) the other command; ``share`` of the first one in the step of it.
+    """Write one profile, with the other command from ``change`` to ``meeting`` (s).
 
-    In the step of the change the command leads to the speed that the change would. ``early``: so many steps earlier.
+    In the step of the first change, the command leads to the speed that the change in mid-step would. In the step of
+    the second change the first command has the weight ``share``. ``early`` moves the second change earlier by that many
+    steps.
     """
     low, high, step = world.bounds[0, 0], world.bounds[0, 1], world.episode.clock[CLOCK.TIME_STEP]
     last = int(world.episode.clock[CLOCK.LAST_STEP])

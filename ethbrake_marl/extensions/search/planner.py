@@ -10,7 +10,7 @@ import numpy as np
 
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
 from ethbrake_marl.agents.protocol import Agent, Source, fixed_commands
-from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.engine.memory import Memory, renew_memory, take_memory
 from ethbrake_marl.engine.profiles import TIME_STEP_S, ProfileProblem, Profiles, profile_problem
 from ethbrake_marl.engine.scripts import Script
@@ -22,11 +22,11 @@ from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.registry import Part
 
-MOST_CANDIDATES = 1_000_000  # per world and decision
+MOST_CANDIDATES = 1_000_000  # most candidates per world and decision
 
 
 class Outlook(NamedTuple):
-    """How an agent looks ahead for its vehicle: whose harm counts, how far, and when the vehicle decides."""
+    """How an agent looks ahead: which harm counts, how far, and at which decisions."""
 
     harm_count: HarmCount
     horizon_s: float
@@ -34,51 +34,51 @@ class Outlook(NamedTuple):
 
     @property
     def decisions(self) -> int:
-        """Of a whole episode, at most."""
+        """Largest number of decisions in an episode."""
         return int(np.ceil(self.horizon_s / self.time_step_s)) + 1
 
     def problem(self, worlds: Worlds, vehicle: int, others_mps2: Floats) -> ProfileProblem:
-        """The search for the vehicle's profile from now on."""
+        """Return the problem of choosing the vehicle's profile from now on."""
         return profile_problem(
             worlds, [vehicle], harm_count=self.harm_count, horizon_s=self.horizon_s, time_step_s=self.time_step_s,
             others_mps2=others_mps2,
         )  # fmt: skip
 
     def due(self, worlds: Worlds, planned_s: Floats) -> Ints:
-        """The worlds in which it is time to plan again: some vehicle moves, and a decision has come since."""
+        """Return the worlds that need a new plan: something moves, and a decision was due since the last plan."""
         moving = (worlds.speeds_mps != 0.0).any(axis=1)
         return np.flatnonzero((worlds.time_s > planned_s) & (worlds.time_s < self.horizon_s) & moving)
 
     def command(self, worlds: Worlds, memory: Memory) -> Floats:
-        """What ``commands_mps2`` [n, decisions], from ``start_s`` on, say now, [n]."""
+        """Return the present command, [n], from ``commands_mps2`` [n, decisions], which start at ``start_s``."""
         step = Decisions(memory["start_s"], self.time_step_s).latest(worlds.time_s)
         now: Floats = memory["commands_mps2"][np.arange(worlds.n), np.clip(step, 0, self.decisions - 1)]
         return now
 
 
 def budget_of(argument: str) -> int | None:
-    """The number of candidates that an argument is; None: it is none."""
+    """Return the argument as a number of candidates, or None if it is not a valid number."""
     number = int(argument) if re.fullmatch("[0-9]{1,7}", argument) else 0
     return number if 1 <= number <= MOST_CANDIDATES else None
 
 
-CANDIDATES = 256  # per world and decision
+CANDIDATES = 256  # default number of candidates per world and decision
 
 
 class Planner:
-    """Receding horizon: the own profile is searched anew at each decision, the others following their scripts.
+    """Receding-horizon planner: at each decision it searches its own profile, while the others follow their scripts.
 
-    Each search starts from the plan so far, from constants and, at first, from the pairwise optimum. ``predicted_harm``
-    [n] is that of the first plan (m2/s2); no more is done if the others do as expected. Vehicles without a script
-    (learners) are taken to brake fully. Raises ``InvalidInput`` for an unusable argument or count and, when
-    an episode begins, for another vehicle's script whose command is not fixed at the alert.
+    Each search starts from the previous plan, from constants and, at the first decision, from the pairwise optimum.
+    ``predicted_harm`` [n] is the harm of the first plan (m2/s2); the simulated harm is no larger if the others behave
+    as expected. Vehicles without a script (learners) are assumed to brake fully. Raises ``InvalidInput`` for an invalid
+    argument or count and, when an episode begins, for another vehicle's script whose command is not fixed at the alert.
 
     Args:
         argument: candidates per world and decision.
-        harm_count: which harm it minimises, ``first`` or ``total``.
-        horizon_s: until when it looks ahead, s.
-        most_candidates: of a search, whatever the argument says.
-        time_step_s: between two decisions, s.
+        harm_count: harm to minimise, ``first`` or ``total``.
+        horizon_s: time up to which it looks ahead, s.
+        most_candidates: upper limit of the number of candidates, whatever ``argument`` says.
+        time_step_s: time between two decisions, s.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -121,7 +121,7 @@ class Planner:
         return {"plan": plan, "planned_s": start_s, "others_mps2": others, "predicted_harm": harm}
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """The first command of the new plans, [n] m/s2."""
+        """Return the first command of the new plans, [n] m/s2."""
         rows = self._outlook.due(worlds, memory["planned_s"])
         if rows.size:
             now, held = worlds.take(rows), take_memory(memory, rows)
@@ -131,7 +131,7 @@ class Planner:
         return Profiles(*memory["plan"]).commands_mps2[:, 0, 0], memory
 
     def _rest(self, held: Memory, time_s: Floats, problem: ProfileProblem) -> Profiles:
-        """What is left of the plans from ``time_s`` on."""
+        """Return the rest of the plans from ``time_s`` on."""
         plan = Profiles(*held["plan"])
         passed = np.rint((time_s - held["planned_s"]) / self._outlook.time_step_s).astype(np.int64)[:, np.newaxis]
         ends = np.minimum(np.maximum(plan.ends - passed, 0), problem.last_step[:, np.newaxis])
@@ -139,9 +139,9 @@ class Planner:
         return Profiles(ends, plan.commands_mps2)
 
     def _search(self, problem: ProfileProblem, plan: Profiles) -> tuple[Profiles, Floats]:
-        """The best plans found from these and from constants, with their harm under the own count."""
+        """Return the best plans from a search that starts with ``plan`` and constants, and their harm."""
         constants = problem.constant(problem.even_grid(15))
-        n, K = plan.ends.shape  # each world's plan, then its constants: [n * Q]
+        n, K = plan.ends.shape  # [n * Q]: for each world its plan, then constants
         ends = np.concatenate([plan.ends[:, np.newaxis], constants.ends.reshape(n, -1, K)], axis=1)
         commands = constants.commands_mps2.reshape(n, -1, K, 1)
         commands = np.concatenate([plan.commands_mps2[:, np.newaxis], commands], axis=1)
@@ -151,7 +151,7 @@ class Planner:
 
 
 def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """``planner`` or ``planner:CANDIDATES``."""
+    """Make ``planner`` or ``planner:CANDIDATES``."""
     return Planner(
         argument, harm_count=settings.harm_count, horizon_s=settings.horizon_s,
         most_candidates=settings.most_candidates, time_step_s=settings.time_step_s,
@@ -159,7 +159,7 @@ def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
 
 
 def make_estimating_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """``planner:believed`` or ``planner:CANDIDATES:believed``: it searches in the estimated world."""
+    """Make ``planner:believed`` or ``planner:CANDIDATES:believed``, which searches in the estimated world."""
     return Believing(make_planner(argument, settings), settings.needed_scenario(), shows=True)
 
 

@@ -1,9 +1,8 @@
-"""The refinement of an episode: a compiled search around the commands that somebody gives in its steps.
+"""Refine an episode: a compiled random search around the commands of its steps.
 
-Two climbs, each by random changes of a few neighbouring steps: one from the given commands, and one from the best of
-some random templates (one command, another one for a short while, then full braking), as what is best may lie in a
-valley of its own. Everything advances decision by decision, as the engine does: what is found will happen, to the
-bit.
+It climbs twice, by random changes of a few neighbouring steps: from the given commands, and from the best of some
+random templates, because the best may lie in a valley of its own. A *template* is one command, another one for a short
+while, then full braking. Everything advances decision by decision as in the engine, so the result is exact.
 """
 
 from __future__ import annotations
@@ -33,42 +32,41 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.rows import ROW
 from ethbrake_marl.physics.state import Bools, Floats, UInt64s
 
-TEMPLATE_SHARE, THEIR_CLIMB_SHARE = 0.3, 0.3  # of the budget; the rest is for the climb from the given commands
+TEMPLATE_SHARE, THEIR_CLIMB_SHARE = 0.3, 0.3  # shares of the budget; the rest is for the climb from the given commands
 
-ATTENTION_S = 3.0  # from the first decision on; later steps are changed only together with earlier ones
+ATTENTION_S = 3.0  # changes start within this time from the first decision
 
-LONGEST_CHANGE_S = 0.6
+LONGEST_CHANGE_S = 0.6  # longest change
 
-LONGEST_WHILE_S = 0.8  # of a template
+LONGEST_WHILE_S = 0.8  # longest second command of a template
 
-SET_SHARE = 0.1  # of the changes, which replace commands; the others add to them
+SET_SHARE = 0.1  # share of changes that replace commands; the others add to them
 
-FULL_BRAKE_SHARE = 0.8  # of the templates, which begin with full braking
+FULL_BRAKE_SHARE = 0.8  # share of templates that begin with full braking
 
 LN_SMALLEST_CHANGE = (
     -6.907755278982138
-)  # amounts that are added range over three decades below the whole range of commands
+)  # ln of the smallest added amount, relative to the whole range of commands: three decades
 
-WORSE = 5.0  # m2/s2: a template may be worse by so much before it is climbed from
+WORSE = 5.0  # m2/s2; a climb starts from a template only if it is worse by at most this
 
-NO_HARM = 1e-9  # m2/s2
+NO_HARM = 1e-9  # m2/s2; less harm than this counts as none
 
 
 class Plan(NamedTuple):
-    """Commands of one world, and where they lead."""
+    """Commands of one world, and the states that they lead to."""
 
-    commands: Floats  # [T]
-    states: Floats  # [T + 1, S] at the start of each step
+    commands: Floats  # [T] command of each step
+    states: Floats  # [T + 1, S] state at the start of each step
 
 
 def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
     """Search around ``commands_mps2`` [n, T] of the one controlled vehicle, with ``budget`` candidates per world.
 
-    Returns the commands found, never worse than the given ones, and their harm [n] under the problem's count, as
-    the engine counts it (m2/s2).
-    Worlds are independent of each other. Raises ``InvalidInput`` for several vehicles, commands of another shape or
-    beyond a capacity, or a budget below 1, ``PhysicsError`` naming worlds in which the given commands cannot be
-    played.
+    Returns the best commands, never worse than the given ones, and their harm [n] under the problem's count, as the
+    engine counts it (m2/s2). Worlds are independent of each other. Raises ``InvalidInput`` for several vehicles,
+    commands of another shape or beyond a capacity, or a budget below 1, and ``PhysicsError`` with the worlds in which
+    the given commands cannot be played.
     """
     check_whole_number("budget", budget, 1)
     n, steps = problem.n, int(problem.last_step.max(initial=0))
@@ -90,7 +88,7 @@ def _refine_worlds(
     problem: ProfileProblem, random: UInt64s, budget: int, commands: Floats, first: Floats, total: Floats,
     failed: Bools,
 ) -> None:  # fmt: skip
-    """Improve ``commands`` in place, and fill the other outputs [n]."""
+    """Improve ``commands`` [n, T] in place, and fill ``first`` and ``total`` harm [n] and ``failed`` worlds [n]."""
     start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
     mine, other = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))
     room = Plan(np.zeros(T), np.zeros((T + 1, S)))
@@ -109,7 +107,7 @@ def _refine_worlds(
 
 @compiled(apart=True)
 def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budget: int) -> bool:
-    """Improve ``mine``; False if it cannot be played."""
+    """Improve ``mine`` in place. Return False if it cannot be played."""
     templates, theirs = int(TEMPLATE_SHARE * budget), int(THEIR_CLIMB_SHARE * budget)
     value, reached = follow_steps(world.episode, mine, 0, math.inf)
     if reached < 0:
@@ -127,9 +125,10 @@ def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budge
 
 @compiled(apart=True)
 def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[float, int]:
-    """Play a plan from the start of step ``begin`` on, and fill its states; the value, and the steps up to the end.
+    """Play a plan from the start of step ``begin``, and fill its states. Return its value, and the number of steps.
 
-    Gives up as soon as the value is not below ``bound``: harm never falls again. -1 steps if the kernel failed.
+    Stops as soon as the value is not below ``bound``, because harm never falls. The number of steps is -1 if the
+    physics failed.
     """
     table, clock = world.table, world.clock
     grid, restitution, total, last = (
@@ -155,9 +154,9 @@ def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[
 
 @compiled(apart=True)
 def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int, budget: int) -> tuple[float, int]:
-    """Change a plan of this value for the better, in place, with ``budget`` candidates; its value and steps.
+    """Improve a plan with this value in place, with ``budget`` candidates; return its value and number of steps.
 
-    A success by addition is repeated twice as large.
+    A successful addition is repeated with twice the amount.
     """
     low, high = world.bounds[0, 0], world.bounds[0, 1]
     longest = steps_in(world.episode, LONGEST_CHANGE_S)
@@ -170,7 +169,7 @@ def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int
             first = draw_below(world.random, min(reached, steps_in(world.episode, ATTENTION_S)))
             u = draw(world.random)
             length = 1 + int(u * u * longest)
-            if adds:  # of either sign; its logarithm is uniform over the decades below the whole range
+            if adds:  # an amount of either sign, log-uniform
                 sign = 1.0 if draw(world.random) < 0.5 else -1.0
                 amount = sign * (high - low) * exp(LN_SMALLEST_CHANGE * draw(world.random))
             else:
@@ -198,7 +197,10 @@ def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int
 
 @compiled(apart=True)
 def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, number: int) -> tuple[float, int]:
-    """Fill ``best`` with the best of some random templates; its value and steps, 0 if none is below ``bound``."""
+    """Fill ``best`` with the best of some random templates; return its value and number of steps.
+
+    The number of steps is 0 if no template is below ``bound``.
+    """
     low, high, T = world.bounds[0, 0], world.bounds[0, 1], room.commands.shape[0]
     attention, longest = steps_in(world.episode, ATTENTION_S), steps_in(world.episode, LONGEST_WHILE_S)
     reached = 0
@@ -218,7 +220,7 @@ def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, num
 
 @compiled
 def steps_in(world: Episode, duration_s: float) -> int:
-    """How many steps fit into a time, at least 1."""
+    """Return how many steps fit into a duration, at least 1."""
     return max(int(duration_s / world.clock[CLOCK.TIME_STEP] + 0.5), 1)
 
 

@@ -1,8 +1,7 @@
-"""Random templates of a whole episode, of which the best one in each world is kept: brake fully, give way, brake
-again.
+"""Random templates of a whole episode: brake fully, give way, brake again. The best one in each world is returned.
 
-They show how a world could be driven quite otherwise than a policy drives it (``refine`` climbs from the same
-ones). Nothing is improved: what does little harm as it was drawn stands on no edge, and a policy can imitate it.
+Templates show how a world could be driven differently from a policy (``refine`` climbs from the same templates). They
+are not improved: a random template with little harm is robust, so a policy can imitate it.
 """
 
 from __future__ import annotations
@@ -18,11 +17,11 @@ from ethbrake_marl.physics.state import Floats, Ints, UInt64s
 
 
 def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed: int = 0) -> tuple[Floats, Ints]:
-    """The best of ``number`` templates below ``bound`` [n] (m2/s2) in each world, of the one controlled vehicle.
+    """Return the best of ``number`` templates below ``bound`` [n] (m2/s2) in each world, for one controlled vehicle.
 
-    Returns its commands [n, T] (m/s2), and in how many steps it was played to its end [n]: 0 where none was below.
-    Each world draws its own; worlds are independent of each other. Raises ``InvalidInput`` for several vehicles, or
-    no template.
+    Returns its commands [n, T] (m/s2), and the number of steps to its end [n]: 0 if none is below the bound. Each world
+    draws its own templates and is independent of the others. Raises ``InvalidInput`` for several vehicles, or no
+    template.
     """
     check_whole_number("templates", number, 1)
     if len(problem.vehicles) != 1:
@@ -37,7 +36,7 @@ def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed:
 def _best_templates(
     problem: ProfileProblem, random: UInt64s, bound: Floats, number: int, commands: Floats, steps: Ints
 ) -> None:
-    """Fill ``commands`` and ``steps``."""
+    """Fill ``commands`` [n, T] and ``steps`` [n] with the best template of each world."""
     start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
     best, room = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))
     for k in range(start.shape[0]):

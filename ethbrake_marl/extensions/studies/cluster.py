@@ -1,4 +1,4 @@
-"""A Ray while a study works: one of this machine alone, or a cluster that runs."""
+"""Connect to Ray while a study works: on this machine, or on a running cluster."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from contextlib import contextmanager
 
 from ethbrake_marl.parallel import connect_ray
 
-_SILENT = ("ray.tune.tune", "ray.tune.analysis.experiment_analysis")  # they advise Tuner.restore
+_SILENT = ("ray.tune.tune", "ray.tune.analysis.experiment_analysis")  # they advise Tuner.restore, which is not used
 
 
 @contextmanager
 def connected(address: str, cores: int | None) -> Iterator[None]:
-    """Ray, while the block runs, in which SIGTERM is Ctrl-C; see ``connect_ray``."""
+    """Connect to Ray while the block runs (see ``connect_ray``). SIGTERM acts like Ctrl-C in the block."""
     ray = connect_ray(address, cores)
     for name in _SILENT:
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    in_main = threading.current_thread() is threading.main_thread()  # no other may set a handler
+    in_main = threading.current_thread() is threading.main_thread()  # only the main thread may set a handler
     before = in_main and signal.signal(signal.SIGTERM, lambda number, frame: signal.raise_signal(signal.SIGINT))
     try:
         yield

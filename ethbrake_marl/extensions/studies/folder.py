@@ -1,4 +1,4 @@
-"""The folder of a study: it answers one question, and one process at a time works in it."""
+"""The folder of a study: it belongs to one question, and one process at a time works in it."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ _LOCK = ".lock"
 
 
 class StudyFolder:
-    """Where a study leaves its results, so that the same command goes on after a kill.
+    """Folder of a study's results, so that the same command continues after an interruption.
 
     Args:
-        path: made when work begins.
-        kind: what it holds, for messages.
-        question: what every result in it depends on, as plain data; None: each result knows its own.
-        record: name of the file with the question, and with what ``more`` adds to it when it is written.
-        advice: what to do about a folder that answers another question.
-        beside: names of what may be in a folder without a record; None: anything.
-        writes: names of files that its work replaces, at its end perhaps.
+        path: the folder; it is created when work begins.
+        kind: what the folder holds, for messages.
+        question: everything that the results depend on, as plain data; None if each result stores its own.
+        record: name of the file that stores the question.
+        more: further entries of that file.
+        advice: what to do about a folder with another question.
+        beside: names that may exist in a folder without a record; None: any.
+        writes: names of files that the work replaces.
 
     """
 
@@ -46,10 +47,10 @@ class StudyFolder:
         self._record, self._more = path / record, dict(more or {})
 
     def check(self) -> bool:
-        """Whether the record of the question is still to be written; makes nothing.
+        """Return whether the record of the question must still be written. Writes nothing.
 
-        Raises ``InvalidInput`` for what is no folder, cannot be written to (nor one of ``writes``), or answers another
-        question, with what differs; ``AlreadyExists`` for a folder of something else.
+        Raises ``InvalidInput`` if the path is not a folder, if it or one of ``writes`` cannot be written, or if it
+        holds another question (with the differences); ``AlreadyExists`` for a folder with other content.
         """
         check_folder(self.path, self._writes, force=True)
         if self._question is None:
@@ -77,9 +78,9 @@ class StudyFolder:
 
     @contextmanager
     def work(self) -> Iterator[None]:
-        """Keep others out of the folder while the block runs; what killed writers left goes.
+        """Lock the folder while the block runs, and remove what killed writers left.
 
-        Raises what ``check`` raises, and ``InvalidInput`` where another process works in it.
+        Raises the exceptions of ``check``, and ``InvalidInput`` if another process works in the folder.
         """
         self.check()
         self.path.mkdir(parents=True, exist_ok=True)
@@ -94,7 +95,7 @@ class StudyFolder:
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
-    """What differs between two questions, in words; of lists and of what stands in one alone the name."""
+    """Return the differences between two questions, in words. For lists, and entries of one side only, the name."""
     found: list[str] = []
     for name in dict.fromkeys([*now, *before]):
         old, new = before.get(name), now.get(name)

@@ -1,6 +1,6 @@
-"""Files of named worlds: what a search has found, to be driven again.
+"""Files of named worlds: the result of a search, to be driven again.
 
-A file says which scenario its worlds are of, by its content, what drove there, and what that was measured to be.
+A file stores the scenario of its worlds (with a hash of its content), the agent that drove, and its measurements.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from ethbrake_marl.physics.state import Worlds
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.tables import worlds_from_table
 
-MOST_NAMED_WORLDS = 1000  # of a file
+MOST_NAMED_WORLDS = 1000  # most worlds in a file
 
-SIZE_LIMIT = 8 << 20  # bytes of it: so many worlds of a long line
+SIZE_LIMIT = 8 << 20  # largest file in bytes, enough for that many worlds of a long line
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class NamedWorld(FileModel):
-    """One world: its name, its initial state by the columns of a table, and what was measured there (m2/s2)."""
+    """One world: its name, its initial state by the columns of a table, and its measurements (m2/s2)."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
     score: Number
@@ -37,28 +37,28 @@ class NamedWorld(FileModel):
 
 
 class NamedWorlds(FileModel):
-    """A file of named worlds."""
+    """Content of a file of named worlds."""
 
     format: Literal["ethbrake-worlds"]
-    version: Annotated[int, Field(ge=1, le=1)]  # a literal would take true and 1.0, which equal 1
+    version: Annotated[int, Field(ge=1, le=1)]  # not a Literal, which would accept true and 1.0
     scenario: str
     scenario_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-    settings: list[str] = Field(default=[])  # what was set beside the scenario's name, as ``--set`` takes it
+    settings: list[str] = Field(default=[])  # settings of the scenario, as for ``--set``
     agent: str
     measure: Literal["harm", "regret", "difference", "bound"]
     against: str | None = None
     harm_count: HarmCount
-    found_by: str  # the command
+    found_by: str  # command of the search
     worlds: Annotated[list[NamedWorld], Field(min_length=1, max_length=MOST_NAMED_WORLDS)]
 
     @classmethod
     def of(cls, scenario: Scenario, /, **told: Any) -> NamedWorlds:
-        """The file of worlds of this scenario."""
+        """Return the file of worlds of this scenario."""
         return cls(format="ethbrake-worlds", version=1, scenario_sha256=scenario_sha256(scenario), **told)
 
     @classmethod
     def read(cls, path: str | Path) -> NamedWorlds:
-        """Read such a file; raises ``InvalidInput`` naming file, line and key."""
+        """Read a file of named worlds. Raises ``InvalidInput`` with file, line and key."""
         document = read_yaml(path, SIZE_LIMIT)
         found = read_model(document, cls, Wording(cls, "search again (ethbrake study falsify)"), "of named worlds")
         names = [world.name for world in found.worlds]
@@ -68,7 +68,7 @@ class NamedWorlds(FileModel):
 
     @property
     def text(self) -> str:
-        """The file's text; reading it back gives the same worlds to the bit."""
+        """The text of the file. Reading it back gives the same worlds, bit for bit."""
         head = self.model_dump(exclude={"worlds"}, exclude_none=True)
         lines = [f"{key}: {flow_text(value)}" for key, value in head.items() if value != []]
         lines.append("worlds:")
@@ -78,7 +78,7 @@ class NamedWorlds(FileModel):
         return "\n".join(lines) + "\n"
 
     def worlds_of(self, scenario: Scenario, where: str) -> Worlds:
-        """The worlds at the alert; raises ``InvalidInput`` for another scenario than theirs."""
+        """Return the worlds at the alert. Raises ``InvalidInput`` if ``scenario`` is not their scenario."""
         if scenario_sha256(scenario) != self.scenario_sha256:
             raise InvalidInput(
                 f"{where}: its worlds were found in scenario {self.scenario!r}"

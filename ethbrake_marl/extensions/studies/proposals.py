@@ -1,7 +1,7 @@
-"""Proposals of Optuna for a tuning, through Ray Tune, kept in a file: those that stand there are proposed again first.
+"""Optuna's proposals for a tuning, through Ray Tune, stored in a file and proposed again first after a restart.
 
-A sampler is made anew for each trial, of a seed and the trial's number: what is proposed depends on what had
-ended by then, and not on how often the command was stopped in between.
+Each trial has a new sampler, seeded by a seed and the trial's number. So a proposal depends on the trials that have
+ended, and not on interruptions of the command.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
     from optuna.trial import FrozenTrial
 
-Proposal = Mapping[str, Any]  # key -> value as Optuna has it
+Proposal = Mapping[str, Any]  # key -> value in Optuna's form
 
 
 class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
-    """Optuna's search of a space; a trial's configuration is its ``trial``, a number, and its ``values``.
+    """Optuna's search of a space. The configuration of a trial is its number, ``trial``, and its ``values``.
 
     Args:
-        file: of the proposals; made with the first one.
-        known: what stands in it.
-        space: the distribution of each key.
-        sampler: makes the sampler for the trial of a number.
-        first: the first proposal, where none is known.
+        file: file of the proposals; created with the first one.
+        known: proposals in that file.
+        space: distribution of each key.
+        sampler: makes the sampler of the trial with a given number.
+        first: the first proposal if none is known.
 
     """
 
@@ -58,7 +58,7 @@ class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
         )
 
     def suggest(self, trial_id: str) -> dict[str, Any] | None:
-        """The next trial."""
+        """Return the next trial."""
         values, number = super().suggest(trial_id), self._asked
         if number == len(self.known):
             self.known.append(values)
@@ -68,7 +68,7 @@ class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
 
 
 class _SamplerOfTrial(BaseSampler):
-    """A sampler of its own for each trial."""
+    """Sampler that makes a new sampler for each trial."""
 
     def __init__(self, of: Callable[[int], BaseSampler]) -> None:
         self._of = of

@@ -1,7 +1,7 @@
-"""A sweep: the trainings that a YAML file lists, checked before one begins, done on Ray Tune, and one table of them.
+"""A sweep: the trainings listed in a YAML file, checked first, run on Ray Tune, with one table of results.
 
-The table is made of the runs' folders alone. It is the same, byte for byte, in whatever order and wherever the jobs
-ran, and however often they were stopped.
+The table is made only from the folders of the runs. It is the same, byte for byte, in whatever order, place and number
+of attempts the jobs ran.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _GRID: YamlPath = ("grid",)
 
 
 class _OneOrMore:
-    """Of a list: in a file a single entry may stand in its place (a check of the model makes it a list)."""
+    """Annotation of a list that accepts a single entry in its JSON schema; a validator makes it a list."""
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
@@ -64,16 +64,16 @@ _Settings = Annotated[dict[str, Any], AfterValidator(_check_keys)]
 
 
 class Request(NamedTuple):
-    """One job as the file asks for it."""
+    """One job as the file requests it."""
 
-    path: YamlPath  # in the file: of the grid, or of a listed job
-    scenario: str  # a name or a path
-    recipe: str  # a name or a path
-    settings: tuple[str, ...]  # KEY=VALUE each, as for ``train --set``
+    path: YamlPath  # place in the file: the grid, or a listed job
+    scenario: str  # name or path
+    recipe: str  # name or path
+    settings: tuple[str, ...]  # KEY=VALUE texts, as for ``train --set``
     seed: int
 
     def __str__(self) -> str:
-        """The job in words."""
+        """Return the job in words."""
         settings = f", {', '.join(self.settings)}" if self.settings else ""
         return f"{_place(self.path)} ({self.scenario}, {self.recipe}, seed {self.seed}{settings})"
 
@@ -83,7 +83,7 @@ def _place(path: YamlPath) -> str:
 
 
 class SeedRange(FileModel):
-    """``count`` seeds from ``first`` on."""
+    """Range of ``count`` seeds, starting with ``first``."""
 
     first: Seed = Field(default=0, description="the smallest seed")
     count: int = Field(ge=1, le=MOST_JOBS, description="how many seeds")
@@ -97,7 +97,7 @@ _Seeds = Annotated[
 
 
 class Grid(FileModel):
-    """All combinations of what is listed."""
+    """Jobs for all combinations of the listed values."""
 
     settings: Annotated[dict[str, _Values], AfterValidator(_check_keys)] = Field(
         default={}, alias="set", description="a list of values for each dotted key"
@@ -113,14 +113,14 @@ class Grid(FileModel):
 
     @property
     def seeds(self) -> Sequence[int]:
-        """The seeds, one by one."""
+        """The seeds as a sequence."""
         if isinstance(self.seed, SeedRange):
             return range(self.seed.first, self.seed.first + self.seed.count)
         return self.seed
 
 
 class ListedJob(FileModel):
-    """One job."""
+    """One single job."""
 
     settings: _Settings = Field(default={}, alias="set", description="settings by dotted key, as train --set")
     scenario: str = Field(description="a name or a path, as train --scenario")
@@ -129,20 +129,23 @@ class ListedJob(FileModel):
 
 
 class SweepFile(StudyFile):
-    """The whole file; ``settings`` hold for every job."""
+    """Content of a sweep's file; ``settings`` apply to every job."""
 
     settings: _Settings = Field(default={}, alias="set", description="settings of every job, as train --set")
     grid: Grid | None = Field(default=None, description="every combination of what it lists")
     jobs: tuple[ListedJob, ...] = Field(default=(), strict=False, description="single jobs, after those of the grid")
 
     def size(self) -> int:
-        """Number of jobs."""
+        """Return the number of jobs."""
         grid = self.grid
         lists = [] if grid is None else [grid.scenario, grid.recipe, grid.seeds, *grid.settings.values()]
         return (math.prod(map(len, lists)) if lists else 0) + len(self.jobs)
 
     def requests(self) -> Iterator[Request]:
-        """The jobs: of the grid, seed by seed, so that first results of all are there early; then those listed."""
+        """Yield the jobs: first those of the grid, then the listed ones.
+
+        The grid is ordered by seed, so that first results of all combinations exist early.
+        """
         if (grid := self.grid) is not None:
             changes = [
                 self._texts(dict(zip(grid.settings, values, strict=True)), _GRID)
@@ -155,7 +158,7 @@ class SweepFile(StudyFile):
             yield Request(("jobs", k), job.scenario, job.recipe, self._texts(job.settings, ("jobs", k)), job.seed)
 
     def where(self, asked: Request, part: str = "") -> str:
-        """File and line of a job; of a ``part`` of it: ``recipe``, ``scenario``, or the key of a setting."""
+        """Return file and line of a job, or of a ``part`` of it: ``recipe``, ``scenario``, or the key of a setting."""
         path = (*asked.path, "set", part) if part else asked.path
         if part in self.settings:
             path = ("set", part)
@@ -173,17 +176,17 @@ class SweepFile(StudyFile):
         return texts_of({**self.settings, **own})
 
 
-TABLE, FAILURES, RUNS = "results.csv", "failures.csv", "runs"  # inside the folder
+TABLE, FAILURES, RUNS = "results.csv", "failures.csv", "runs"  # names inside the folder
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One job: what was asked for, and what is known of it without resolving it again."""
+    """One job with its training's identity, so that nothing must be loaded again."""
 
     asked: Request
-    identity: str  # of its training
-    name: str  # of its folder
-    first: Training  # of the job with these settings and the first seed
+    identity: str  # identity of its training
+    name: str  # name of its folder
+    first: Training  # training with the same settings and the first seed
 
     @property
     def settings(self) -> dict[str, str]:
@@ -192,7 +195,7 @@ class Row:
 
     @property
     def about(self) -> dict[str, Any]:
-        """What the tables say of it first."""
+        """First columns of the tables for this job."""
         return {
             "hash": self.identity,
             "scenario": self.asked.scenario,
@@ -206,13 +209,13 @@ class Row:
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """All jobs, in the order of the table. What they have in common is loaded once."""
+    """All jobs of a sweep, in the order of its table. Common parts are loaded once."""
 
     rows: Sequence[Row]
 
     @staticmethod
     def json_schema() -> dict[str, Any]:
-        """JSON Schema of the file of a sweep, for editors that complete and check YAML."""
+        """Return the JSON Schema of a sweep's file, for editors that complete and check YAML."""
         schema = SweepFile.model_json_schema(schema_generator=FileSchema)
         return FileSchema.publish(
             {**schema, "title": "Sweep", "anyOf": [{"required": ["grid"]}, {"required": ["jobs"]}]}
@@ -222,8 +225,8 @@ class SweepPlan:
     def read(cls, path: str | Path) -> Self:
         """Read the file of a sweep, and resolve every job.
 
-        Raises ``InvalidInput`` with file and line for what the file may not say, and naming the job: an unknown
-        scenario or recipe, a setting that neither has, what does not fit each other, two jobs with one hash.
+        Raises ``InvalidInput`` with file, line and job for invalid content: an unknown scenario or recipe, an unknown
+        setting, parts that do not fit together, or two jobs with the same hash.
         """
         file = SweepFile.read_as(path, "scaling", "with a grid or a list of jobs")
         if not 1 <= file.size() <= MOST_JOBS:
@@ -254,12 +257,12 @@ class SweepPlan:
 
     @staticmethod
     def folder(path: Path) -> StudyFolder:
-        """The folder of a sweep; its jobs know by themselves what they are."""
+        """Return the folder of a sweep. It has no record, because each job stores its own question."""
         return StudyFolder(path, "a sweep", writes=(TABLE, FAILURES))
 
     @staticmethod
     def job(row: Row, path: Path) -> TrainingJob:
-        """The training of a row in the folder of a sweep."""
+        """Return the training of a row in the folder of a sweep."""
         training = Training.of(row.first.recipe, row.first.scenario, seed=row.asked.seed)
         return TrainingJob(training, path / RUNS / row.name, row.asked.settings)
 
@@ -268,12 +271,12 @@ class SweepPlan:
         finish(self.job(row, path))
 
     def results(self, path: Path) -> dict[str, dict[str, Any]]:
-        """``HARM`` and ``FIGURES`` of each job that is done, by its name."""
+        """Return the figures (``HARM`` and ``FIGURES``) of each finished job, by its name."""
         jobs = ((row.name, self.job(row, path)) for row in self.rows)
         return {name: final_figures(job) for name, job in jobs if is_done(job)}
 
     def states(self, path: Path) -> list[dict[str, Any]]:
-        """Every job and its state: new, begun or finished."""
+        """Return every job and its state: new, begun or finished."""
         done = self.results(path)
         return [
             {
@@ -288,16 +291,16 @@ class SweepPlan:
     def run(
         self, path: Path, *, jobs: int | None = None, ray: str = LOCAL, retries: int = 2, tell: OnProgress | None = None
     ) -> SweepResult:
-        """Do what is left of a sweep and write its tables, after Ctrl-C too.
+        """Run the remaining jobs of a sweep and write its tables, also after Ctrl-C.
 
         Args:
-            path: the folder of everything; made if it is not there.
-            jobs: at once; None: one for each core.
-            ray: address of a Ray cluster; ``local``: this machine alone.
+            path: folder of all results; created if needed.
+            jobs: number of jobs at once; None: one for each core.
+            ray: address of a Ray cluster; ``local``: only this machine.
             retries: further attempts at a job whose process was lost.
-            tell: hears how many jobs have ended, and why some failed.
+            tell: called with the number of ended jobs, and reasons of failures.
 
-        Raises ``InvalidInput`` where another process works in the folder, or where there is no cluster.
+        Raises ``InvalidInput`` if another process works in the folder, or if there is no cluster.
 
         """
         with self.folder(path).work():
@@ -336,7 +339,7 @@ class SweepPlan:
     def _train(
         self, left: list[int], path: Path, jobs: int | None, ray: str, retries: int, tell: OnProgress | None
     ) -> dict[str, str]:
-        """Train the jobs of these numbers; why some failed, by name."""
+        """Train the jobs with these numbers. Return the reasons of failed jobs, by name."""
         with connected(ray, jobs):
             from ray import tune
 
@@ -352,13 +355,13 @@ class SweepPlan:
                 retries=retries,
                 told=Told("sweep", len(self.rows) - len(left), len(self.rows), tell),
             )
-        named = zip(left, ends, strict=False)  # after Ctrl-C some have not begun
+        named = zip(left, ends, strict=False)  # fewer ends than jobs after Ctrl-C
         return {self.rows[number].name: end[REASON] for number, end in named if REASON in end}
 
 
 @dataclass(frozen=True, slots=True)
 class SweepResult:
-    """What a sweep left behind."""
+    """Result of a sweep."""
 
     table: Path
     jobs: int
@@ -367,10 +370,10 @@ class SweepResult:
 
     @property
     def interrupted(self) -> bool:
-        """Whether some jobs did not come to an end."""
+        """Whether some jobs did not end."""
         return self.finished + self.failed < self.jobs
 
 
 def do_job(config: dict[str, Any], plan: SweepPlan, path: Path) -> None:
-    """Train one job, in a process of its own."""
+    """Train one job; runs in a worker process."""
     plan.train(plan.rows[config["job"]], path)

@@ -1,4 +1,4 @@
-"""Trainings of a study: a finished one is kept, one that was begun goes on; several at a time; and what they cost."""
+"""Trainings of a study: finished ones are kept, unfinished ones continue, several at a time; and their cost."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 
 def train_all(trainings: Sequence[TrainingJob], jobs: int = 1, tell: OnProgress | None = None) -> bool:
-    """Bring every training to its end, ``jobs`` at a time; False when Ctrl-C stopped one.
+    """Bring every training to its end, ``jobs`` at a time. Return False if Ctrl-C stopped one.
 
-    The policies do not depend on ``jobs`` or on interruptions. Raises, before any is begun, what ``steps_left`` raises,
-    and what the first training raises that fails.
+    The policies do not depend on ``jobs`` or on interruptions. Raises the exceptions of ``steps_left`` before any
+    training begins, and the exception of the first training that fails.
     """
     left = [training for training in trainings if training.steps_left()]
     if jobs == 1 or len(left) < 2:
@@ -49,7 +49,7 @@ class TrainingJob:
 
     training: Training
     folder: Path
-    noted: tuple[str, ...] = ()  # by which scenario and recipe differ from their files, for ``config.json``
+    noted: tuple[str, ...] = ()  # overrides of scenario and recipe, for ``config.json``
 
     @property
     def per_update(self) -> int:
@@ -57,7 +57,7 @@ class TrainingJob:
         return self.training.recipe.n_envs * len(self.training.scenario.learners) * self.training.recipe.rounds
 
     def steps_left(self) -> int:
-        """Decisions that are still to do; raises ``InvalidInput`` for a folder that holds another training."""
+        """Return the number of remaining decisions. Raises ``InvalidInput`` if the folder holds another training."""
         run, total = RunDirectory(self.folder), self.training.recipe.total_steps
         if not run.status.exists():
             if self.folder.exists():
@@ -74,9 +74,9 @@ class TrainingJob:
         return max(total - (steps if isinstance(steps, int) else 0), 1)
 
     def finish(self, tell: OnProgress | None = None, *, stop_at: StopAt | None = None) -> bool | None:
-        """Bring it to its end; None where it was stopped before, by ``stop_at`` too, as ``train`` has it.
+        """Bring the training to its end. Return None if it was stopped before, also by ``stop_at``.
 
-        Raises what ``train`` and ``resume`` raise.
+        Raises the exceptions of ``train`` and ``resume``.
         """
         from ethbrake_marl.training.session import resume, train  # torch takes seconds to load
 
@@ -105,7 +105,7 @@ class TrainingJob:
         short = recipe.replace(evaluation={**recipe.evaluation.model_dump(), "worlds": 10, "every_updates": 1000})
         with tempfile.TemporaryDirectory(prefix="ethbrake-") as folder:
             path = Path(folder) / "timed"
-            train(short, scenario, path, steps=1)  # compiles and warms up
+            train(short, scenario, path, steps=1)  # to compile and warm up
             train(short, scenario, path, steps=4 * self.per_update, force=True, on_progress=told.append)
             updates = [one for one in told if one.updates >= 1]
             last = updates[-1]
@@ -115,23 +115,23 @@ class TrainingJob:
             return Timed(self, decision_s, replace(self, folder=path).world_seconds(worlds))
 
     def world_seconds(self, sample: Sample) -> float:
-        """Seconds per world that its team drives."""
+        """Return the seconds that its team needs to drive one world."""
         team = {"team": load_team(self.folder, self.training.scenario)}
         drive = partial(evaluate, agents=team, scenario=self.training.scenario, aftermath=False)
         return Timed.each_s(sample.worlds, drive)
 
 
 class Timed(NamedTuple):
-    """Seconds of one core, by the clock, that a training takes."""
+    """Measured speed of a training on one core, by the wall clock."""
 
     job: TrainingJob
-    decision_s: float  # of a learner, its share of the learning included
-    world_s: float  # that the policy drives
+    decision_s: float  # seconds per decision of a learner, including its share of the learning
+    world_s: float  # seconds per world of an evaluation
 
     def seconds(self, steps: int) -> float:
-        """Of ``steps`` decisions, of as many trainings as they make, with what is measured on the way.
+        """Return the seconds for ``steps`` decisions of whole trainings, including evaluations.
 
-        A training measures its policies on the fixed list at first, now and then, and at the end.
+        A training evaluates its policies on the fixed list at the start, now and then, and at the end.
         """
         recipe = self.job.training.recipe
         times = recipe.total_steps // self.job.per_update // recipe.evaluation.every_updates + 2
@@ -139,7 +139,7 @@ class Timed(NamedTuple):
 
     @staticmethod
     def each_s(worlds: Worlds, work: Callable[[Worlds], object], most: int = 50) -> float:
-        """Seconds per world of some work on at most so many, which one world has done before: it compiles."""
+        """Return the seconds per world of some work on at most ``most`` worlds. One world runs first, to compile."""
         work(worlds.take([0]))
         some, started = worlds.take(range(min(worlds.n, most))), time.monotonic()
         work(some)
@@ -147,7 +147,7 @@ class Timed(NamedTuple):
 
     @staticmethod
     def in_words(seconds: float) -> str:
-        """Seconds, minutes or hours."""
+        """Return a duration as seconds, minutes or hours."""
         if seconds < 90.0:
             return f"{seconds:.0f} s"
         return f"{seconds / 60.0:.0f} min" if seconds < 36_000.0 else f"{seconds / 3600.0:.0f} h"

@@ -1,7 +1,7 @@
-"""A tuning: the settings of a recipe that do least harm, searched by Optuna on Ray Tune, and one table of the trials.
+"""A tuning: search the settings of a recipe for the least harm with Optuna on Ray Tune, with one table of the trials.
 
-No time and no place stands in the table: with one job at once it is the same, byte for byte, however often the search
-was stopped.
+The table holds no time or place: with one job at once it is the same, byte for byte, however often the search was
+interrupted.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _Count = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
 def _check_number(value: Any) -> int | float:
-    """A whole number stays one: it says that whole numbers alone are tried."""
+    """Check for a finite number. A whole number stays an ``int``, which limits the search to whole numbers."""
     if not isinstance(value, int | float) or isinstance(value, bool):
         raise ValueError("must be a number")
     if not math.isfinite(value):
@@ -70,20 +70,23 @@ _Number = Annotated[int | float, PlainValidator(_check_number), WithJsonSchema({
 
 
 class Range(FileModel):
-    """From ``low`` to ``high``, both included; whole numbers where both are written without a point."""
+    """Range of a setting from ``low`` to ``high``, both included.
+
+    If both ends are written without a point, only whole numbers are tried.
+    """
 
     low: _Number = Field(description="the least value, included")
     high: _Number = Field(description="the largest value, included; with low: whole numbers where neither has a point")
     log: bool = Field(default=False, description="the logarithm is searched, not the number")
 
     def __str__(self) -> str:
-        """The range in words."""
+        """Return the range in words."""
         kind = ", whole" * self.whole + ", by its logarithm" * self.log
         return f"from {flow_text(self.low)} to {flow_text(self.high)}{kind}"
 
     @property
     def whole(self) -> bool:
-        """Whether whole numbers alone are tried."""
+        """Whether only whole numbers are tried."""
         return isinstance(self.low, int) and isinstance(self.high, int)
 
     @model_validator(mode="after")
@@ -96,11 +99,11 @@ class Range(FileModel):
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """The values that are tried before anything starts."""
+        """Values that are checked before the search starts."""
         return self.low, self.high
 
     def own(self, value: Any) -> int | float | None:
-        """A recipe's value as it would be tried; None where it is not in the range."""
+        """Return a recipe's value as the search would try it; None if it is not in the range."""
         if not isinstance(value, int | float) or isinstance(value, bool) or not self.low <= value <= self.high:
             return None
         if not self.whole:
@@ -108,7 +111,7 @@ class Range(FileModel):
         return int(value) if value == int(value) else None
 
     def distribution(self) -> BaseDistribution:
-        """The same for Optuna."""
+        """Return the range as an Optuna distribution."""
         from optuna.distributions import FloatDistribution, IntDistribution
 
         if self.whole:
@@ -116,19 +119,19 @@ class Range(FileModel):
         return FloatDistribution(float(self.low), float(self.high), log=self.log)
 
     def stored(self, value: Any) -> Any:
-        """A value as Optuna has it: as it is."""
+        """Return a value in Optuna's form, which is the value itself."""
         return value
 
     value = stored
 
 
 class Choices(FileModel):
-    """One of a list of values, of any kind."""
+    """List of values of a setting, of any kind."""
 
     choices: tuple[Any, ...] = Field(strict=False, min_length=2, description="values of any kind that the recipe takes")
 
     def __str__(self) -> str:
-        """The values in words."""
+        """Return the values in words."""
         return f"one of {', '.join(map(flow_text, self.choices))}"
 
     @model_validator(mode="after")
@@ -141,25 +144,25 @@ class Choices(FileModel):
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """The values that are tried before anything starts."""
+        """Values that are checked before the search starts."""
         return self.choices
 
     def own(self, value: Any) -> Any:
-        """A recipe's value as it would be tried; None where it is no choice."""
+        """Return a recipe's value as the search would try it; None if it is not one of the choices."""
         return next((each for each in self.choices if flow_text(each) == flow_text(value)), None)
 
     def distribution(self) -> BaseDistribution:
-        """The same for Optuna."""
+        """Return the choices as an Optuna distribution."""
         from optuna.distributions import CategoricalDistribution
 
         return CategoricalDistribution([*map(flow_text, self.choices)])
 
     def stored(self, value: Any) -> str:
-        """A value as Optuna has it: its text, for Optuna chooses among no lists."""
+        """Return a value in Optuna's form: as text, because Optuna's choices cannot be lists."""
         return flow_text(value)
 
     def value(self, stored: Any) -> Any:
-        """What Optuna has as a value."""
+        """Return the value of a choice in Optuna's form."""
         return {flow_text(value): value for value in self.choices}[stored]
 
 
@@ -178,7 +181,7 @@ def _check_recipe_keys(value: dict[str, Any]) -> dict[str, Any]:
 
 
 class Measuring(FileModel):
-    """The list by which trials are judged and pruned, and how often in a training."""
+    """List of worlds on which trials are judged and pruned, and the number of evaluations in a training."""
 
     worlds: int = Field(default=1000, ge=1, le=1_000_000, description="of the list")
     seed: Seed = Field(default=4007, description="of the list")
@@ -186,34 +189,37 @@ class Measuring(FileModel):
 
 
 class Pruning(FileModel):
-    """A trial stops whose least harm so far is above the median of the others' means until then (Ray's median rule)."""
+    """Rule that stops weak trials early (Ray's median stopping rule).
+
+    A trial stops if its least harm so far is above the median of the other trials' mean harm up to the same time.
+    """
 
     after_trials: _Count = Field(default=5, description="so many others must have come as far before one is stopped")
     after_times: _Count = Field(default=3, description="nobody is stopped before it was measured so often")
 
     def rule(self) -> TrialScheduler:
-        """The same for Ray Tune."""
+        """Return Ray Tune's scheduler that applies this rule."""
         from ray.tune.schedulers import MedianStoppingRule
 
         return MedianStoppingRule(
             "training_iteration",
             HARM,
             "min",
-            grace_period=self.after_times + 1,  # the first is that of an untrained policy
+            grace_period=self.after_times + 1,  # the first evaluation is of an untrained policy
             min_samples_required=self.after_trials,
             min_time_slice=math.inf,  # no trial waits for others
         )
 
 
 class Sampling(FileModel):
-    """Who proposes: Optuna's TPE, or chance."""
+    """Source of the proposals: Optuna's TPE, or random values."""
 
     name: Literal["tpe", "random"] = Field(default="tpe", description="Optuna's TPE, or chance")
     seed: Seed = Field(default=0, description="of what is proposed")
     random_trials: _Count = Field(default=10, description="trials by chance before TPE begins")
 
     def of_trial(self, number: int) -> BaseSampler:
-        """The same for Optuna, for one trial."""
+        """Return the Optuna sampler of one trial."""
         from optuna.samplers import RandomSampler, TPESampler
 
         seed = int(np.random.SeedSequence([self.seed, number]).generate_state(1)[0])
@@ -223,7 +229,7 @@ class Sampling(FileModel):
 
 
 class TuningFile(StudyFile):
-    """The whole file."""
+    """Content of a tuning's file."""
 
     scenario: str = Field(description="a name or a path, as train --scenario")
     recipe: str = Field(description="a name or a path, as train --recipe")
@@ -239,15 +245,15 @@ class TuningFile(StudyFile):
     sampler: Sampling = Field(default=Sampling(), description="who proposes")
 
     def values(self, proposal: Mapping[str, Any]) -> dict[str, Any]:
-        """What Optuna proposes, as YAML has it."""
+        """Return the values of a proposal in YAML's form."""
         return {key: self.search[key].value(value) for key, value in proposal.items()}
 
     def space(self) -> dict[str, BaseDistribution]:
-        """The space for Optuna."""
+        """Return the space as Optuna distributions."""
         return {key: dimension.distribution() for key, dimension in self.search.items()}
 
     def points(self, number: int) -> Iterator[dict[str, Any]]:
-        """Points of the space by chance, the same ones each time."""
+        """Return random points of the space, the same ones each time."""
         with naming_extras():
             import optuna
         optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -256,9 +262,9 @@ class TuningFile(StudyFile):
         return (self.values(study.ask(space).params) for _ in range(number))
 
 
-Values = Mapping[str, Any]  # of a trial: key -> value, as YAML has it
+Values = Mapping[str, Any]  # values of a trial: key -> value in YAML's form
 
-_NOT_SEARCHED = {  # key -> why; what is inside it, too
+_NOT_SEARCHED = {  # key -> reason; also holds for keys inside it
     "seed": "a seed is luck; give one for all trials, as seed",
     "evaluation": "trials are judged on one list; give it as measure",
     "algorithm": "each algorithm has a recipe of its own; tune one at a time",
@@ -269,31 +275,31 @@ _NOT_SEARCHED = {  # key -> why; what is inside it, too
 
 PRUNED = "pruned: too much harm for so many decisions"
 
-_TRIED = 200  # points of the space that are checked before anything starts
+_TRIED = 200  # random points of the space that are checked before the search starts
 
-TABLE, TRIALS, PROPOSALS = "trials.csv", "trials", "proposals.json"  # inside the folder
+TABLE, TRIALS, PROPOSALS = "trials.csv", "trials", "proposals.json"  # names inside the folder
 
 
 @dataclass(frozen=True)
 class TuningPlan:
-    """What every trial has in common."""
+    """Everything that the trials of a tuning have in common."""
 
     file: TuningFile
-    recipe: TrainingRecipe  # with the file's settings, its seed and its list
+    recipe: TrainingRecipe  # recipe with the file's settings and seed
     scenario: Scenario
-    question: Mapping[str, Any]  # all that makes a trial's harm what it is, versions included
+    question: Mapping[str, Any]  # everything that a trial's harm depends on, including versions
 
     @staticmethod
     def json_schema() -> dict[str, Any]:
-        """JSON Schema of the file of a tuning, for editors that complete and check YAML."""
+        """Return the JSON Schema of a tuning's file, for editors that complete and check YAML."""
         return FileSchema.publish({**TuningFile.model_json_schema(), "title": "Tuning"})
 
     @classmethod
     def read(cls, path: str | Path) -> TuningPlan:
-        """Read the file of a tuning, resolve it and try its space.
+        """Read the file of a tuning, load its parts and check its space.
 
-        Raises ``InvalidInput`` with file and line: an unknown scenario or recipe, a key that the recipe does not have
-        or that is not to be searched, a value that it does not allow, values that do not go together.
+        Raises ``InvalidInput`` with file and line for: an unknown scenario or recipe, a key that the recipe does not
+        have or that may not be searched, a value that the recipe does not allow, and values that do not go together.
         """
         file = TuningFile.read_as(path, "tuning", "with scenario, recipe and search")
         at = file._document.refusing_at
@@ -336,9 +342,9 @@ class TuningPlan:
         return plan
 
     def training(self, values: Values) -> Training:
-        """The training of a trial, measured so often that all trials can be compared on the way.
+        """Return the training of a trial, with evaluations so often that all trials can be compared on the way.
 
-        Raises ``InvalidInput`` where the values do not go together.
+        Raises ``InvalidInput`` if the values do not go together.
         """
         recipe = read_settings(texts_of(values), [self.recipe]).change(self.recipe)
         asked = self.file.measure
@@ -347,19 +353,19 @@ class TuningPlan:
         return Training.of(recipe.replace(evaluation=listed), self.scenario)
 
     def updates(self, recipe: TrainingRecipe) -> int:
-        """Updates of a whole training."""
+        """Return the number of updates of a whole training."""
         return -(-recipe.total_steps // (recipe.n_envs * len(self.scenario.learners) * recipe.rounds))
 
     def own_values(self) -> dict[str, Any] | None:
-        """The values that the recipe has, None where one of them is not in the space."""
+        """Return the recipe's own values; None if one of them is not in the space."""
         content = self.recipe.model_dump(mode="json")
         own = {key: dimension.own(_value_at(content, key)) for key, dimension in self.file.search.items()}
         return None if None in own.values() else own
 
     def example(self) -> str:
-        """The command line that trains what a trial trains: the first one, where the space holds the recipe's values.
+        """Return a command line that trains the same as a trial.
 
-        Else one with values of the space by chance.
+        It is the first trial if the space contains the recipe's own values, else one with random values.
         """
         values = self.own_values() or next(self.file.points(1))
         measured = {"evaluation": self.training(values).recipe.evaluation.model_dump(mode="json")}
@@ -375,7 +381,7 @@ class TuningPlan:
             try:
                 self.training({key: math.nextafter(dimension.low, math.inf)})
             except InvalidInput:
-                written = f"{{low: {dimension.low!r}, high: {dimension.high!r}}}"  # with the points that make it wrong
+                written = f"{{low: {dimension.low!r}, high: {dimension.high!r}}}"  # as written, with decimal points
                 right = "must be whole numbers, written without a decimal point"
                 raise InvalidInput(f"search.{key} = {written}: {right}") from None
         for value in dimension.ends:
@@ -388,11 +394,14 @@ class TuningPlan:
             raise InvalidInput(f"search, at {', '.join(texts_of(values))}: {error}") from None
 
     def folder(self, path: Path) -> StudyFolder:
-        """The folder, which no other tuning may have."""
+        """Return the study folder, which belongs to this tuning only."""
         return StudyFolder(path, "a tuning", self.question, record="tuning.json", writes=(TABLE,))
 
     def proposals(self, path: Path) -> list[Values]:
-        """What was proposed in a folder, as Optuna has it; raises ``InvalidInput`` unless it is all in the space."""
+        """Return the stored proposals of a folder in Optuna's form.
+
+        Raises ``InvalidInput`` if one is not in the space.
+        """
         file, space = path / PROPOSALS, self.file.search
         if not file.exists():
             return []
@@ -407,7 +416,7 @@ class TuningPlan:
         return [*known]
 
     def job(self, values: Values, path: Path) -> TrainingJob:
-        """The training of a trial in the folder of a tuning; equal trials are one training."""
+        """Return the training of a trial in the folder of a tuning. Equal trials share one training."""
         training = self.training(values)
         return TrainingJob(training, path / TRIALS / training.identity[:16], texts_of({**self.file.settings, **values}))
 
@@ -421,20 +430,20 @@ class TuningPlan:
         retries: int = 2,
         tell: OnProgress | None = None,
     ) -> TuningResult:
-        """Bring the trials of a folder to so many, and write their table, after Ctrl-C too.
+        """Run trials until the folder has ``trials`` of them, and write their table, also after Ctrl-C.
 
-        The search begins anew each time, with what was proposed before; a training that is done is answered from its
-        folder, and one that was stopped goes on.
+        The search starts over each time with the stored proposals: a finished training is read from its folder, and an
+        unfinished one continues.
 
         Args:
-            path: the folder of everything; made if it is not there.
-            trials: that this folder shall have altogether.
-            jobs: trials at once; more than one change what is proposed.
-            ray: address of a Ray cluster; ``local``: this machine alone.
+            path: folder of all results; created if needed.
+            trials: number of trials that the folder has at the end.
+            jobs: trials at once; more than one changes the proposals.
+            ray: address of a Ray cluster; ``local``: only this machine.
             retries: further attempts at a trial whose process was lost.
-            tell: hears how many trials have ended, and why some failed.
+            tell: called with the number of ended trials, and reasons of failures.
 
-        Raises ``InvalidInput`` where another process works in the folder, for a damaged file, or without the cluster.
+        Raises ``InvalidInput`` if another process works in the folder, for a damaged file, or if there is no cluster.
 
         """
         with self.folder(path).work():
@@ -466,7 +475,7 @@ class TuningPlan:
     def _search(
         self, path: Path, known: list[Values], trials: int, jobs: int, retries: int, tell: OnProgress | None
     ) -> tuple[list[Values], list[dict[str, Any]]]:
-        """What was proposed, and how each trial of these ended."""
+        """Return the proposals, and the last report of each of their trials."""
         from ray import tune
 
         from ethbrake_marl.extensions.studies.proposals import Proposals
@@ -494,9 +503,9 @@ class TuningPlan:
         return search.known, ends
 
     def best_recipe(self, values: Values, file: Path, source: str) -> str:
-        """The text of a recipe that trains what the trial with these values trained, named as its file.
+        """Return the text of a recipe that repeats the training with these values, named like its file.
 
-        Raises ``InvalidInput`` for a file whose name cannot be a recipe's.
+        Raises ``InvalidInput`` if the file's name is not a valid name of a recipe.
         """
         check_file_name("recipe", file.stem)
         described = f"Settings of {self.file.recipe} that `ethbrake study tune` found."
@@ -504,7 +513,7 @@ class TuningPlan:
             name=file.stem, title=self.file.title, description=described, source=source
         )
         parts = {*type(self.recipe).model_fields, "recipe"}
-        of_scenario = {  # no recipe has these
+        of_scenario = {  # settings of the scenario, which a recipe does not have
             key: value
             for key, value in self.file.settings.items()
             if key.startswith("scenario.") or key.partition(".")[0] not in parts
@@ -514,7 +523,7 @@ class TuningPlan:
         return recipe.text(f"# The best trial of a tuning, trained again: {command}\n")
 
     def has_exported(self, path: Path, file: Path) -> bool:
-        """Whether a file is what the tuning in this folder exported: the recipe of one of its trials."""
+        """Return whether a file is the exported recipe of one of the trials in this folder."""
         try:
             source, text = load_recipe(file).source, file.read_text("utf-8")
         except InvalidInput:
@@ -528,18 +537,18 @@ State = Literal["running", "finished", "pruned", "failed"]
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """How a trial ended."""
+    """One trial and how it ended."""
 
-    number: int  # from 0
+    number: int  # counted from 0
     state: State
     values: Values
-    harm: float | None  # m2/s2 on the tuning's list, of a finished one
-    figures: Mapping[str, Any]  # those of a pruned one say how it stood when it stopped
-    reason: str  # why it failed
+    harm: float | None  # m2/s2 on the tuning's list; None unless finished
+    figures: Mapping[str, Any]  # figures of a table; of a pruned trial, at the time when it stopped
+    reason: str  # reason of a failure
 
     @classmethod
     def of(cls, number: int, values: Values, end: Mapping[str, Any]) -> Trial:
-        """From the last report of the trial."""
+        """Return a trial from its last report."""
         reason = str(end.get(REASON, ""))
         state: State = "running"
         if reason:
@@ -552,7 +561,7 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class TuningResult:
-    """What a tuning left behind."""
+    """Result of a tuning."""
 
     table: Path
     asked: int
@@ -560,23 +569,23 @@ class TuningResult:
 
     @property
     def counts(self) -> Counter[State]:
-        """How many trials ended in which way."""
+        """Number of trials in each state."""
         return Counter(each.state for each in self.trials)
 
     @property
     def interrupted(self) -> bool:
-        """Whether some trials did not come to an end."""
+        """Whether some trials did not end."""
         return len(self.trials) < self.asked or "running" in self.counts
 
     @property
     def best(self) -> Trial | None:
-        """The finished trial of least harm, of equals the first; None where none has finished."""
+        """The finished trial with the least harm, the first one of equals; None if none has finished."""
         finished = [each for each in self.trials if each.harm is not None]
         return min(finished, key=lambda each: (each.harm, each.number), default=None)
 
 
 def do_trial(config: dict[str, Any], plan: TuningPlan, path: Path) -> None:
-    """Train to the end and report every evaluation; Ray ends it there where the trial is pruned."""
+    """Train to the end and report every evaluation. Ray stops a pruned trial in a report."""
     from ray.tune import report
 
     job = plan.job(plan.file.values(config["values"]), path)
@@ -585,7 +594,7 @@ def do_trial(config: dict[str, Any], plan: TuningPlan, path: Path) -> None:
 
     def judge(evaluation: Evaluation) -> None:
         if evaluations and evaluation["steps"] <= evaluations[-1]["steps"]:
-            return  # measured again, after a stop
+            return  # the same evaluation again, after an interruption
         evaluations.append(evaluation)
         if evaluation["steps"] < last:
             report(figures(job, evaluations))
@@ -593,7 +602,7 @@ def do_trial(config: dict[str, Any], plan: TuningPlan, path: Path) -> None:
     def stop_at(evaluation: Evaluation) -> str | None:
         try:
             judge(evaluation)
-        except SystemExit:  # how Ray ends a trial: the training is to close its folder first
+        except SystemExit:  # Ray's way to end a trial; first let the training close its folder
             return PRUNED
         return None
 
@@ -619,7 +628,7 @@ def _check_searched(key: str, recipe: TrainingRecipe, file: TuningFile) -> None:
 
 
 def _value_at(content: Any, key: str) -> Any:
-    """What stands at a dotted key; None where nothing does."""
+    """Return the value at a dotted key; None if there is none."""
     for part in key.removeprefix("recipe.").split("."):
         if isinstance(content, list) and part.isdecimal() and int(part) < len(content):
             content = content[int(part)]

@@ -25,34 +25,34 @@ MeasureName = Literal["harm", "regret", "difference", "bound"]
 
 MEASURES: tuple[MeasureName, ...] = get_args(MeasureName)
 
-HINDSIGHT = "best_harm"  # the reference of regret, unless another is given
+HINDSIGHT = "best_harm"  # default reference of regret
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What was measured in some worlds, [n] each, m2/s2; minus infinity and NaN where the physics failed."""
+    """Measurements in some worlds, [n] each, m2/s2; minus infinity and NaN where the physics failed."""
 
     score: Floats
     harm: Floats
-    reference: Floats | None  # harm of the agent that it is compared with, or the bound that a shield told
+    reference: Floats | None  # harm of the reference agent, or the bound of the shield
 
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """How bad a world is for an agent.
+    """Measure of how bad a world is for an agent.
 
-    ``harm``: its harm. ``regret``: what it does more than the reference, by default the best profile that a search
-    finds with hindsight. ``difference``: by how much it and the reference differ, either way. ``bound``: its harm less
-    the bound that its shield told at the alert; above zero the bound is broken.
+    ``harm``: its harm. ``regret``: its harm minus the harm of the reference, by default the best profile that a search
+    finds with hindsight. ``difference``: the absolute difference between its harm and that of the reference. ``bound``:
+    its harm minus the bound of its shield at the alert; above zero the bound is broken.
     """
 
     name: MeasureName
-    agents: Mapping[str, Driver]  # the agent, and the reference if there is one
+    agents: Mapping[str, Driver]  # the agent, and the reference agent if there is one
     scenario: Scenario
     harm_count: HarmCount
 
     def __call__(self, sample: Sample) -> Measured:
-        """Measure in these worlds; where the physics fails with one of the agents the score is minus infinity."""
+        """Measure in these worlds. If the physics fails with one of the agents the score is minus infinity."""
         n = sample.worlds.n
         score, harm, reference = np.full(n, -np.inf), np.full(n, np.nan), np.full(n, np.nan)
         try:
@@ -79,12 +79,12 @@ class Measure:
     def falsify(
         self, budget: int, seed: int, *, most: int = 20, adaptive: bool = True, on_round: Watcher | None = None
     ) -> Falsified:
-        """Try ``budget`` worlds of the scenario, and keep the worst, at most ``most``, that are far apart.
+        """Try ``budget`` worlds of the scenario, and keep at most ``most`` of the worst that are far apart.
 
-        Worlds without harm, regret or difference are not kept: the result may hold none.
+        Worlds without harm, regret or difference are not kept, so the result may be empty.
 
-        Raises ``InvalidInput`` where the scenario draws nothing, or has none of the worlds that were tried, and what
-        ``scenario.ranges`` raises.
+        Raises ``InvalidInput`` if the scenario draws nothing, or if none of the tried worlds belongs to it, and the
+        exceptions of ``scenario.ranges``.
         """
         drawn = ranges(self.scenario)
 
@@ -122,7 +122,7 @@ class Measure:
 
     @classmethod
     def of(cls, name: str, agent: str, against: str | None, scenario: Scenario, harm_count: HarmCount) -> Measure:
-        """The measure of that name; raises ``InvalidInput`` for a reference that is missing or not asked for."""
+        """Return the measure with that name. Raises ``InvalidInput`` if a reference is missing or not allowed."""
         chosen = next((each for each in MEASURES if each == name), None)
         if chosen is None:
             raise unknown_name("measure", name, MEASURES)

@@ -109,7 +109,7 @@ def test_line_env__behind_a_shield_keeps_the_bound_of_every_alert() -> None:
     for shield in (None, "step"):
         env = LineTask("pair", {**config, "shield": shield}).get_env_fun(64, True, 5, "cpu")()
         seen = env.reset()
-        bound = env.engine.guarded.shield.first_bound.copy() if shield else np.inf
+        bound = env.engine.guarded.shield.memory.first_bound.copy() if shield else np.inf
         returned = torch.zeros(64)
         for _ in range(90):
             seen["learners", "action"] = torch.ones((64, 2, 1))

@@ -8,7 +8,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import episode_engine
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.evaluation.shield_modes import compare_modes
 from ethbrake_marl.extensions.certified.guards import RobustMode
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
@@ -83,7 +83,7 @@ def test_world__that_goes_on_after_the_shields_own_end_is_braked_fully():
     engine = episode_engine(worlds, ShieldedDriver(drives_off, PAPER, told=slower, uncertainty="gaps_m=0.02"), PAPER, 1)
     braking, after = -worlds.vehicles.braking_capacity_mps2[:, 1], np.zeros(40, bool)
     while not engine.ended.all():
-        over = engine.guarded.shield.running.finished & ~engine.ended
+        over = engine.guarded.shield.memory.running.finished & ~engine.ended
         engine.step({})
         assert (engine.wanted_mps2[over, 1] == braking[over]).all()
         after |= over

@@ -5,8 +5,9 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive, script_agents
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Source
-from ethbrake_marl.agents.registry import make_agent, parse_spec
+from ethbrake_marl.agents.spec import parse_spec
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.certified.estimated import Ranges, Told
 from ethbrake_marl.extensions.certified.estimating_agents import Odometer

@@ -9,8 +9,9 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents import registry
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import Entry, make_agent
+from ethbrake_marl.agents.registry import Entry
 from ethbrake_marl.envs.gymnasium import EthBrakeEnv
 from ethbrake_marl.envs.pettingzoo import parallel_env
 from ethbrake_marl.errors import UnknownName
@@ -246,7 +247,7 @@ def test_agent__is_refused(message: str) -> None:
 def test_team__goes_behind_no_robust_shield(monkeypatch) -> None:
     team = Team.of(make_agent("coast"), [1, 2])
     entry = Entry("team", "team@RUN", "", (), lambda argument, settings: team)
-    monkeypatch.setitem(registry._AGENTS.loaded, "team", entry)
+    monkeypatch.setitem(registry.AGENTS.loaded, "team", entry)
     with refused("'team@run+robust': is a team, and +robust is for one driven vehicle"):
         make_lineup(["team@run+robust"], PAIR)
 

@@ -10,7 +10,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.extensions.certified.options import checked_uncertainty
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
@@ -83,7 +83,7 @@ def test_every_member__realises_at_most_the_bound_to_the_bit(N, harm_count, who)
         episodes = drive(members.take(np.arange(worlds.n) * M + m), driver, scenario, vehicle)
         harm, shield = episodes.ledger.world_harm(harm_count), episodes.guarded.shield
         assert (harm <= shield.bound).all() and (shield.bound <= shield.predicted_harm).all()
-        assert not shield.distrusted.any()
+        assert not shield.memory.distrusted.any()
         tight += int((harm > 0.9 * shield.bound).sum())
     assert tight > 0  # the bound is not out of reach
 
@@ -112,7 +112,7 @@ def test_seen__inside_the_range_of_the_members_is_no_surprise_outside_is_one(gap
     driver = ShieldedDriver(make_agent("full_brake"), STANDING, uncertainty=OPEN, told=told)
     episodes = drive(truth, driver, STANDING, 1)
     shield = episodes.guarded.shield
-    assert shield.distrusted.tolist() == [surprising]
+    assert shield.memory.distrusted.tolist() == [surprising]
     assert surprising or 0.0 < episodes.ledger.world_harm("first")[0] <= shield.predicted_harm[0]
 
 
@@ -152,12 +152,12 @@ def test_bound_at_the_alert__is_that_of_the_best_constant_in_the_worst_corner() 
     )  # fmt: skip
     worlds, uncertainty = scenario.sample(1, 0).worlds, parse_uncertainty("gaps_m=3")
     shield = begun(scenario, worlds, RobustShield, uncertainty=uncertainty)
-    alone = [begun(scenario, uncertainty.members(worlds).take([m])).first_bound[0] for m in range(5)]
-    tried = [plan_harm(shield.running, np.full((1, 81), -a))[0] for a in np.linspace(0.0, 1.0, 41)]
-    assert shield.running.members == 5
+    alone = [begun(scenario, uncertainty.members(worlds).take([m])).memory.first_bound[0] for m in range(5)]
+    tried = [plan_harm(shield.memory.running, np.full((1, 81), -a))[0] for a in np.linspace(0.0, 1.0, 41)]
+    assert shield.memory.running.members == 5
     assert len(set(alone)) > 2
     # No single deceleration is best in all of them.
-    assert max(*alone, alone[0] + 1.0) - 1e-9 <= shield.first_bound[0] <= min(tried)
+    assert max(*alone, alone[0] + 1.0) - 1e-9 <= shield.memory.first_bound[0] <= min(tried)
 
 
 def test_seen__counts_from_then_on() -> None:
@@ -191,7 +191,7 @@ def test_friction__no_truth_of_its_box_is_distrusted_and_no_corner_is_above_the_
     for corners, spec in ((True, "coast"), (True, "full_brake"), (False, "full_brake")):
         shield = ShieldedDriver(make_agent(spec), wet, told=told, uncertainty=uncertainty)
         found = drive(uncertainty.draw(told, rng, corners=corners), shield, wet, 1)
-        assert not found.guarded.shield.distrusted.any()
+        assert not found.guarded.shield.memory.distrusted.any()
         harm = found.ledger.world_harm("first")
         assert not corners or (harm <= found.guarded.shield.predicted_harm + 1e-9).all()
 
@@ -204,7 +204,7 @@ def test_robust_shield__trusts_a_longer_line_inside_its_box() -> None:
     uncertain = parse_uncertainty("gaps_m.pair_1=0.5")
     shielded = ShieldedDriver.around(make_agent("full_brake"), task, mode="robust", uncertainty=uncertain, told=told)
     driven = drive(replace(told, gaps_m=told.gaps_m + shift), shielded, five)
-    assert driven.guarded.shield.distrusted.sum() == 0
+    assert driven.guarded.shield.memory.distrusted.sum() == 0
     assert driven.ledger.world_harm("first").sum() > 0.0
 
 

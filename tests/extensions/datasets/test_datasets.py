@@ -13,7 +13,7 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.record import record_episode

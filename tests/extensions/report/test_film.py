@@ -10,7 +10,7 @@ import pytest
 from PIL import Image, ImageSequence
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.extensions.report.film import film_bytes, film_scenes

@@ -6,7 +6,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.protocol import policy_sha256
-from ethbrake_marl.agents.registry import AgentSpec, parse_spec
+from ethbrake_marl.agents.spec import AgentSpec, parse_spec
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.search.around import Searched
 from ethbrake_marl.shield.drivers import ShieldedDriver

@@ -2,8 +2,8 @@
 
 import pytest
 
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Source
-from ethbrake_marl.agents.registry import make_agent
 from tests.agents.test_knowledge import BLOCKED, agent_of, changed_decisions, check_stated, in_two, with_channels
 from tests.extensions.certified.test_knowledge import LINES, drives_each_world_alone, line_of
 

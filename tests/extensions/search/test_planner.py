@@ -6,7 +6,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive, script_agents
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.extensions.search import refine as refine_module

@@ -8,7 +8,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.engine.profiles import ProfileProblem, profile_problem
 from ethbrake_marl.extensions.search.around import Searched
 from ethbrake_marl.extensions.search.refine import refine

@@ -1,0 +1,187 @@
+"""``Trace``: recorded motion of an engine's worlds, so that every moment can be shown exactly.
+
+Between two decisions, the motion follows from the state and the command alone, so each moment is advanced from the
+beginning of its step. A ``Trace`` watches the engine; without a ``Trace`` nothing is recorded and nothing costs time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.envs.rendering import (
+    AHEAD_M,
+    BEHIND_M,
+    BODY_M,
+    FLASH_S,
+    LATE_S,
+    LEAST_WIDTH_M,
+    Scene,
+    Struck,
+    View,
+    follow,
+)
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.left_out import ImpactRows
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """One step of every world, or the time from its alert to its first decision."""
+
+    start: Worlds  # the n worlds at the start
+    command_mps2: Floats  # [n, N] commands; where ``fresh``, set to the commands in force at the end
+    until_s: Floats  # [n] end; NaN: the engine's current time
+    fresh: Bools  # [n] whether the motion begins at the alert
+    front_m: Floats  # [n] position of Vehicle 1 at the start, relative to the alert
+    harm: Floats  # [n, 2] first-impact harm and total harm at the start (m2/s2)
+    left_m: Floats  # [n] left end of the view of the episode
+    right_m: Floats  # [n] right end
+    struck: Floats  # [k, 4] impacts shortly before the start: world, pair, time, closing speed
+    stepped_in: Bools | None  # [n] whether a shield replaced an action; None: no shield
+    parts: tuple[tuple[Worlds, Floats, Floats], ...] = ()  # parts from ``Engine.segments``, once the motion is closed
+
+    def closed(self, engine: Engine) -> Motion:
+        """Return this motion with its end set to the engine's current state."""
+        worlds = engine.worlds
+        command = np.where(self.fresh[:, np.newaxis], worlds.command_mps2, self.command_mps2)
+        parts = tuple(engine.segments(self.start, command))
+        return replace(self, command_mps2=command, until_s=worlds.time_s, parts=parts)
+
+    def scenes(self, engine: Engine, row: int, times_s: Floats | None = None) -> list[Scene]:
+        """Return the scenes of world ``row`` at these times [k] of a closed motion, or the scene at its end."""
+        times = self.until_s[[row]] if times_s is None else times_s
+        alert_view = View(float(self.left_m[row]), float(self.right_m[row]))
+        obstacle = self.start.obstacle_gap_m[row] + self.front_m[row]
+        front_m, harm = self.front_m[row], self.harm[row]
+        struck = [Struck(int(m[1]), float(m[3]), float(m[2])) for m in self.struck if m[0] == row]
+        shown: list[Scene] = []
+        for part in self.parts:
+            world, command, until = part[0].take([row]), part[1][[row]], part[2][[row]]
+            now = times if part is self.parts[-1] else times[times <= until]
+            times = times[len(now) :]
+            post = world.with_post_ahead(until - world.time_s).take(np.zeros(len(now) + 1, np.int64))
+            moved, _ = advance(post, command, until_s=np.append(now, until))
+            impacts = _rows(world, command, until)
+            first = (front_m + (post.obstacle_gap_m - moved.obstacle_gap_m))[:, np.newaxis]
+            fronts = np.concatenate([first, first - np.cumsum(moved.gaps_m + BODY_M, axis=1)], axis=1)
+            told = zip(impacts.pair.tolist(), impacts.closing_speed_mps.tolist(), impacts.time_s.tolist(), strict=True)
+            struck += [Struck(*each) for each in told]
+            by_then = impacts.time_s <= np.append(now, until)[:, np.newaxis]
+            each_harm = impacts.closing_speed_mps * impacts.closing_speed_mps
+            counted = [(by_then * (each_harm * impacts.first)).sum(axis=1), (by_then * each_harm).sum(axis=1)]
+            latency, done = world.vehicles.latency_s[0], harm + np.stack(counted, axis=1)
+            shown += [
+                Scene(
+                    title=engine.scenario.name,
+                    time_s=float(time),
+                    view=follow(alert_view, fronts[k]),
+                    front_m=fronts[k],
+                    gaps_m=moved.gaps_m[k],
+                    speeds_mps=moved.speeds_mps[k],
+                    command_mps2=moved.command_mps2[k],
+                    braking_mps2=world.vehicles.braking_capacity_mps2[0],
+                    driving_mps2=world.vehicles.driving_capacity_mps2[0],
+                    latency_s=latency,
+                    hit=moved.pair_hit[k],
+                    struck=tuple(s for s in struck if time - FLASH_S < s.time_s <= time),
+                    first_harm=float(done[k, 0]),
+                    total_harm=float(done[k, 1]),
+                    obstacle_m=float(obstacle),
+                    learners=engine.learners or tuple(engine.deciders),
+                    shield=None if self.stepped_in is None or self.fresh[row] else bool(self.stepped_in[row]),
+                    ended=bool(engine.ended[row])
+                    and time == float(engine.packed.state[row, engine.packed.column.time]),
+                )
+                for k, time in enumerate(now)
+            ]
+            front_m, harm = fronts[-1][0], done[-1]
+        return shown
+
+
+Memory = tuple[Motion, ...]  # recorded motions, the running one last
+
+
+class Trace:
+    """Record the motion of an engine's worlds; a ``Watcher`` of ``engine.engine``.
+
+    Args:
+        engine: engine to watch, from its next reset on.
+        whole: keep every step since the episode began (one world); else the last step only.
+        alert: the worlds at the alert of an engine that is still at its first decision; recording starts there at once.
+
+    """
+
+    def __init__(self, engine: Engine, *, whole: bool = False, alert: Worlds | None = None) -> None:
+        self._whole = whole
+        engine.watch(self, () if alert is None else self.begun((), alert, np.arange(alert.n)))
+
+    def begun(self, memory: Memory, alert: Worlds, rows: Ints) -> Memory:
+        """Return the memory after the worlds in these rows were replaced by new ones at their alert."""
+        v, n = alert.vehicles, alert.n
+        # The view contains each line from the alert to rest if all brake fully as soon as they can. A rear vehicle that
+        # would stop further on is assumed to push the vehicles ahead that far.
+        behind = np.concatenate([np.zeros((n, 1)), np.cumsum(alert.gaps_m, axis=1)], axis=1)
+        reaction = alert.speeds_mps * np.minimum(v.latency_s, LATE_S)
+        rising = (
+            alert.speeds_mps * v.braking_capacity_mps2 / (2.0 * v.brake_rate_mps3)
+        )  # upper bound while brakes build up
+        way = reaction + rising + alert.speeds_mps**2 / (2.0 * v.braking_capacity_mps2)
+        left = -behind[:, -1] - alert.N * BODY_M - BEHIND_M
+        right = np.minimum((way - behind).max(axis=1), alert.obstacle_gap_m) + AHEAD_M
+        new = Motion(
+            alert, np.zeros(alert.speeds_mps.shape), np.full(n, np.nan), np.ones(n, np.bool_), np.zeros(n),
+            np.zeros((n, 2)), left, np.maximum(right, left + LEAST_WIDTH_M), np.zeros((0, 4)), None,
+        )  # fmt: skip
+        if not memory or n == memory[-1].start.n:
+            return (new,)
+        last = memory[-1]
+        columns: dict[str, Any] = {}
+        for name in ("command_mps2", "until_s", "fresh", "front_m", "harm", "left_m", "right_m"):
+            columns[name] = getattr(last, name).copy()
+            columns[name][rows] = getattr(new, name)
+        struck = last.struck[~np.isin(last.struck[:, 0], rows)]
+        return (replace(last, start=last.start.assign(rows, alert), struck=struck, **columns),)
+
+    def stepped(self, memory: Memory, before: Engine, after: Engine) -> Memory:
+        """Close the motion that led to this step, and begin the motion of the step."""
+        last = memory[-1].closed(before)
+        front_m, met = last.front_m, [last.struck]
+        for start, command, until_s in last.parts:
+            post = start.with_post_ahead(until_s - start.time_s)
+            moved, _ = advance(post, command, until_s=until_s)
+            front_m = front_m + (post.obstacle_gap_m - moved.obstacle_gap_m)
+            rows = _rows(start, command, until_s)
+            columns = (rows.world, rows.pair, rows.time_s, rows.closing_speed_mps)
+            met.append(np.stack(columns, axis=1).astype(np.float64))
+        struck, ledger, n = np.concatenate(met), before.ledger, before.n
+        new = replace(
+            last,
+            start=before.worlds,
+            command_mps2=after.wanted_mps2.copy(),
+            until_s=np.full(n, np.nan),
+            fresh=np.zeros(n, np.bool_),
+            front_m=front_m,
+            harm=np.stack([ledger.world_harm("first"), ledger.world_harm("total")], axis=1),
+            struck=struck[struck[:, 2] > last.until_s[struck[:, 0].astype(np.int64)] - FLASH_S],
+            stepped_in=None if after.ruling is None else after.ruling.stepped_in,
+        )
+        return (*memory[:-1], last, new) if self._whole else (new,)
+
+    def motions(self, engine: Engine) -> Memory:
+        """Return all recorded motions, closed. Raise ``InvalidInput`` before the first reset."""
+        memory: Memory = engine.memory(self)
+        if not memory:
+            raise InvalidInput("render: no episode was started; call reset first")
+        return (*memory[:-1], memory[-1].closed(engine))
+
+
+def _rows(worlds: Worlds, command: Floats, until_s: Floats) -> ImpactRows:
+    rows = advance(worlds, command, until_s=until_s, record=True)[1].rows
+    assert rows is not None  # because of ``record=True``
+    return rows
