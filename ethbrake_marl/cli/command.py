@@ -29,8 +29,6 @@ ScenarioOption = Annotated[
     str, typer.Option(metavar="NAME|PATH", help="A shipped or registered scenario, or a path to a YAML file.")
 ]
 
-RecipeOption = Annotated[str, typer.Option(metavar="NAME|PATH", help="A shipped recipe, or a path to a YAML file.")]
-
 SettingsOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Set a key to another value: mass_t=40. Repeatable."),

@@ -275,7 +275,7 @@ def scenario_parts(as_json: JsonOption = False) -> None:
         "V2X presets": [*scenarios.CHANNELS],
         "Objectives": [kind.form for kind in OBJECTIVES.usable().values()],
         "Algorithms": [*training.algorithm_names()],
-        "Recipes": [*training.TrainingRecipe.shipped()],
+        "Recipes": [*training.TrainingRecipe.usable()],
         "Measures": [*MEASURES],
     }
     with Out(as_json=as_json) as out:

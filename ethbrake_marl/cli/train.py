@@ -13,7 +13,6 @@ from ethbrake_marl.cli.command import (
     ForceOption,
     JsonOption,
     Out,
-    RecipeOption,
     ScenarioOption,
     SettingsOption,
     StepsOption,
@@ -27,6 +26,8 @@ KEPT = (
 )
 
 RUNS = Path("runs")
+
+QUICKEST = ("quick", "ppo")  # what `ethbrake run` trains: the first whose algorithm is installed
 
 TrainingSeedOption = Annotated[int | None, typer.Option(help="Seed of the training.", show_default="the recipe's")]
 
@@ -47,7 +48,14 @@ def run_command(
     seed: TrainingSeedOption = None,
     episodes: Annotated[int, typer.Option(help="Worlds of the evaluation list.")] = 10_000,
     list_seed: Annotated[int, typer.Option(help="Seed of the evaluation list.")] = 7,
-    recipe: RecipeOption = "quick",
+    recipe: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME|PATH",
+            help="A shipped recipe, or a path to a YAML file.",
+            show_default=f"{QUICKEST[0]}, or {QUICKEST[1]} where no extension gives its algorithm",
+        ),
+    ] = None,
     settings: SettingsOption = None,
     output: OutputOption = None,
     force: ForceOption = False,
@@ -63,7 +71,7 @@ def run_command(
         # torch takes seconds to load, here and in the other commands that learn
         from ethbrake_marl.training.experiment import run_experiment
 
-        plan = training.load_recipe(recipe)
+        plan = training.load_recipe(recipe or quickest())
         given = training.read_settings(settings, [plan])
         chosen = evaluation.load_runnable(scenario, given.scenario, drives="one")
         plan = given.change(plan, out.note)
@@ -90,6 +98,12 @@ def run_command(
         for note in result.notes:
             out.note(note)
         _end(out, result.trained)
+
+
+def quickest() -> str:
+    """Return the recipe that `ethbrake run` trains by default."""
+    usable = training.TrainingRecipe.usable()
+    return next(name for name in QUICKEST if name in usable)
 
 
 def train_command(

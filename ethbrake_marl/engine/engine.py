@@ -75,8 +75,8 @@ class Guard(Protocol):
     """A shield inside an engine: it replaces proposed actions by the actions that are applied.
 
     The engine calls it inside ``Engine.step``, so no action bypasses it. The engine keeps the guard's memory beside its
-    state. State, memory and ruling change in one assignment, or, after an error or an interrupt, none of them does. So a
-    guard never changes its memory in place.
+    state. State, memory and ruling change in one assignment, or, after an error or an interrupt, none of them does. So
+    a guard never changes its memory in place.
     """
 
     def begin(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
@@ -86,13 +86,13 @@ class Guard(Protocol):
         """
 
     def decide(self, running: Engine, memory: Any, proposed: Floats) -> Ruling:
-        """Return the actions to apply instead of ``proposed`` [n, L]. A column of NaN: that learner proposed nothing."""
+        """Return the actions to apply instead of ``proposed`` [n, L]; a column of NaN: that learner proposed none."""
 
     def check(self, ruling: Ruling, after: Engine) -> Any:
         """Return the memory to keep after the step. Raise ``UncertifiedStep`` to roll the step back."""
 
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
-        """Return the infos of every vehicle by name, each [n, N]: of the last step, or of the alert before the first."""
+        """Return the infos of every vehicle by name, each [n, N]: of the last step, or of the alert before it."""
 
 
 class Now(NamedTuple):
@@ -120,9 +120,9 @@ class Now(NamedTuple):
 class Engine:
     """A batch of ``n`` running episodes of one scenario.
 
-    A step goes from one decision of the ``deciders`` to the next; the first begins when the first decider may act. With a
-    ``guard`` (a shield), the applied actions may differ from the proposed ones. If the physics cannot advance a world, its
-    episode is truncated and the ``roster`` names it; the other worlds go on.
+    A step goes from one decision of the ``deciders`` to the next; the first begins when the first decider may act. With
+    a ``guard`` (a shield), the applied actions may differ from the proposed ones. If the physics cannot advance a
+    world, its episode is truncated and the ``roster`` names it; the other worlds go on.
 
     Args:
         scenario: the scenario of all episodes, or another ``Game``.
@@ -373,9 +373,9 @@ class Engine:
     def step(self, actions: Actions) -> Step:
         """Advance every running episode by one time step.
 
-        ``actions`` are numbers in [-1, 1] for each learner: an array [n, L] with columns in the order of ``learners``, or a
-        mapping from vehicle index to [n]. With a guard, the mapping may leave learners out. Rows whose episode has ended do not
-        move until ``renew`` or ``reset``. If the guard refuses the step, nothing changes.
+        ``actions`` are numbers in [-1, 1] for each learner: an array [n, L] with columns in the order of ``learners``,
+        or a mapping from vehicle index to [n]. With a guard, the mapping may leave learners out. Rows whose episode has
+        ended do not move until ``renew`` or ``reset``. If the guard refuses the step, nothing changes.
         """
         columns = self._columns(actions)
         if self._nobody_refuses_steps:
@@ -532,8 +532,8 @@ class Engine:
     def segments(self, before: Worlds, last_mps2: Floats) -> Iterator[tuple[Worlds, Floats, Floats]]:
         """Yield the parts of the last step between which a script decided; after a reset, from the alert on.
 
-        Each part is the worlds at its start, the commands [n, N] that they followed, and its end [n]. ``before`` are the worlds
-        at the start of the step, ``last_mps2`` the commands of the last part.
+        Each part is the worlds at its start, the commands [n, N] that they followed, and its end [n]. ``before`` are
+        the worlds at the start of the step, ``last_mps2`` the commands of the last part.
         """
         for motion, wanted in self._now.stops:
             then = Packed(motion, self.state.params).worlds(before.vehicles)
@@ -556,8 +556,8 @@ class Engine:
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Continue exactly from a ``snapshot`` of an engine of the same scenario, size and scripts.
 
-        Raises ``InvalidInput`` before anything changes: for a missing array, an array of another shape, or an engine with a
-        guard, whose memory the snapshot does not hold.
+        Raises ``InvalidInput`` before anything changes: for a missing array, an array of another shape, or an engine
+        with a guard, whose memory the snapshot does not hold.
         """
         if self.guard is not None:
             raise InvalidInput(
@@ -587,9 +587,9 @@ class Engine:
     def place(self, worlds: Worlds, ledger: Ledger | None = None, *, ended: Bools | None = None) -> None:
         """Set the running worlds in all rows, as another simulator has moved them, with their ``ledger`` so far.
 
-        Vehicles, memories and times of decisions stay those of the last reset; the next step goes to the next decision after
-        the worlds' time. ``ended`` [n]: worlds that no step moves any more; None: the worlds at the horizon. Raises
-        ``InvalidInput`` for another number of worlds or vehicles.
+        Vehicles, memories and times of decisions stay those of the last reset; the next step goes to the next decision
+        after the worlds' time. ``ended`` [n]: worlds that no step moves any more; None: the worlds at the horizon.
+        Raises ``InvalidInput`` for another number of worlds or vehicles.
         """
         state = self.state
         if state.impacts is not None:
@@ -610,7 +610,7 @@ class Engine:
         return self.state.copy()
 
     def first_moments(self, count: int) -> tuple[Worlds, State]:
-        """Return the first ``count`` worlds of the training stream: at the alert, and their state at the first decision."""
+        """Return the first ``count`` worlds of the training stream at the alert, and at their first decision."""
         stream = copy.copy(self._now.stream)
         stream.restart(self.seed)
         alert, new = stream.take(count).alert, self._unwatched(count, self._now)

@@ -209,8 +209,21 @@ class TrainingRecipe(FileModel):
 
     @staticmethod
     def shipped() -> dict[str, Path]:
-        """Return the file of every recipe that comes with the package, by name."""
-        return {file.stem: file for file in sorted(shipped_folder("train").glob("*.yaml"))}
+        """Return the file of every recipe that comes with the package, by name.
+
+        A recipe for an algorithm of an extension is in a folder with the name of the extension.
+        """
+        files = sorted(shipped_folder("train").rglob("*.yaml"), key=lambda file: file.name)
+        return {file.stem: file for file in files}
+
+    @staticmethod
+    def usable() -> dict[str, Path]:
+        """Return the shipped recipes whose algorithm is installed; the others need an extension."""
+        return {
+            name: file
+            for name, file in TrainingRecipe.shipped().items()
+            if _algorithm_in(read_yaml(file)) in ALGORITHMS
+        }
 
     @staticmethod
     def file(name_or_path: str | Path) -> Path:
@@ -220,7 +233,7 @@ class TrainingRecipe(FileModel):
             return Path(text)
         shipped = TrainingRecipe.shipped()
         if text not in shipped:
-            raise unknown_name("recipe", text, shipped)
+            raise unknown_name("recipe", text, TrainingRecipe.usable())
         return shipped[text]
 
     @staticmethod
@@ -360,14 +373,20 @@ def load_recipe(name_or_path: str | Path) -> TrainingRecipe:
     return _checked(TrainingRecipe.file(name_or_path))
 
 
+def _algorithm_in(document: Document) -> object:
+    """Return the algorithm that a recipe file names."""
+    return document.content.get("algorithm", "ppo") if isinstance(document.content, dict) else "ppo"
+
+
 def _checked(source: Path | Document) -> TrainingRecipe:
     document = source if isinstance(source, Document) else read_yaml(source)
-    name = document.content.get("algorithm", "ppo") if isinstance(document.content, dict) else "ppo"
+    name = _algorithm_in(document)
     if not isinstance(name, str) or name not in ALGORITHMS:
         where, right = document.where(("algorithm",)), f"one of {', '.join(ALGORITHMS)}"
-        absent = "; the package or extension that gives it is not installed"
-        ships = isinstance(source, Path) and source in TrainingRecipe.shipped().values()
-        raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: must be {right}{absent if ships else ''}")
+        absent = ""
+        if isinstance(source, Path) and source in TrainingRecipe.shipped().values():
+            absent = f"; the extension {source.parent.name}, which gives it, is not installed"
+        raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: must be {right}{absent}")
     shipped = f"; every key is in the shipped recipe {name}" if name in TrainingRecipe.shipped() else ""
     model = ALGORITHMS[name][0]
     wording = _RecipeWording(model, f"it is needed{shipped}")

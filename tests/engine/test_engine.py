@@ -266,11 +266,14 @@ def with_script(script: str) -> eb.Scenario:
             "harm",
         ),
         (with_script("e_v2x_bm:pairwise"), "harm"),
-        (with_script("planner:20"), "harm"),
     ],
 )
 @pytest.mark.parametrize("before", [0, 45])
 def test_restore__the_next_steps_are_the_same_to_the_bit(scenario: eb.Scenario, reward: Any, before: int) -> None:
+    check_restore(scenario, reward, before)
+
+
+def check_restore(scenario: eb.Scenario, reward: Any, before: int) -> None:
     first = make_engine(scenario, 6, reward=reward, seed=3)
     rng = np.random.default_rng(0)
     steps_of(first, rng, before)

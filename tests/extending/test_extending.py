@@ -2,7 +2,6 @@
 
 import csv
 import json
-import re
 import runpy
 from pathlib import Path
 from typing import Any
@@ -13,10 +12,9 @@ import pytest
 import yaml
 
 import ethbrake_marl as eb
-from ethbrake_marl.cli.app import app, run_command
+from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.statistics import mean, rate
-from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.game.measures import BUILT_IN, REPORTED
 from ethbrake_marl.game.objectives import declared_objectives
 from ethbrake_marl.game.observations import observe
@@ -296,14 +294,8 @@ def test_measure__sees_every_impact_whatever_the_chunk_and_changes_nothing_else(
     assert evaluated(aftermath=False).outcome("full_brake").metrics == {}
 
 
-def test_measure__of_each_vehicle_stands_in_rows_frame_markdown_and_report() -> None:
-    eb.register_measure("squared", squared, unit="m2/s2")
-    injury = changed(lambda episodes: 1.0 / (1.0 + np.exp(4.457 - 0.177 * episodes.largest_speed_change_mps)))
-    eb.register_measure("injured", injury, unit="1")
-    eb.register_measure("change", changed(lambda episodes: episodes.largest_speed_change_mps), unit="m/s")
-    struck = changed(lambda each: np.isin(np.arange(each.worlds.n), each.rows.world[each.rows.pair == 1]))
-    eb.register_measure("rear_ended", struck, unit="1")  # whether Vehicle 3 hit Vehicle 2
-    found = evaluated()
+def test_measure__of_each_vehicle_stands_in_rows_frame_and_markdown() -> None:
+    found = measured_by_vehicle()
     rows, braked = eb.summarise(found), found.outcome("full_brake")
     changes = np.stack([braked.metrics[f"change_{i}"] for i in (1, 2, 3)], axis=1)
     assert (((changes > 0.0).sum(axis=1) > 1) == braked.collided).all() and (changes >= 0.0).all()  # of both in a pair
@@ -313,11 +305,20 @@ def test_measure__of_each_vehicle_stands_in_rows_frame_markdown_and_report() -> 
     told = rows[0].to_json()
     assert told["metric_squared"] == near(told["total_harm"]) and len(told["metric_injured_3_interval"]) == 2
     assert told["metrics"]["injured_3"] == "injured, vehicle 3 (1)"
-    frame, report = found.to_frame("columns"), Report("mine", rows, found).html
+    frame = found.to_frame("columns")
     assert frame["metric_squared"] == near(frame["total_harm"])
-    for text in (rows.markdown(), report):
-        assert "squared (m2/s2)" in text and "injured, vehicle 2 (1)" in text
-    assert "Squared closing speed of every impact." in report
+    text = rows.markdown()
+    assert "squared (m2/s2)" in text and "injured, vehicle 2 (1)" in text
+
+
+def measured_by_vehicle() -> Any:
+    eb.register_measure("squared", squared, unit="m2/s2")
+    injury = changed(lambda episodes: 1.0 / (1.0 + np.exp(4.457 - 0.177 * episodes.largest_speed_change_mps)))
+    eb.register_measure("injured", injury, unit="1")
+    eb.register_measure("change", changed(lambda episodes: episodes.largest_speed_change_mps), unit="m/s")
+    struck = changed(lambda each: np.isin(np.arange(each.worlds.n), each.rows.world[each.rows.pair == 1]))
+    eb.register_measure("rear_ended", struck, unit="1")  # whether Vehicle 3 hit Vehicle 2
+    return evaluated()
 
 
 def test_measure__one_function_and_it_stands_in_every_output(
@@ -333,12 +334,11 @@ def test_measure__one_function_and_it_stands_in_every_output(
         assert run_command(["evaluate", *agents, *words]) == 0
         return capsys.readouterr().out
 
-    text = " ".join(told("--episodes", "40", "--output", "out", "--per-world", "csv", "--report").split())
+    text = " ".join(told("--episodes", "40", "--output", "out", "--per-world", "csv").split())
     rows = list(csv.DictReader(Path("out/worlds.csv").read_text().splitlines()))[:40]
     change, hit = (np.array([float(row[name]) for row in rows]) for name in names)
     assert np.ptp(change) > 1.0 and set(hit) == {0.0, 1.0} and ((change > 2.0) == hit).all()
-    for page in (text, Path("out/report.html").read_text()):
-        assert "change_of_rear (m/s)" in page and f"{change.mean():.2f}" in page and "hit_hard (1)" in page
+    assert "change_of_rear (m/s)" in text and f"{change.mean():.2f}" in text and "hit_hard (1)" in text
     results = json.loads(Path("out/results.json").read_text())[0]
     expected = [mean(change), rate(int(hit.sum()), 40)]
     assert [(results[n], tuple(results[f"{n}_interval"])) for n in names] == [(e.value, e.interval) for e in expected]
@@ -382,26 +382,3 @@ def test_folder__makes_its_scenarios_known_by_name_and_to_the_command_line(
     assert [(entry.name, entry.origin) for entry in added] == [("coast-road", str(folder)), ("hills", str(folder))]
     assert eb.parallel_env(scenario="hills").reset(seed=1)[0] and {entry.origin for entry in before} == {"shipped"}
     assert "worst" in REPORTED
-
-
-DOCS = Path(__file__).resolve().parents[2] / "docs"
-PAGE = "".join((DOCS / f"{name}.md").read_text("utf-8") for name in ("extending", "own-policy"))
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_page__its_code_runs_from_the_top_down(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(app, "registered_commands", [*app.registered_commands])
-    code = "\n".join(re.findall("```python\n(.*?)```", PAGE, re.DOTALL))
-    names: dict[str, object] = {"__name__": "my_file"}
-    exec(compile(code, "extending.md", "exec"), names)
-    assert names["status"] == 0
-    assert run_command(["scenario", "parts"]) == 0
-    told = capsys.readouterr().out
-    assert all(name in told for name in ("comfort", "time_gap", "rural", "front-first", "patient", "absorbed"))
-    policy = eb.load_policy(tmp_path / "runs" / "again")
-    assert policy.manifest.algorithm == "patient" and "comfort" in policy.manifest.reward["terms"]
-    assert policy.manifest.observation.features[-1] == "rear_1.mass_ratio"
-    assert (tmp_path / "runs" / "again" / "harm.png").stat().st_size > 1000

@@ -265,14 +265,14 @@ def test_measures__of_a_file_are_told_where_it_is_named(tmp_path: Path, capsys: 
 def test_scenario_recipe_and_bundle__run_no_file_that_they_name(tmp_path: Path) -> None:
     (tmp_path / "evil.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
     evil = f"{tmp_path}/evil.py:make"
-    paper, quick = eb.load_scenario("paper-random"), eb.load_recipe("quick")
+    paper, ppo = eb.load_scenario("paper-random"), eb.load_recipe("ppo")
     for use in (
         lambda: paper.replace(roles={"vehicle_1": evil}),
         lambda: paper.replace(objective=evil),
         lambda: paper.replace(observation=[evil]),
-        lambda: quick.replace(algorithm=evil),
-        lambda: quick.replace(reward={"harm": 1.0, evil: 1.0}),
-        lambda: quick.replace(observation=[evil]),
+        lambda: ppo.replace(algorithm=evil),
+        lambda: ppo.replace(reward={"harm": 1.0, evil: 1.0}),
+        lambda: ppo.replace(observation=[evil]),
     ):
         with pytest.raises(InvalidInput):
             use()

@@ -22,11 +22,8 @@ from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts
 from ethbrake_marl.shield.running import begin_running
 from ethbrake_marl.shield.step import StepShield
 from tests.fixtures.asked import Acts
-from tests.fixtures.extensions import of
 from tests.shield.attacks import ADVERSARIES, LEAKS, TEAM_ADVERSARIES, TEAMS, all_infos, attack, begun, line, search
 from tests.shield.plays import reported
-
-Searched = of("search.around", "Searched")
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::RuntimeWarning",  # uncompiled, a division by 0 warns
@@ -370,12 +367,6 @@ def test_rollout__a_policy_that_does_otherwise_when_it_is_tried_out_gets_no_furt
 def test_later_rollouts__may_be_switched_off():
     _, _, reasons, _ = driven(eb.LearnedAgent(Weights()), later_rollouts=False)
     assert not (reasons == ShieldReason.POLICY_ROLLOUT).any()
-
-
-def test_rollout__also_of_a_searched_policy_that_cannot_be_divided():
-    driver = ShieldedDriver(Searched(Remembering(), PAPER, candidates=20), PAPER)
-    episodes = drive(WORLDS.take(np.arange(20)), driver, PAPER, 1)
-    assert episodes.ledger.world_harm("first").tolist() == episodes.guarded.shield.bound.tolist()
 
 
 # ---------------------------------------------------------------- several shielded vehicles, decided together

@@ -24,9 +24,9 @@ from ethbrake_marl.files.yaml import read_yaml
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.training.settings import read_settings
 from ethbrake_marl.training.training import Training
-from tests.cli.conftest import rows_of as read
 from tests.extensions.studies.conftest import TRIALS, Write, study, write_yaml
 from tests.extensions.studies.counting import PROGRAM, ROOT, end_when, finished, holders
+from tests.fixtures.commands import rows_of as read
 from tests.learning.tiny import marked
 
 DOCS = ROOT / "docs"
