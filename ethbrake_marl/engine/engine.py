@@ -199,117 +199,6 @@ class Engine:
                     f" scenario {self.scenario.name!r} has one every {here:g} s: make_agent(..., scenario=...) knows"
                 )
 
-    @property
-    def observation(self) -> ObservationSpec:
-        """The observation of all learners. Raises ``InvalidInput`` if learners observe different features."""
-        return common_observation(self.observations, self.scenario)
-
-    @property
-    def seed(self) -> int:
-        """Seed of the training stream."""
-        return self._now.stream.seed
-
-    @property
-    def state(self) -> State:
-        """The running episodes, not a copy: read them, do not change them."""
-        return self._now.state
-
-    @property
-    def roster(self) -> Roster:
-        """Number of the world in each row, and the worlds that the physics could not advance."""
-        return self._now.roster
-
-    @property
-    def memories(self) -> dict[int, Memory]:
-        """Memories of the scripts, by vehicle."""
-        return self._now.state.memories
-
-    @property
-    def guarded(self) -> Any:
-        """Memory of the guard; None without a guard, or before its first episode."""
-        return self._now.state.guarded
-
-    @property
-    def ruling(self) -> Ruling | None:
-        """The guard's ruling in the last step; None without one."""
-        return self._now.ruling
-
-    @property
-    def packed(self) -> Packed:
-        """The running worlds as rows (``physics.columns``), not a copy: kernels read them, nobody changes them."""
-        return self._now.state.packed
-
-    @property
-    def wanted_mps2(self) -> Floats:
-        """Acceleration that each vehicle asked for in the last step, [n, N] m/s2; not a copy."""
-        return self._now.state.wanted
-
-    @property
-    def worlds(self) -> Worlds:
-        """The running worlds, as a copy."""
-        return self._now.rules.unpack(self.packed)
-
-    @property
-    def in_pieces(self) -> bool:
-        """Whether a script follows a braking profile of several pieces."""
-        return bool(self._now.rules.pieces.shape[1] > 0)
-
-    @property
-    def ledger(self) -> Ledger:
-        """Harm of the running episodes so far, as a copy."""
-        return self._now.state.ledger
-
-    @property
-    def ended(self) -> Bools:
-        """Whether each episode has ended, [n]."""
-        return self._now.state.ended
-
-    @property
-    def steps(self) -> Ints:
-        """Number of steps that each running episode has taken, [n]."""
-        return self._now.state.steps
-
-    def observe(self, vehicle: int) -> Observations:
-        """Return the current observation of one vehicle, [n, F]."""
-        if not isinstance(vehicle, int | np.integer) or not 0 <= vehicle < self.scenario.vehicles:
-            raise InvalidInput(f"observe: vehicle index {vehicle!r}; must be in 0..{self.scenario.vehicles - 1}")
-        return self.observe_all(np.array([vehicle]))[:, 0]
-
-    def observe_all(self, vehicles: Ints | None = None, rows: Ints | None = None) -> Observations:
-        """Return the current observations of several vehicles, [n, len(vehicles), F]; None: of all learners.
-
-        ``rows`` selects worlds. Raises ``InvalidInput`` if these vehicles observe different features.
-        """
-        vehicles = self._learner_index if vehicles is None else vehicles
-        if not self._alike and len({self.observations[i] for i in vehicles.tolist()}) > 1:
-            names = ", ".join(self.scenario.vehicle_names[i] for i in vehicles.tolist())
-            raise InvalidInput(f"observe_all: {names} observe different features; use observe for each")
-        state = self._now.state
-        motion, params, clock = state.motion, state.params, state.clock
-        plan: Plan = self._plans[0 if self._alike else int(vehicles[0])]
-        if rows is not None:
-            motion, params = motion.take(rows, axis=0), params.take(rows, axis=0)
-        if not plan.extras:
-            return plan.observe(motion, params, vehicles)
-        return plan.observe(motion, params, vehicles, clock[:, STEP] if rows is None else clock[rows, STEP])
-
-    def memory(self, watcher: Watcher) -> Any:
-        """Return the memory of a watcher."""
-        return self._now.watched[watcher]
-
-    def watch(self, watcher: Watcher, memory: Any) -> None:
-        """Add a watcher, with its first memory."""
-        self._now = self._now._replace(watched={**self._now.watched, watcher: memory})
-
-    def protect(self, guard: Guard | None) -> None:
-        """Set the guard, from the next reset on; None removes it."""
-        self.guard = guard
-        self._now = self._now._replace(state=self._now.state._replace(guarded=None), ruling=None)
-
-    def remember(self, guarded: Any) -> None:
-        """Replace the guard's memory, for a caller that decides itself and uses ``place`` instead of ``step``."""
-        self._now = self._now._replace(state=self._now.state._replace(guarded=guarded))
-
     def reset(self, *, seed: int | None = None, worlds: Worlds | None = None) -> None:
         """Start new episodes in all rows, with these worlds (at t = 0) or with the next ones of the training stream.
 
@@ -338,37 +227,38 @@ class Engine:
         new._begin(np.arange(self.n), start)
         return new._now
 
-    def _at(self, now: Now) -> Engine:
-        """Return this engine with another state of affairs."""
-        new = copy.copy(self)
-        new._now = now
-        return new
-
-    def renew(self, rows: Ints) -> None:
-        """Start new episodes of the training stream in these rows (autoreset). If anything fails, nothing changes."""
-        if len(rows) == 0:
-            return
-        if not 0 <= np.min(rows) <= np.max(rows) < self.n or np.bincount(rows).max() > 1:
-            raise InvalidInput(f"renew: rows {rows}; must be different numbers from 0 to {self.n - 1}")
-        new = self if self._nobody_refuses_episodes else self._at(self._now.apart())
-        (state, roster, stream, *_), now = new._now, new._now
-        position = stream.position
-        start = stream.take(len(rows))
-        roster.renew(rows, position)
-        state.motion[rows], state.params[rows] = now.kept(start.packed)
-        state.clock[rows], state.wanted[rows] = start.clock, start.wanted
-        new._begin(rows, start)
-        self._now = new._now
-
-    @property
-    def _nobody_refuses_episodes(self) -> bool:
-        """Whether the start of an episode cannot fail. Then the arrays are changed in place, which is faster."""
-        return not (self._now.watched or self._remembering or self.guard or self._terms.count_impacts)
-
-    def cut(self, step: Step, most_steps: int) -> None:
-        """Truncate the episodes that have taken ``most_steps`` steps, in this engine and in the last ``step``."""
-        cut = (self.steps >= most_steps) & (step.ended | ~self.ended)
-        step.outcome[TRUNCATED, cut] = self._now.state.clock[cut, ENDED] = 1.0
+    def _begin(self, rows: Ints, start: Start) -> None:
+        """Start episodes in ``rows``: memories, decisions and messages before the first step, potentials."""
+        if not self._nobody_refuses_episodes:
+            alert, memories = start.alert, self.memories
+            with renumbered(rows):
+                if self.guard is not None:
+                    self.remember(self.guard.begin(self.guarded, alert, rows))
+                watched = {w: w.begun(memory, alert, rows) for w, memory in self._now.watched.items()}
+                self._now = self._now._replace(watched=watched)
+                begun = {i: begin_script(s, alert, i, self._now.stream.known) for i, s in self._remembering.items()}
+            self._change(memories=renew_memory(memories, rows, begun) if memories else begun)
+        (motion, params, _, wanted, potential, *_), rules = self.state, self._now.rules
+        if self._own_grid.scripts:
+            at_alert = self._now.kept(Packed.of(start.alert)).state
+            stops = tuple((there.copy(), last) for there, last in self._now.stops)  # of the episodes that go on
+            for there in (motion, *(there for there, _ in stops)):
+                there[rows] = at_alert
+            way = self._own_grid.drive_to_start(self.state, rules, rows, start.clock[:, START])
+            self._change(memories=way.memories)
+            self._now = self._now._replace(stops=(*stops, *way.stops))
+        elif self.packed.has_messages:
+            at_alert, heard = self._now.kept(Packed.of(start.alert)).state, params[rows]
+            start_s = self.state.time_s[rows]
+            hear_rows(at_alert, heard, wanted[rows], start_s, start_s, self.scenario.time_step_s, rules.pieces)
+            params[rows] = heard
+        if self._terms.count_impacts:
+            alert, now, before = start.alert, self.worlds, self.state.impacts
+            impacts = EpisodeImpacts.of(alert) if before is None else before.renewed(rows, alert)
+            since_alert = self.segments(now.assign(rows, alert), now.command_mps2)
+            self._change(impacts=impacts.and_then(since_alert, np.isin(np.arange(self.n), rows)))
+        if self.reward.shaping > 0.0:
+            potential[rows] = self._terms.potentials(rules.unpack(Packed(motion[rows], params[rows])), self.scenario)
 
     def step(self, actions: Actions) -> Step:
         """Advance every running episode by one time step.
@@ -398,6 +288,33 @@ class Engine:
         """Whether a step cannot fail. Then the arrays are changed in place, which is faster."""
         return not (self.guard or self._now.watched or self._terms.are_foreign or self._own_grid.scripts)
 
+    def _columns(self, actions: Actions) -> Floats:
+        """Return the learners' actions as [n, L]. Their range is checked where they are used."""
+        shape = (self.n, len(self.learners))
+        if type(actions) is np.ndarray and actions.shape == shape and actions.dtype.kind in "fiu":
+            return np.ascontiguousarray(actions, np.float64)
+        if not isinstance(actions, Mapping):
+            return checked_action(actions, shape, "the learners")
+        for vehicle in actions:
+            if vehicle not in self.learners:
+                raise InvalidInput(
+                    f"step: an action for vehicle index {vehicle!r}; the learners have the indices {self.learners}"
+                )
+        columns = np.empty(shape)
+        for c, vehicle in enumerate(self.learners):
+            if vehicle not in actions and self.guard is not None:
+                columns[:, c] = np.nan
+                continue
+            if vehicle not in actions:
+                raise InvalidInput(f"step: no action for the learner vehicle_{vehicle + 1}")
+            columns[:, c] = checked_action(actions[vehicle], (self.n,), f"vehicle_{vehicle + 1}")
+        return columns
+
+    def _in_range(self, columns: Floats) -> Floats:
+        """Return the actions [n, L] clipped by a rounding error of float32 at most; else raise ``InvalidInput``."""
+        each = [checked_action(columns[:, c], (self.n,), f"vehicle_{i + 1}") for c, i in enumerate(self.learners)]
+        return np.stack(each, axis=1) if each else columns
+
     def _ruled(self, before: Engine, columns: Floats, *, checked: bool) -> Ruling:
         """Return the guard's ruling on these actions [n, L]; ``checked`` says that they are in range."""
         assert self.guard is not None
@@ -407,10 +324,9 @@ class Engine:
 
     def _advance(self, columns: Floats) -> Step:
         """Advance every running episode by one time step, in place: scripts, motion, failed worlds, reward."""
-        asked = self._ask_scripts()
         harm_before = self._terms.objective_harm(self.state) if self._terms.by_objective else None
-        impacts = self.state.impacts
-        start = None if impacts is None else self.worlds
+        start = None if self.state.impacts is None else self.worlds
+        asked = self._ask_scripts()
         step, some_failed = self._move(columns)
         if asked:
             self._change(memories=self.memories | asked)
@@ -418,17 +334,8 @@ class Engine:
             times = self.state.motion[:, 0]
             self.roster.mark(step.failed, times, np.minimum(times + self.scenario.time_step_s, self.scenario.horizon_s))
         if self._terms.add_something:
-            if impacts is not None and start is not None:
-                moved = start.time_s < self.state.time_s
-                self._change(impacts=impacts.and_then(self.segments(start, self.wanted_mps2), moved))
-            worlds = self.worlds if self.reward.shaping > 0.0 else None
-            state = self._terms.add(step, self.state, self.scenario, harm_before, impacts, worlds)
-            self._now = self._now._replace(state=state)
+            self._add_terms(step, harm_before, start)
         return step
-
-    def _change(self, **fields: Any) -> None:
-        """Replace fields of the state."""
-        self._now = self._now._replace(state=self._now.state._replace(**fields))
 
     def _ask_scripts(self) -> dict[int, Memory]:
         """Let the scripts with a memory decide that are deciders; return their new memories, by vehicle."""
@@ -469,65 +376,76 @@ class Engine:
         self._now = self._now._replace(stops=way.stops)
         return way
 
-    def _columns(self, actions: Actions) -> Floats:
-        """Return the learners' actions as [n, L]. Their range is checked where they are used."""
-        shape = (self.n, len(self.learners))
-        if type(actions) is np.ndarray and actions.shape == shape and actions.dtype.kind in "fiu":
-            return np.ascontiguousarray(actions, np.float64)
-        if not isinstance(actions, Mapping):
-            return checked_action(actions, shape, "the learners")
-        for vehicle in actions:
-            if vehicle not in self.learners:
-                raise InvalidInput(
-                    f"step: an action for vehicle index {vehicle!r}; the learners have the indices {self.learners}"
-                )
-        columns = np.empty(shape)
-        for c, vehicle in enumerate(self.learners):
-            if vehicle not in actions and self.guard is not None:
-                columns[:, c] = np.nan
-                continue
-            if vehicle not in actions:
-                raise InvalidInput(f"step: no action for the learner vehicle_{vehicle + 1}")
-            columns[:, c] = checked_action(actions[vehicle], (self.n,), f"vehicle_{vehicle + 1}")
-        return columns
+    def _add_terms(self, step: Step, harm_before: Floats | None, start: Worlds | None) -> None:
+        """Add the reward terms that the compiled step does not know.
 
-    def _in_range(self, columns: Floats) -> Floats:
-        """Return the actions [n, L] clipped by a rounding error of float32 at most; else raise ``InvalidInput``."""
-        each = [checked_action(columns[:, c], (self.n,), f"vehicle_{i + 1}") for c, i in enumerate(self.learners)]
-        return np.stack(each, axis=1) if each else columns
+        Args:
+            step: the step just made.
+            harm_before: harm of each vehicle's objective before the step, [n, N]; None without objectives.
+            start: the worlds before the step, where a measure of impacts is rewarded; else None.
 
-    def _begin(self, rows: Ints, start: Start) -> None:
-        """Start episodes in ``rows``: memories, decisions and messages before the first step, potentials."""
-        if not self._nobody_refuses_episodes:
-            alert, memories = start.alert, self.memories
-            with renumbered(rows):
-                if self.guard is not None:
-                    self.remember(self.guard.begin(self.guarded, alert, rows))
-                watched = {w: w.begun(memory, alert, rows) for w, memory in self._now.watched.items()}
-                self._now = self._now._replace(watched=watched)
-                begun = {i: begin_script(s, alert, i, self._now.stream.known) for i, s in self._remembering.items()}
-            self._change(memories=renew_memory(memories, rows, begun) if memories else begun)
-        (motion, params, _, wanted, potential, *_), rules = self.state, self._now.rules
-        if self._own_grid.scripts:
-            at_alert = self._now.kept(Packed.of(start.alert)).state
-            stops = tuple((there.copy(), last) for there, last in self._now.stops)  # of the episodes that go on
-            for there in (motion, *(there for there, _ in stops)):
-                there[rows] = at_alert
-            way = self._own_grid.drive_to_start(self.state, rules, rows, start.clock[:, START])
-            self._change(memories=way.memories)
-            self._now = self._now._replace(stops=(*stops, *way.stops))
-        elif self.packed.has_messages:
-            at_alert, heard = self._now.kept(Packed.of(start.alert)).state, params[rows]
-            start_s = self.state.time_s[rows]
-            hear_rows(at_alert, heard, wanted[rows], start_s, start_s, self.scenario.time_step_s, rules.pieces)
-            params[rows] = heard
-        if self._terms.count_impacts:
-            alert, now, before = start.alert, self.worlds, self.state.impacts
-            impacts = EpisodeImpacts.of(alert) if before is None else before.renewed(rows, alert)
-            since_alert = self.segments(now.assign(rows, alert), now.command_mps2)
-            self._change(impacts=impacts.and_then(since_alert, np.isin(np.arange(self.n), rows)))
-        if self.reward.shaping > 0.0:
-            potential[rows] = self._terms.potentials(rules.unpack(Packed(motion[rows], params[rows])), self.scenario)
+        """
+        impacts = self.state.impacts
+        if impacts is not None and start is not None:
+            moved = start.time_s < self.state.time_s
+            self._change(impacts=impacts.and_then(self.segments(start, self.wanted_mps2), moved))
+        worlds = self.worlds if self.reward.shaping > 0.0 else None
+        state = self._terms.add(step, self.state, self.scenario, harm_before, impacts, worlds)
+        self._now = self._now._replace(state=state)
+
+    def _change(self, **fields: Any) -> None:
+        """Replace fields of the state."""
+        self._now = self._now._replace(state=self._now.state._replace(**fields))
+
+    def observe(self, vehicle: int) -> Observations:
+        """Return the current observation of one vehicle, [n, F]."""
+        if not isinstance(vehicle, int | np.integer) or not 0 <= vehicle < self.scenario.vehicles:
+            raise InvalidInput(f"observe: vehicle index {vehicle!r}; must be in 0..{self.scenario.vehicles - 1}")
+        return self.observe_all(np.array([vehicle]))[:, 0]
+
+    def observe_all(self, vehicles: Ints | None = None, rows: Ints | None = None) -> Observations:
+        """Return the current observations of several vehicles, [n, len(vehicles), F]; None: of all learners.
+
+        ``rows`` selects worlds. Raises ``InvalidInput`` if these vehicles observe different features.
+        """
+        vehicles = self._learner_index if vehicles is None else vehicles
+        if not self._alike and len({self.observations[i] for i in vehicles.tolist()}) > 1:
+            names = ", ".join(self.scenario.vehicle_names[i] for i in vehicles.tolist())
+            raise InvalidInput(f"observe_all: {names} observe different features; use observe for each")
+        state = self._now.state
+        motion, params, clock = state.motion, state.params, state.clock
+        plan: Plan = self._plans[0 if self._alike else int(vehicles[0])]
+        if rows is not None:
+            motion, params = motion.take(rows, axis=0), params.take(rows, axis=0)
+        if not plan.extras:
+            return plan.observe(motion, params, vehicles)
+        return plan.observe(motion, params, vehicles, clock[:, STEP] if rows is None else clock[rows, STEP])
+
+    def renew(self, rows: Ints) -> None:
+        """Start new episodes of the training stream in these rows (autoreset). If anything fails, nothing changes."""
+        if len(rows) == 0:
+            return
+        if not 0 <= np.min(rows) <= np.max(rows) < self.n or np.bincount(rows).max() > 1:
+            raise InvalidInput(f"renew: rows {rows}; must be different numbers from 0 to {self.n - 1}")
+        new = self if self._nobody_refuses_episodes else self._at(self._now.apart())
+        (state, roster, stream, *_), now = new._now, new._now
+        position = stream.position
+        start = stream.take(len(rows))
+        roster.renew(rows, position)
+        state.motion[rows], state.params[rows] = now.kept(start.packed)
+        state.clock[rows], state.wanted[rows] = start.clock, start.wanted
+        new._begin(rows, start)
+        self._now = new._now
+
+    @property
+    def _nobody_refuses_episodes(self) -> bool:
+        """Whether the start of an episode cannot fail. Then the arrays are changed in place, which is faster."""
+        return not (self._now.watched or self._remembering or self.guard or self._terms.count_impacts)
+
+    def cut(self, step: Step, most_steps: int) -> None:
+        """Truncate the episodes that have taken ``most_steps`` steps, in this engine and in the last ``step``."""
+        cut = (self.steps >= most_steps) & (step.ended | ~self.ended)
+        step.outcome[TRUNCATED, cut] = self._now.state.clock[cut, ENDED] = 1.0
 
     def segments(self, before: Worlds, last_mps2: Floats) -> Iterator[tuple[Worlds, Floats, Floats]]:
         """Yield the parts of the last step between which a script decided; after a reset, from the alert on.
@@ -540,6 +458,23 @@ class Engine:
             yield before, wanted, then.time_s
             before = then
         yield before, last_mps2, self.state.time_s.copy()
+
+    def protect(self, guard: Guard | None) -> None:
+        """Set the guard, from the next reset on; None removes it."""
+        self.guard = guard
+        self._now = self._now._replace(state=self._now.state._replace(guarded=None), ruling=None)
+
+    def remember(self, guarded: Any) -> None:
+        """Replace the guard's memory, for a caller that decides itself and uses ``place`` instead of ``step``."""
+        self._now = self._now._replace(state=self._now.state._replace(guarded=guarded))
+
+    def memory(self, watcher: Watcher) -> Any:
+        """Return the memory of a watcher."""
+        return self._now.watched[watcher]
+
+    def watch(self, watcher: Watcher, memory: Any) -> None:
+        """Add a watcher, with its first memory."""
+        self._now = self._now._replace(watched={**self._now.watched, watcher: memory})
 
     def snapshot(self) -> Arrays:
         """Return copies of everything that changes while the engine runs: rows, place in the stream, memories.
@@ -636,3 +571,79 @@ class Engine:
         new = self._at(now._replace(watched={}))
         new.n = n
         return new
+
+    def _at(self, now: Now) -> Engine:
+        """Return this engine with another state of affairs."""
+        new = copy.copy(self)
+        new._now = now
+        return new
+
+    @property
+    def state(self) -> State:
+        """The running episodes, not a copy: read them, do not change them."""
+        return self._now.state
+
+    @property
+    def worlds(self) -> Worlds:
+        """The running worlds, as a copy."""
+        return self._now.rules.unpack(self.packed)
+
+    @property
+    def packed(self) -> Packed:
+        """The running worlds as rows (``physics.columns``), not a copy: kernels read them, nobody changes them."""
+        return self._now.state.packed
+
+    @property
+    def wanted_mps2(self) -> Floats:
+        """Acceleration that each vehicle asked for in the last step, [n, N] m/s2; not a copy."""
+        return self._now.state.wanted
+
+    @property
+    def ledger(self) -> Ledger:
+        """Harm of the running episodes so far, as a copy."""
+        return self._now.state.ledger
+
+    @property
+    def ended(self) -> Bools:
+        """Whether each episode has ended, [n]."""
+        return self._now.state.ended
+
+    @property
+    def steps(self) -> Ints:
+        """Number of steps that each running episode has taken, [n]."""
+        return self._now.state.steps
+
+    @property
+    def roster(self) -> Roster:
+        """Number of the world in each row, and the worlds that the physics could not advance."""
+        return self._now.roster
+
+    @property
+    def seed(self) -> int:
+        """Seed of the training stream."""
+        return self._now.stream.seed
+
+    @property
+    def observation(self) -> ObservationSpec:
+        """The observation of all learners. Raises ``InvalidInput`` if learners observe different features."""
+        return common_observation(self.observations, self.scenario)
+
+    @property
+    def memories(self) -> dict[int, Memory]:
+        """Memories of the scripts, by vehicle."""
+        return self._now.state.memories
+
+    @property
+    def guarded(self) -> Any:
+        """Memory of the guard; None without a guard, or before its first episode."""
+        return self._now.state.guarded
+
+    @property
+    def ruling(self) -> Ruling | None:
+        """The guard's ruling in the last step; None without one."""
+        return self._now.ruling
+
+    @property
+    def in_pieces(self) -> bool:
+        """Whether a script follows a braking profile of several pieces."""
+        return bool(self._now.rules.pieces.shape[1] > 0)
