@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
@@ -38,7 +37,7 @@ def episode(scenario: eb.Scenario, reward: Any, action: float, worlds: eb.Worlds
 
 def measured(scenario: eb.Scenario, agent: str, worlds: eb.Worlds) -> Any:
     """What an evaluation shows of registered measures."""
-    return eb.evaluate(worlds, {"a": make_agent(agent)}, scenario=scenario).outcome("a").metrics
+    return eb.evaluate(worlds, {"a": eb.make_agent(agent)}, scenario=scenario).outcome("a").metrics
 
 
 # ---------------------------------------------------------------- by impacts
@@ -235,7 +234,10 @@ def test_built_in__reported_is_the_return_of_an_episode_to_the_bit(name: str) ->
 def test_built_in__in_parts_and_behind_a_shield_and_with_an_objective() -> None:
     load_measures(["risk", "harm"])
     scenario = PAPER.replace(objective="own")
-    sample, agents = scenario.sample(12, 7), {n: make_agent(n, scenario=scenario) for n in ("full_brake", "coast+step")}
+    sample, agents = (
+        scenario.sample(12, 7),
+        {n: eb.make_agent(n, scenario=scenario) for n in ("full_brake", "coast+step")},
+    )
     whole, parts = (eb.evaluate(sample, agents, scenario=scenario, chunk=chunk) for chunk in (12, 5))
     for name in agents:
         metrics = whole.outcome(name).metrics
