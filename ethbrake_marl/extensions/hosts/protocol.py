@@ -47,6 +47,7 @@ from ethbrake_marl.physics.paper_map import held_speeds
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Vehicles, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.step import StepShield
 
 STANDS_MPS = 1e-3  # below this speed a vehicle of a host with a fixed step counts as standing
 
@@ -251,7 +252,8 @@ class _Run:
         guarded = self.engine.guarded
         driven = {i: memory for i, memory in self.memories.items() if i in self.team.drivers}
         outcome = outcome_of(self.team, Episodes(self.ledger, self.final, self.at_rest, guarded, driven))
-        return Hosted(outcome, getattr(getattr(guarded, "shield", None), "distrusted", None))
+        shield = None if guarded is None else guarded.shield
+        return Hosted(outcome, shield.memory.distrusted if isinstance(shield, StepShield) else None)
 
     # decisions
     def _decide(self) -> None:
