@@ -251,7 +251,7 @@ class _Run:
         guarded = self.engine.guarded
         driven = {i: memory for i, memory in self.memories.items() if i in self.team.drivers}
         outcome = outcome_of(self.team, Episodes(self.ledger, self.final, self.at_rest, guarded, driven))
-        return Hosted(outcome, getattr(getattr(guarded, "shield", None), "distrusted", None))
+        return Hosted(outcome, getattr(getattr(getattr(guarded, "shield", None), "memory", None), "distrusted", None))
 
     # decisions
     def _decide(self) -> None:
