@@ -19,8 +19,8 @@ A module imports from its own folder, or from what stands below it. `make lint` 
 This page is made from the code: `python -m tests.docs.layout`.
 """
 END = """
-`scenarios/` holds one YAML file per scenario, `train/` the training recipes, an extension's in
-a folder of its name. Both are also inside the wheel. [How the tests are run](tests.md).
+`scenarios/` holds one YAML file per scenario, `train/` the training recipes; those of an extension
+stand in a folder of its name. Both are also inside the wheel. [How the tests are run](tests.md).
 """
 
 
