@@ -65,9 +65,7 @@ class Knowledge(tuple[Source, ...]):
 
     @property
     def sees_through(self) -> bool:
-        """Whether the sources include information about the line that no message or sensor delivered (true state or
-        model).
-        """
+        """Whether the true state or the true model, which no message or sensor delivers, is among the sources."""
         return Source.STATE in self or Source.MODEL in self
 
 

@@ -23,7 +23,7 @@ class Entry:
     """Entry of the registry: an agent, or a wrapper, which is a shield or a search that goes around an agent."""
 
     name: str  # plain name, without argument
-    form: str  # how a specification is written, as "name[:ARGUMENT][@POLICY]"; without ":" it takes no argument
+    form: str  # how it is written, as "name[:ARGUMENT][@POLICY]"; without ":" no argument, without "@" no policy
     about: str  # description in one line
     knows: Source | Sequence[Source]  # knowledge of the agent while it drives; for a wrapper: knowledge that it adds
     make: Factory | Wrapper  # function that makes the agent, or makes the wrapper around an agent
@@ -45,9 +45,7 @@ class Entry:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """For a wrapper with fixed words as arguments: all texts that may follow the ``+``, as ``("step",
-        "step:pairwise")``.
-        """
+        """Every text that may follow the ``+`` for a wrapper with fixed arguments, as ``("step", "step:mine")``."""
         name, *options = re.findall(r"[^\[\]+]+", self.whole_form)
         found = [name]
         for option in options:
@@ -166,7 +164,7 @@ def group_names() -> tuple[str, ...]:
 
 
 def agents_of_group(group: str) -> tuple[str, ...]:
-    """Return the specifications of the agents in a group: first its own, then those of ``GROUP.MORE``, sorted by name."""
+    """Return the specifications of all agents in a group: its own, then those of ``GROUP.MORE``, sorted by name."""
     return tuple(spec for name in sorted(GROUPS) if name.partition(".")[0] == group for spec in GROUPS[name])
 
 

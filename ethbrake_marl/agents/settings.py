@@ -43,11 +43,13 @@ class AgentSettings:
         return self.scenario
 
 
+# Called as (argument, settings).
 Factory = Callable[[str | None, AgentSettings], Driver]
-"""Function that makes an agent from its argument (the text after the colon, or None) and its settings."""
+"""Makes the agent of an argument (what stands after the colon, or None)."""
 
+# Called as (agent or team, argument, settings); makes a shield or a search around the agent.
 Wrapper = Callable[[Any, str | None, AgentSettings], Driver]
-"""Function ``(agent, argument, settings)`` that makes a shield or search around an agent."""
+"""Makes the agent around an agent."""
 
 
 class Variant(NamedTuple):

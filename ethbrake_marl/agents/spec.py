@@ -103,13 +103,13 @@ def _is_one_spec(text: str) -> bool:
 
 
 def _existing_file(core: str) -> str:
-    """Return the path of the longest existing Python file with which the specification ``core`` begins; empty if none."""
+    """Return the longest path of an existing Python file with which the specification ``core`` begins, or ""."""
     ends = (match.start() for match in re.finditer(r"(?<=\.py):", core))
     return max((core[:end] for end in ends if os.path.isfile(core[:end])), key=len, default="")
 
 
 def _python_file(core: str) -> str:
-    """Return the path of the Python file, existing or not, with which ``core`` begins; empty if there is none."""
+    """Return the path of the Python file, existing or not, with which ``core`` begins, or "" without one."""
     return _existing_file(core) or (core.partition(":")[0] if _BEGINS_WITH_FILE.fullmatch(core) else "")
 
 
