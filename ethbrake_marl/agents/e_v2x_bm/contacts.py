@@ -8,8 +8,8 @@ gap            bumper to bumper at the start [m], >= 0
 v_l, v_f       speeds at the start [m/s], >= 0
 a_l, a_f       decelerations [m/s2], >= 0, held to standstill
 onset_l/_f     start of braking after the start [s]; before it a vehicle coasts
-tau            latency of the follower after the leader's onset [s], >= 0
-lead           latency of the leader after the follower's onset [s], > 0
+tau            time from the leader's onset to the follower's [s], >= 0
+lead           time from the follower's onset to the leader's [s], > 0
 w              closing speed ``v_f - v_l`` [m/s]
 =============  ===============================================================
 
@@ -48,7 +48,11 @@ def stopping_distance(speed: float, deceleration: float) -> float:
 
 @compiled
 def contact_while_coasting(gap: float, v_l: float, a_l: float, v_f: float, tau: float) -> float:
-    """Return the squared closing speed if the pair meets while the follower coasts (regimes A and A'), else -1."""
+    """Return the squared closing speed if the pair meets while the follower coasts, else -1. [m2/s2]
+
+    The leader (``_l``) brakes from 0, the follower (``_f``) only from ``tau``. Regimes A (the leader still moves) and
+    A' (it stands) of docs/proofs/constant-deceleration.md.
+    """
     w = v_f - v_l
     stop_l = stopping_time(v_l, a_l)
     squared = w * w + 2.0 * a_l * gap
@@ -66,7 +70,11 @@ def contact_while_coasting(gap: float, v_l: float, a_l: float, v_f: float, tau: 
 
 @compiled
 def contact_while_both_brake(gap: float, v_l: float, a_l: float, v_f: float, a_f: float, tau: float) -> float:
-    """Return the squared closing speed if the pair meets while both brake and move (regime B), else -1."""
+    """Return the squared closing speed if the pair meets while both brake and move, else -1. [m2/s2]
+
+    The leader (``_l``) brakes from 0, the follower (``_f``) from ``tau``. Regime B of
+    docs/proofs/constant-deceleration.md.
+    """
     stop_l = stopping_time(v_l, a_l)
     if not stop_l > tau:
         return _NONE
@@ -87,9 +95,9 @@ def contact_while_both_brake(gap: float, v_l: float, a_l: float, v_f: float, a_f
 
 @compiled
 def contact_leader_first(gap: float, v_l: float, a_l: float, v_f: float, a_f: float, tau: float) -> float:
-    """Return the squared closing speed at the first contact if the leader brakes first; 0 without contact.
+    """Return the squared closing speed at the first contact if the leader brakes first; 0 without contact. [m2/s2]
 
-    The leader brakes from 0, the follower from ``tau``.
+    The leader (``_l``) brakes from 0, the follower (``_f``) from ``tau``.
     """
     squared = contact_while_coasting(gap, v_l, a_l, v_f, tau)
     if squared < 0.0:
@@ -105,9 +113,10 @@ def contact_leader_first(gap: float, v_l: float, a_l: float, v_f: float, a_f: fl
 
 @compiled
 def contact_before_leader_brakes(gap: float, w: float, a_f: float, lead: float) -> float:
-    """Return the squared closing speed if a braking follower meets a leader that coasts for ``lead``, else -1.
+    """Return the squared closing speed if a braking follower meets a leader that still coasts; else -1. [m2/s2]
 
-    ``w^2 - 2 a_f gap`` at ``s = 2 gap / (w + sqrt(.)) <= lead``. A touch is ignored: the pair separates again.
+    The follower brakes from 0 with ``a_f``; the leader coasts until ``lead``; ``w`` is the closing speed at the start.
+    The pair meets at ``s = 2 gap / (w + sqrt(w^2 - 2 a_f gap)) <= lead``. A touch is ignored: the pair separates again.
     """
     squared = w * w - 2.0 * a_f * gap
     if w > 0.0 and squared > TOUCH_SQUARED and 2.0 * gap / (w + math.sqrt(squared)) <= lead:
@@ -119,7 +128,11 @@ def contact_before_leader_brakes(gap: float, w: float, a_f: float, lead: float) 
 def closing_speed_squared(
     gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, a_f: float, onset_f: float
 ) -> float:
-    """Return the squared closing speed at the pair's first impact; 0 without one, or for a mere touch. [m2/s2]"""
+    """Return the squared closing speed at the pair's first impact; 0 without one, or for a mere touch. [m2/s2]
+
+    ``gap`` and speeds ``v`` hold at the start; each vehicle (leader ``_l``, follower ``_f``) coasts until its onset and
+    then brakes with ``a`` to standstill.
+    """
     w = v_f - v_l
     both_coast = min(onset_l, onset_f)
     if w > 0.0 and gap <= w * both_coast:
@@ -140,7 +153,7 @@ def closing_speed_squared(
 
 @compiled
 def least_behind_braking(gap: float, v_l: float, a_l: float, v_f: float, tau: float) -> float:
-    """Case of ``least_to_spare_front`` in which the leader brakes from 0 and the follower from ``tau >= 0``."""
+    """Return ``least_to_spare_front`` if the leader brakes from 0 and the follower from ``tau >= 0``. [m/s2]"""
     coasting = contact_while_coasting(gap, v_l, a_l, v_f, tau)
     if coasting > TOUCH_SQUARED:
         return math.inf
@@ -159,7 +172,7 @@ def least_behind_braking(gap: float, v_l: float, a_l: float, v_f: float, tau: fl
 
 @compiled
 def least_behind_coasting(gap: float, v_l: float, a_l: float, v_f: float, lead: float) -> float:
-    """Case of ``least_to_spare_front`` in which the follower brakes from 0 and the leader from ``lead > 0``."""
+    """Return ``least_to_spare_front`` if the follower brakes from 0 and the leader from ``lead > 0``. [m/s2]"""
     if v_f == 0.0:
         return 0.0
     w = v_f - v_l
@@ -178,9 +191,9 @@ def least_behind_coasting(gap: float, v_l: float, a_l: float, v_f: float, lead: 
 def least_to_spare_front(gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, onset_f: float) -> float:
     """Return the smallest constant deceleration of the follower that avoids the leader; inf if none does. [m/s2]
 
-    At any time the follower's position decreases with its deceleration, so every larger deceleration avoids the leader
-    too. The leader brakes (``a_l > 0``). The limit is either the stopping distance or, if the follower would stop
-    first, a grazing contact of two moving vehicles.
+    The leader (``_l``) brakes with ``a_l > 0``; each vehicle coasts until its onset. At any time the follower's
+    position decreases with its deceleration, so every larger deceleration avoids the leader too. The limit is either
+    the stopping distance or, if the follower would stop first, a grazing contact of two moving vehicles.
     """
     w = v_f - v_l
     both_coast = min(onset_l, onset_f)
@@ -194,7 +207,7 @@ def least_to_spare_front(gap: float, v_l: float, a_l: float, onset_l: float, v_f
 
 @compiled
 def most_ahead_of_coasting(gap: float, v_l: float, v_f: float, a_f: float, tau: float) -> float:
-    """Case of ``most_to_spare_rear`` in which the leader brakes from 0 and the follower from ``tau >= 0``."""
+    """Return ``most_to_spare_rear`` if the leader brakes from 0 and the follower from ``tau >= 0``. [m/s2]"""
     reach = v_f * tau + stopping_distance(v_f, a_f)
     touching = gap == 0.0 and v_f == v_l  # pressed together from the start: no impact
     if reach <= gap or touching:
@@ -213,9 +226,9 @@ def most_ahead_of_coasting(gap: float, v_l: float, v_f: float, a_f: float, tau: 
 def most_to_spare_rear(gap: float, v_l: float, onset_l: float, v_f: float, a_f: float, onset_f: float) -> float:
     """Return the leader's largest constant deceleration that avoids the follower; inf: all do, -inf: none does. [m/s2]
 
-    At any time the leader's position decreases with its deceleration, so every smaller deceleration avoids the follower
-    too. The follower brakes (``a_f > 0``). A follower that brakes first is advanced to the leader's onset, because
-    until then nothing depends on the leader's deceleration.
+    The follower (``_f``) brakes with ``a_f > 0``; each vehicle coasts until its onset. At any time the leader's
+    position decreases with its deceleration, so every smaller deceleration avoids the follower too. A follower that
+    brakes first is advanced to the leader's onset, because until then nothing depends on the leader's deceleration.
     """
     w = v_f - v_l
     both_coast = min(onset_l, onset_f)
