@@ -127,9 +127,7 @@ class Now(NamedTuple):
         return self._replace(state=self.state.copy(), roster=self.roster.apart(), stream=copy.copy(self.stream))
 
     def kept(self, packed: Packed) -> Packed:
-        """Return packed worlds with the columns of this batch, such as those for an obstacle or for messages over
-        links.
-        """
+        """Return packed worlds with the columns of this batch, which may have some for an obstacle and for messages."""
         return packed.widened(self.obstacle, self.by_link)
 
 
@@ -606,7 +604,10 @@ class Engine:
         return self.state.copy()
 
     def first_moments(self, count: int) -> tuple[Worlds, State]:
-        """Return the first ``count`` worlds of the training stream at the alert, and their state at the first decision."""
+        """Return the first ``count`` worlds of the training stream, and their state at the first decision.
+
+        The worlds are at the alert.
+        """
         stream = copy.copy(self._now.stream)
         stream.restart(self.seed)
         alert, new = stream.take(count).alert, self._unwatched(count, self._now)

@@ -384,7 +384,7 @@ class Decision(NamedTuple):
     intervened: Bools  # [n] or [n, K] whether the proposal was replaced (clipping to [-1, 1] does not count)
     reason: NDArray[np.int64]  # [n] or [n, K] codes of ShieldReason
     bound: Floats  # [n] largest possible harm of the episode from now on (m2/s2)
-    margin: Floats  # [n] or [n, K] accepted harm minus the least harm found after the proposal; negative if rejected
+    margin: Floats  # [n] or [n, K] accepted harm minus least harm found after the proposal (m2/s2); < 0: rejected
     after: Running  # the predicted episodes at the next decision
     backup: Backup  # the plan whose harm is the bound
 

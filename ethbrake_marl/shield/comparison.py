@@ -20,11 +20,10 @@ GROUPS = (("gap", " m"), ("hit flag", ""), ("first-impact harm", " m2/s2"), ("to
 
 
 def seen_columns(packed: Packed) -> Floats:
-    """Return the running worlds of an engine as rows [n, S] in the layout of the shield's predictions
-    (``Running.states``).
+    """Return an engine's running worlds as rows [n, S] in the layout of the shield's predictions.
 
-    The columns are speeds, gaps, hit flags, first-impact harm and total harm. If some world has an obstacle ahead, its
-    column comes first in each group.
+    This is the layout of ``Running.states``: speeds, gaps, hit flags, first-impact harm and total harm. If some world
+    has an obstacle ahead, its column comes first in each group.
     """
     state, column = packed.state, packed.column
     speeds, first, pairs, at = state[:, column.speed : column.command], column.gap, column.vehicles - 1, column.obstacle

@@ -68,8 +68,9 @@ class Guarded(NamedTuple):
 
     @property
     def told(self) -> dict[str, Any]:
-        """The entries ``predicted_harm`` and ``chosen_policy``, each [n], as an agent's memory has them; None if
-        unknown.
+        """Predicted harm and whether the policy drives, each [n], by their names in an agent's memory.
+
+        The names are ``predicted_harm`` and ``chosen_policy``; the value is None if unknown.
         """
         return {what: getattr(self.shield, what, None) for what in ("predicted_harm", "chosen_policy")}
 
@@ -215,7 +216,7 @@ class ShieldGuard(ABC):
         return proposed, memories
 
     def _proposer(self, memories: dict[int, Memory], worlds: Worlds | None) -> Proposer | None:
-        """Return the policies with their ``memories`` and the current ``worlds``, for rollouts; None without policies."""
+        """Return the policies with their memories and the current worlds, for rollouts; None without policies."""
         return Proposer(self._policies, memories, worlds) if self._policies and worlds is not None else None
 
 

@@ -25,7 +25,7 @@ from ethbrake_marl.shield.attach import Attached, Proposing
 from ethbrake_marl.shield.drivers import ShieldedDriver, shielded
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
 
-Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # return value of a step of the environment
+Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # observations, rewards, terminated, truncated, infos
 
 
 class _Closing:
@@ -34,7 +34,7 @@ class _Closing:
     attached: Attached
 
     def close(self, **settings: Any) -> None:
-        """Remove the shield from the environment, and close the environment."""
+        """Remove the shield from the environment, then close the environment with its keywords ``settings``."""
         self.attached.close()
         super().close(**settings)  # type: ignore[misc]  # of the wrapper's own library
 
@@ -93,14 +93,22 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observations], dict[str, dict[str, Any]]]:
-        """Start an episode. ``infos[agent]["shield_bound_harm"]`` already holds the bound."""
+        """Start an episode; return the observations and infos of the agents.
+
+        ``seed`` and ``options`` are the environment's. ``infos[agent]["shield_bound_harm"]`` already holds the bound.
+        """
         self.attached.check_open()
         begun: tuple[dict[str, Observations], dict[str, dict[str, Any]]] = super().reset(seed=seed, options=options)
         self.attached.check_open()
         return begun
 
     def step(self, actions: Mapping[str, Any]) -> Told:
-        """Advance by one step with the learners' actions certified or replaced. Actions may be omitted."""
+        """Advance by one step with the learners' actions certified or replaced.
+
+        ``actions`` maps agent names to actions [1]; the policy proposes for agents that are left out. Returns
+        observations, rewards (with the intervention penalty subtracted), terminations, truncations and infos, each by
+        agent name.
+        """
         self.attached.check_open()
         found: Told = super().step(actions)
         for agent, penalty in zip(self.shielded, self.attached.penalty()[0].tolist(), strict=True):
@@ -122,7 +130,7 @@ class ShieldedEnv(
     """``EthBrake-v0`` behind a shield, by default in mode ``step``: each action is certified, or replaced.
 
     ``options`` are keywords of ``ShieldOptions``. The info reports each decision under ``shield_reason`` and other
-    ``shield_...`` keys. ``policy``, required only in mode ``episode``, is rolled out at each alert: where it harms no
+    ``shield_...`` keys. ``policy``, required only in mode ``episode``, is simulated from each alert: where it harms no
     more than the coupled optimum, its harm is the bound.
 
     >>> import ethbrake_marl as eb
@@ -147,14 +155,18 @@ class ShieldedEnv(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode. ``info["shield_bound_harm"]`` already holds the bound."""
+        """Start an episode; return the observation and the info. ``info["shield_bound_harm"]`` already holds the bound."""
         self.attached.check_open()
         begun = self.env.reset(seed=seed, options=options)
         self.attached.check_open()  # a wrapper inside may have put another environment there
         return begun
 
     def step(self, action: NDArray[Any]) -> Any:
-        """Advance by one time step with the action certified or replaced; around ``CostEnv``, also return its cost."""
+        """Advance by one time step with the action [1] certified or replaced.
+
+        Returns what the wrapped environment returns, with the intervention penalty subtracted from the reward; around
+        ``CostEnv`` that includes the cost.
+        """
         self.attached.check_open()
         observation, reward, *others = self.env.step(action)
         return observation, float(reward) - self.attached.penalty().item(), *others
@@ -163,9 +175,10 @@ class ShieldedEnv(
 class ShieldedVectorEnv(_Closing, VectorWrapper):
     """``EthBrakeVectorEnv`` behind a shield, by default in mode ``step``: each row's action is certified, or replaced.
 
-    ``options`` are keywords of ``ShieldOptions``. ``infos["shield_bound_harm"]`` and the other shield entries describe
-    the same moment as the other infos: in a restarted row the new alert, while ``infos["final_info"]`` describes the
-    last step. Raises ``InvalidInput`` for another environment.
+    ``options`` are keywords of ``ShieldOptions``. ``policy``, required only in mode ``episode``, is simulated from each
+    alert: where it harms no more than the coupled optimum, its harm is the bound. ``infos["shield_bound_harm"]`` and
+    the other shield entries describe the same moment as the other infos: in a restarted row the new alert, while
+    ``infos["final_info"]`` describes the last step. Raises ``InvalidInput`` for another environment.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -187,14 +200,21 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode in every row. ``infos["shield_bound_harm"]`` already holds the bounds."""
+        """Start an episode in every row; return observations [rows, F] and infos.
+
+        ``infos["shield_bound_harm"]`` already holds the bounds.
+        """
         self.attached.check_open()
         begun = self.env.reset(seed=seed, options=options)
         self.attached.check_open()  # a wrapper inside may have put another environment there
         return begun
 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
-        """Advance every world by one time step with the actions [rows, 1] certified or replaced."""
+        """Advance every world by one time step with the actions [rows, 1] certified or replaced.
+
+        Returns observations, rewards with the intervention penalty subtracted, terminated, truncated (each [rows]) and
+        infos.
+        """
         self.attached.check_open()
         observation, reward, terminated, truncated, infos = self.env.step(actions)
         return observation, reward - self.attached.penalty()[:, 0], terminated, truncated, infos
