@@ -99,9 +99,7 @@ class ShieldedDriver(ByPolicy):
         return Team(Team.of(self.policy, vehicles).drivers, self.name, shield=self)
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent]) -> Guard:
-        """Return the guard for ``engine``; ``policies`` maps the index of each learner to the agent that proposes for
-        it.
-        """
+        """Return the guard for ``engine``, in which ``policies`` (vehicle index -> agent) propose."""
         return self.options.guard(engine, policies, several=isinstance(self.policy, Team), **self._how)
 
 

@@ -60,9 +60,7 @@ def all_members(running: Running) -> Members:
 
 @compiled
 def members_from(every: Members, a: int, b: int) -> Members:
-    """Return the possible worlds in rows ``a`` to ``b - 1`` of ``every``, usually those of one world; nothing is
-    copied.
-    """
+    """Return the possible worlds in rows ``a`` to ``b - 1`` of ``every``, usually those of one world, as views."""
     clock, bounds, lines, pieces = every.clock[a:b], every.bounds[a:b], every.lines[a:b], every.pieces[a:b]
     return Members(every.table, clock, bounds, lines, pieces, every.vehicles, every.critical)
 

@@ -53,7 +53,7 @@ class Running(NamedTuple):
         return Decisions(clock[:, CLOCK.START], clock[:, CLOCK.TIME_STEP]).at(self.steps)
 
     def rows_of(self, worlds: Ints) -> Ints:
-        """Return the rows that hold the possible worlds of the worlds with the indices ``worlds``, [len(worlds) * M]."""
+        """Return the rows of the possible worlds of the worlds with the indices ``worlds``, [len(worlds) * M]."""
         return np.asarray((worlds[:, np.newaxis] * self.members + np.arange(self.members)).ravel(), np.int64)
 
     def take(self, worlds: Ints) -> Running:
@@ -84,9 +84,7 @@ Number = TypeVar("Number", bound=np.generic)
 
 
 def put(old: NDArray[Number], rows: Ints, new: NDArray[Number]) -> NDArray[Number]:
-    """Return a copy of ``old`` in which the rows with the indices ``rows`` are replaced by the rows of ``new``, in
-    order.
-    """
+    """Return a copy of ``old`` in which the rows with the indices ``rows`` are replaced by those of ``new``."""
     placed = old.copy()
     placed[rows] = new
     return placed

@@ -258,8 +258,7 @@ class StepShield:
         )  # fmt: skip
 
     def _problem(self, possible: Worlds, members: int) -> ProfileProblem:
-        """Return all ``possible`` worlds with the commands of the unshielded vehicles, as a problem of
-        ``engine.profiles``.
+        """Return the possible worlds and the commands of the unshielded vehicles, as a problem of ``engine.profiles``.
 
         Raises ``InvalidInput`` if these commands are not fixed at the alert. If each world has several possible worlds
         (``members``), each of them must also leave the shielded vehicles at least one decision before the horizon.

@@ -155,7 +155,7 @@ class ShieldedEnv(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode; return the observation and the info. ``info["shield_bound_harm"]`` already holds the bound."""
+        """Start an episode; return observation and info. ``info["shield_bound_harm"]`` already holds the bound."""
         self.attached.check_open()
         begun = self.env.reset(seed=seed, options=options)
         self.attached.check_open()  # a wrapper inside may have put another environment there
