@@ -11,9 +11,7 @@ from ethbrake_marl.physics.state import Bools, Floats, Worlds
 from ethbrake_marl.shield.certify import ends_of_plans
 from ethbrake_marl.shield.running import Running
 
-SLACK = (
-    1e-9  # tolerance (m, m/s) around the range that several possible worlds predict; a single one must match exactly
-)
+SLACK = 1e-9  # tolerance (m, m/s) around the range that several possible worlds predict; one alone must match exactly
 
 # columns of each pair in a state: name and unit
 GROUPS = (("gap", " m"), ("hit flag", ""), ("first-impact harm", " m2/s2"), ("total harm", " m2/s2"))

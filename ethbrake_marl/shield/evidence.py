@@ -36,7 +36,10 @@ class Review(NamedTuple):
     trusted: Bools  # [m] whether the world behaved as the shield predicted
 
     def share(self, verdict: str) -> float:
-        """Return the share (0 to 1) of the interventions with this verdict, one of ``VERDICTS``; 0 if there are none."""
+        """Return the share (0 to 1) of the interventions that have this verdict, one of ``VERDICTS``.
+
+        It is 0 if there are no interventions.
+        """
         return float((self.verdict == verdict).mean()) if self.verdict.size else 0.0
 
 
