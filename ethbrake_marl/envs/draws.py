@@ -1,5 +1,4 @@
-"""The random draws behind the worlds of an environment: quantities at the alert, vehicle types and scenario, as
-columns.
+"""The random draws behind the worlds of an environment: initial states, vehicle types and scenarios, as columns.
 
 Worlds are pure functions of scenario, seed and number. So nothing is stored while episodes run; the worlds are drawn
 again on request.

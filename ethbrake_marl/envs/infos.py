@@ -86,8 +86,9 @@ class Report(NamedTuple):
 
     @classmethod
     def of(cls, engine: Engine, step: Step | None = None, rows: Ints | None = None) -> Report:
-        """Return the report of an engine's worlds as they are now. Call it before ended episodes are replaced by new
-        ones.
+        """Return the report of an engine's worlds as they are now.
+
+        Call it after a step before ended episodes are replaced by new ones.
 
         Args:
             engine: the engine.
@@ -165,10 +166,10 @@ class Report(NamedTuple):
         return infos
 
     def batch_info(self, vehicle: int, rows: Bools, stepped: Bools) -> dict[str, Any]:
-        """Return one vehicle's infos in all worlds in Gymnasium's vector format: ``{"time_s": [n], "_time_s": [n],
-        ...}``.
+        """Return one vehicle's infos in all worlds in Gymnasium's vector format.
 
-        The entry with an underscore marks the worlds that have the info.
+        This is ``{"time_s": [n], "_time_s": [n], ...}``; the entry with an underscore marks the worlds that have the
+        info.
 
         Args:
             vehicle: index of the vehicle (0 = front).
@@ -324,8 +325,9 @@ class Begun:
             raise InvalidInput(f"{what}: no episode was started; call reset first")
 
     def describe_worlds(self) -> Columns:
-        """Return the random draw of each running world: column name -> values [worlds]; see
-        ``envs.draws.describe_worlds``.
+        """Return the random draw of each running world: column name -> values [worlds].
+
+        See ``envs.draws.describe_worlds``.
         """
         self._check_started("describe_worlds")
         return describe_worlds(self.engine)

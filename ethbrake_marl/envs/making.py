@@ -146,10 +146,10 @@ def chosen_seed(seed: int | None) -> int:
 
 
 def wanted_worlds(engine: Engine, options: Mapping[str, Any]) -> Worlds | None:
-    """Return the worlds that the options of a reset request, one for each row of the engine; None: worlds of the
-    stream.
+    """Return the worlds that the options of a reset request, one for each of the engine's rows.
 
-    Raises ``InvalidInput`` if both options are given, and for an invalid one.
+    None means that the worlds come from the stream. Raises ``InvalidInput`` if both options are given, and for an
+    invalid one.
     """
     if LISTED_WORLD not in options:
         if INITIAL_STATE not in options:

@@ -237,9 +237,7 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
 
 
 def _agent_vehicles(engine: Engine, agents: WhoIsAgent) -> Ints:
-    """Return the indices of the vehicles that are agents: all, or the learners. Raise ``InvalidInput`` for another
-    word.
-    """
+    """Return the indices of the vehicles that are agents; raise ``InvalidInput`` for an unknown word."""
     if agents not in get_args(WhoIsAgent):
         raise InvalidInput(f"agents = {agents!r}: must be 'all' or 'learners'")
     if agents == "all":
@@ -270,10 +268,9 @@ def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[s
 
 
 def env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
-    """Return the environment with agents acting in turn (AEC), the same as ``raw_env``; arguments as for
-    ``parallel_env``.
+    """Return the environment with agents acting in turn (AEC), the same as ``raw_env``.
 
-    Actions are not clipped, and nothing ends an episode early: an invalid action raises ``InvalidInput`` in its agent's
-    turn, and the turn stays with that agent.
+    Arguments are as for ``parallel_env``. Actions are not clipped, and nothing ends an episode early: an invalid action
+    raises ``InvalidInput`` in its agent's turn, and the turn stays with that agent.
     """
     return raw_env(scenario, **settings)

@@ -197,9 +197,7 @@ class _Pen:
         self._draw = draw
 
     def box(self, left: float, top: float, right: float, bottom: float, fill: str, edge: str | None = None) -> None:
-        """Draw a box with slightly round corners, in the colour ``fill`` and with an ``edge`` of another colour or
-        None.
-        """
+        """Draw a box with slightly round corners, filled with one colour; ``edge`` is the edge's colour, or None."""
         corners = [value * _FINE for value in (left, top, max(right, left + 1), max(bottom, top + 1))]
         self._draw.rounded_rectangle(corners, 2 * _FINE, fill=fill, outline=edge, width=_FINE * 2)
 
@@ -247,9 +245,7 @@ def _draw_vehicle(pen: _Pen, scene: Scene, i: int) -> None:
 
 
 def _draw_panel(pen: _Pen, scene: Scene, i: int) -> None:
-    """Draw the command of the vehicle with index ``i`` as a share of its capacity: braking to the left, driving to the
-    right.
-    """
+    """Draw the command of vehicle ``i`` as a share of its capacity: braking to the left, driving to the right."""
     left, width = _panel(scene, i)
     pen.box(left, _PANEL_TOP, left + 20, _PANEL_TOP + 18, vehicle_colour(i))
     middle, half, top = left + width / 2, width / 2, _PANEL_TOP + 62
@@ -340,9 +336,7 @@ def _panel(scene: Scene, i: int) -> tuple[float, float]:
 
 
 def _x(scene: Scene, place_m: float) -> float:
-    """Return the horizontal position (pixels) of the place ``place_m`` on the road (m from Vehicle 1's front at the
-    alert).
-    """
+    """Return the horizontal position (pixels) of the place ``place_m`` on the road (m)."""
     return (float(place_m) - scene.view.left_m) / (scene.view.right_m - scene.view.left_m) * WIDTH
 
 

@@ -170,11 +170,10 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self._actions = own_actions(actions, "the learners")
 
     def step_wait(self) -> tuple[Observations, Rewards, Bools, list[dict[str, Any]]]:
-        """Advance every world by one time step with the stored actions; worlds that end start their next episode at
-        once.
+        """Advance every world by one time step with the stored actions.
 
-        Returns observations [rows, F], rewards [rows], whether each row's episode ended [rows], and one dictionary of
-        infos per row.
+        Worlds that end start their next episode at once. Returns observations [rows, F], rewards [rows], whether each
+        row's episode ended [rows], and one dictionary of infos per row.
         """
         if not self._started or self._actions is None:
             raise InvalidInput("step: no episode is running; call reset first")

@@ -188,8 +188,9 @@ class Trace:
         return (*memory[:-1], last, new) if self._whole else (new,)
 
     def motions(self, engine: Engine) -> Memory:
-        """Return all recorded motions in order, up to the engine's current state. Raise ``InvalidInput`` before a
-        reset.
+        """Return all recorded motions in order, the last one up to the engine's current state.
+
+        Raises ``InvalidInput`` before the first reset.
         """
         memory: Memory = engine.memory(self)
         if not memory:

@@ -47,8 +47,9 @@ class Viewer:
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """Gymnasium's metadata: ``render_modes``, and the ``render_fps`` at which one frame per step plays in real
-        time.
+        """Gymnasium's metadata: the render modes, and the frames per second.
+
+        With one frame per step, ``render_fps`` plays in real time.
         """
         fps = 1.0 / self._engine.scenario.time_step_s
         return {"render_modes": list(self.modes), "render_fps": round(fps) if abs(fps - round(fps)) < 1e-9 else fps}
