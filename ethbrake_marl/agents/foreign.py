@@ -75,9 +75,16 @@ def _without_memory(action: Any) -> Any:
 
 
 def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | None]:
-    """Adapt a model with a method ``predict``; a memory that it returns (sb3-contrib's recurrent models) is kept.
+    """Adapt a model with a method ``predict`` (Stable-Baselines3, sb3-contrib), as ``adapt_policy`` does.
 
-    Which axis of the memory counts the worlds is found by predicting for two worlds and for three.
+    A memory that it returns (recurrent models) is kept. Which axis of the memory counts the worlds is found by
+    predicting for two worlds and for three.
+
+    Args:
+        model: the model.
+        name: name of the agent in error messages.
+        features: number of features in an observation.
+
     """
 
     def predict(seen: Observations, **memory: Any) -> tuple[Any, State]:
@@ -269,7 +276,11 @@ def policy_agent(
 
 
 def _appending(appended: Appended, scenario: Scenario) -> Callable[[Worlds, int], Observations]:
-    """Return a function ``(worlds, vehicle) -> [n, K]`` of the features that follow the vehicle's own observation."""
+    """Return a function ``(worlds, vehicle) -> [n, K]`` that computes what is appended to a vehicle's own observation.
+
+    ``appended`` is ``number`` (the vehicle's number among the scenario's learners) or ``state`` (the state of the
+    line).
+    """
 
     def number(worlds: Worlds, vehicle: int) -> Observations:
         if vehicle not in scenario.learners:
@@ -356,14 +367,20 @@ class PolicyAgent:
             raise AgentFailed(self.name, k, reason) from error
 
     def _answer(self, seen: Observations, state: State, rows: Ints) -> tuple[NDArray[Any], State]:
-        """Return the policy's actions for the worlds with indices ``rows``, and its new memory of these worlds."""
+        """Return the policy's raw actions for the worlds with the indices ``rows``, and its new memory of these worlds.
+
+        ``seen`` [n, F] and ``state`` are observations and the policy's memory of all worlds.
+        """
         if self._initial_state is None:
             return to_array(self._infer(seen[rows], None)[0]), None
         action, state = self._infer(seen[rows], take_memory(state, rows))
         return to_array(action), checked_memory(state, len(rows))
 
     def _find_failing(self, seen: Observations, state: State) -> int | None:
-        """Return the index of a world for which the policy alone raises, found by bisection; None if there is none."""
+        """Return the index of a world for which the policy alone raises, found by bisection; None if there is none.
+
+        ``seen`` [n, F] and ``state`` are observations and the policy's memory of all worlds.
+        """
 
         def fails(rows: Ints) -> bool:
             try:
@@ -382,7 +399,10 @@ class PolicyAgent:
         return int(rows[0])
 
     def _checked(self, action: NDArray[Any], seen: Observations, worlds: Worlds, steps: Ints) -> Floats:
-        """Return a policy's raw actions as [n] in [-1, 1]; raise ``AgentFailed`` for wrong shapes or values."""
+        """Return a policy's raw actions as [n] in [-1, 1]; raise ``AgentFailed`` for wrong shapes or values.
+
+        ``seen``, ``worlds`` and ``steps`` [n] (steps taken) are used in the message only.
+        """
         n, what = worlds.n, f"gave {action.dtype} of shape {action.shape} for observations of shape {seen.shape}"
         if action.shape != (n, 1) or action.dtype.kind not in "fiu":
             first = len(action) if action.shape[1:] in ((), (1,)) and action.ndim and len(action) < n else 0

@@ -107,10 +107,10 @@ def normalisation(model: Any) -> Any:
 
 
 def _was_normalised(model: Any) -> bool:
-    """Return whether a model's saved training data show that its observations were normalised.
+    """Return whether the saved training data of a Stable-Baselines3 model show that its observations were normalised.
 
-    They were if the last observation lies outside the space, or its original is saved too. Off-policy algorithms always
-    save an original, so for them only the space counts.
+    They were if the last observation lies outside the observation space, or its original is saved too. Off-policy
+    algorithms always save an original, so for them only the space counts.
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True

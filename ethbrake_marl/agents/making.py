@@ -109,10 +109,10 @@ def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None =
 
 
 def find_entry(spec: AgentSpec | str) -> Entry:
-    """Return the registry's entry of the agent in a specification such as ``planner:64`` or ``ppo@shipped``.
+    """Return the registry's entry of an agent.
 
-    Raises ``UnknownName`` with a suggestion for an unknown agent; ``InvalidInput`` for an argument or a policy that the
-    agent does not take.
+    ``spec`` is a specification such as ``planner:64`` or ``ppo@shipped``, as a text or parsed. Raises ``UnknownName``
+    with a suggestion for an unknown agent; ``InvalidInput`` for an argument or a policy that the agent does not take.
     """
     written = parse_spec(spec) if isinstance(spec, str) else spec
     if written.file is not None:
@@ -132,9 +132,16 @@ def find_entry(spec: AgentSpec | str) -> Entry:
 
 
 def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: Driver) -> Driver:
-    """Make the driver of a registry entry, for a wrapper around ``inside``, and check it.
+    """Make an agent or a team from its registry entry, and check it.
 
     Errors of agents from outside this package become ``InvalidInput``.
+
+    Args:
+        entry: the entry.
+        argument: text after the colon in the specification; None without one.
+        settings: passed on.
+        inside: for a shield or a search, the agent or team that it goes around.
+
     """
     try:
         driver = entry.call(argument, settings, *inside)

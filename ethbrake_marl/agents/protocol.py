@@ -214,7 +214,7 @@ class AgentAround(ByPolicy):
         return getattr(self.policy, "time_step_s", None)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Return the wrapped agent's initial memory; arguments as in ``Script.begin``.
+        """Return the wrapped agent's initial memory.
 
         Args:
             alert: n worlds at the alert.

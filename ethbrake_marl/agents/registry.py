@@ -75,7 +75,7 @@ class Entry:
 
 
 def around_entry(each: str) -> Entry:
-    """Return the entry of a wrapper, given as it is written after a ``+``, for example ``episode:pairwise``."""
+    """Return the entry of a shield or search, given as it is written after a ``+``, for example ``episode:pairwise``."""
     return SHIELDS[each.partition(":")[0]]
 
 
@@ -164,7 +164,7 @@ def group_names() -> tuple[str, ...]:
 
 
 def agents_of_group(group: str) -> tuple[str, ...]:
-    """Return the specifications of all agents in a group: its own, then those of ``GROUP.MORE``, sorted by name."""
+    """Return the specifications of all agents in ``group``: its own, then those of ``GROUP.MORE``, sorted by name."""
     return tuple(spec for name in sorted(GROUPS) if name.partition(".")[0] == group for spec in GROUPS[name])
 
 

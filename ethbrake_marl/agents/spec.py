@@ -54,7 +54,7 @@ class AgentSpec:
 
 
 def parse_spec(spec: str) -> AgentSpec:
-    """Parse an agent specification. A path in it may contain any character.
+    """Return a parsed agent specification, such as ``ppo@c+step``. A path in it may contain any character.
 
     ``ppo@c+step`` is the folder ``c+step`` if it exists, otherwise the folder ``c`` behind the shield; ``ppo@c/+step``
     is always the latter. Raises ``InvalidInput`` for invalid syntax, two shields or another order; ``UnknownName`` for

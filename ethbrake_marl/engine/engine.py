@@ -60,7 +60,10 @@ class Watcher(Protocol):
         """
 
     def stepped(self, memory: Any, before: Engine, after: Engine) -> Any:
-        """Return the watcher's memory after a step. ``before`` and ``after`` are the engine before and after it."""
+        """Return the watcher's memory after a step, given its ``memory`` before.
+
+        ``before`` and ``after`` are the engine before and after the step.
+        """
 
 
 class Ruling(NamedTuple):
@@ -68,8 +71,8 @@ class Ruling(NamedTuple):
 
     proposed: Floats  # [n, L] actions that the learners proposed; NaN: none, or not a number
     applied: Floats  # [n, L] actions to apply, in [-1, 1]
-    stepped_in: Bools  # [n] whether another action is applied than the proposed one
-    asked: Bools  # [n] whether the guard decided about this world; False for ended episodes
+    stepped_in: Bools  # [n] whether the guard replaced an action, or chose E-V2X-BM (mode ``episode``)
+    asked: Bools  # [n] whether the guard decided in this world; False for ended episodes
     decision: Any  # further details, in the guard's own format
     memory: Any  # the guard's memory after the step
 
@@ -106,7 +109,9 @@ class Guard(Protocol):
         """
 
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
-        """Return the guard's infos about the last step, or before it about the alert: name -> values [n, N]."""
+        """Return the guard's infos about the last step of ``running``, or before it about the alert: name -> values [n,
+        N].
+        """
 
 
 class Now(NamedTuple):
@@ -127,7 +132,9 @@ class Now(NamedTuple):
         return self._replace(state=self.state.copy(), roster=self.roster.apart(), stream=copy.copy(self.stream))
 
     def kept(self, packed: Packed) -> Packed:
-        """Return packed worlds with the columns of this batch, which may have some for an obstacle and for messages."""
+        """Return ``packed`` worlds with the columns that all rows here have, also for an obstacle or messages if need
+        be.
+        """
         return packed.widened(self.obstacle, self.by_link)
 
 
@@ -316,7 +323,10 @@ class Engine:
         return not (self.guard or self._now.watched or self._terms.are_foreign or self._own_grid.scripts)
 
     def _columns(self, actions: Actions) -> Floats:
-        """Return the learners' actions as an array [n, L]. Their range is checked later."""
+        """Return the learners' actions as an array [n, L], from an array or a mapping as in ``step``.
+
+        Their range is checked later.
+        """
         shape = (self.n, len(self.learners))
         if type(actions) is np.ndarray and actions.shape == shape and actions.dtype.kind in "fiu":
             return np.ascontiguousarray(actions, np.float64)
@@ -406,7 +416,10 @@ class Engine:
         return Step(reward, outcome, self.reward, {}), some_failed
 
     def _drive_own_grid(self, columns: Floats) -> Way:
-        """Let the scripts that decide within a step do so, under the actions ``columns`` [n, L]; see ``own_grid``."""
+        """Let the scripts that decide within a step do so, and return the part of the step up to their last decision.
+
+        ``columns`` [n, L] are the learners' actions.
+        """
         way = self._own_grid.drive_step(self.state, self._now.rules, self._in_range(columns))
         self._change(memories=way.memories)
         self._now = self._now._replace(stops=way.stops)
@@ -489,7 +502,10 @@ class Engine:
         return not (self._now.watched or self._remembering or self.guard or self._terms.count_impacts)
 
     def cut(self, step: Step, most_steps: int) -> None:
-        """Truncate the episodes that have taken ``most_steps`` steps, in this engine and in its last result."""
+        """Truncate the episodes that have taken ``most_steps`` steps.
+
+        ``step``, the result of the last step, is changed accordingly.
+        """
         cut = (self.steps >= most_steps) & (step.ended | ~self.ended)
         step.outcome[TRUNCATED, cut] = self._now.state.clock[cut, ENDED] = 1.0
 
@@ -516,7 +532,10 @@ class Engine:
         self._now = self._now._replace(state=self._now.state._replace(guarded=None), ruling=None)
 
     def remember(self, guarded: Any) -> None:
-        """Set the guard's memory, for a caller that moves the worlds by ``place`` instead of ``step``."""
+        """Set the memory of the guard, for a caller that moves the worlds by ``place`` instead of ``step``.
+
+        ``guarded`` is what ``Guard.begin`` or ``Guard.check`` has returned.
+        """
         self._now = self._now._replace(state=self._now.state._replace(guarded=guarded))
 
     def memory(self, watcher: Watcher) -> Any:
@@ -541,7 +560,7 @@ class Engine:
         return arrays | {f"script.{name}": array for name, array in flat(self.memories).items()}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Continue exactly from a ``snapshot`` of an engine of the same scenario, size and scripts.
+        """Continue exactly from ``arrays``, a ``snapshot`` of an engine of the same scenario, size and scripts.
 
         Raises ``InvalidInput`` before anything changes: for a missing array, an array of another shape, or an engine
         with a guard, whose memory the snapshot does not hold.
@@ -567,7 +586,10 @@ class Engine:
         self._now = self._now._replace(state=state, stream=stream, roster=roster, rules=self._rules_for(state))
 
     def _rules_for(self, state: State) -> Rules:
-        """Return the rules for the rows of ``state``, in which brakes may build up even if they do not now."""
+        """Return the settings of the steps (``Rules``) for other rows, ``state``.
+
+        They differ if brakes take time to build up in these rows but not in the present ones.
+        """
         builds_up = self.scenario.builds_up or state.packed.builds_up or self.in_pieces
         return self._now.rules._replace(builds_up=builds_up)
 
@@ -604,10 +626,7 @@ class Engine:
         return self.state.copy()
 
     def first_moments(self, count: int) -> tuple[Worlds, State]:
-        """Return the first ``count`` worlds of the training stream, and their state at the first decision.
-
-        The worlds are at the alert.
-        """
+        """Return the first ``count`` worlds of the training stream: at the alert, and as a state at the first decision."""
         stream = copy.copy(self._now.stream)
         stream.restart(self.seed)
         alert, new = stream.take(count).alert, self._unwatched(count, self._now)
@@ -636,7 +655,7 @@ class Engine:
         return new
 
     def _at(self, now: Now) -> Engine:
-        """Return a copy of this engine with other contents."""
+        """Return a copy of this engine with the contents ``now``."""
         new = copy.copy(self)
         new._now = now
         return new

@@ -212,7 +212,7 @@ def ask_script(script: Script, worlds: Worlds, memory: Memory, vehicle: int) -> 
 
 @contextmanager
 def _as_it_was(script: Script, vehicle: int) -> Iterator[None]:
-    """Raise ``InvalidInput`` if a script changes its own attributes, which all episodes share, in the block."""
+    """Raise ``InvalidInput`` if a script changes its own attributes, which all episodes share, in the ``with`` block."""
     before = dict(getattr(script, "__dict__", {}))
     yield
     for name in {**before, **getattr(script, "__dict__", {})}:
@@ -230,6 +230,14 @@ def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle:
 
     It is an ``InvalidInput`` that names the script; ``error`` itself if it is a package's error or from a package's
     script.
+
+    Args:
+        error: the exception.
+        script: the script.
+        what: name of the method that raised it.
+        worlds: the worlds that the method was given.
+        vehicle: index of the script's vehicle.
+
     """
     if isinstance(error, EthBrakeError) or is_ours(script):
         return error

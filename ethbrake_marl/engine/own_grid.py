@@ -125,9 +125,9 @@ class OwnGrid:
     def _decide(self, state: State, rules: Rules, running: Bools, until_s: Floats, actions: Floats) -> Way:
         """Make all decisions of the scripts before ``until_s`` [n], and return this part of the step.
 
-        Only the ``running`` [n] worlds are advanced, in place. A world is moved to a decision only if that changes a
-        command, because the rounding of the motion depends on where it is interrupted. ``actions`` [n, L] are the
-        learners'.
+        Only the ``running`` [n] worlds of ``state`` are advanced, in place. A world is moved to a decision only if that
+        changes a command, because the rounding of the motion depends on where it is interrupted. ``rules`` advance the
+        worlds; ``actions`` [n, L] are the learners'.
         """
         motion, params, _, wanted_so_far, *_ = state
         (n, N), column = wanted_so_far.shape, state.packed.column
@@ -171,10 +171,16 @@ class OwnGrid:
     def _look_ahead(
         self, state: State, rules: Rules, until_s: Floats, decision_s: Floats, actions: Floats
     ) -> tuple[Packed, Floats, Floats]:
-        """Return copies of the worlds advanced to ``until_s`` [n], their reward [n, N] and their outcome up to then.
+        """Return copies of the worlds advanced to ``until_s`` [n], their reward [n, N] and outcome [OUTCOME_ROWS, n] up
+        to then.
 
-        ``decision_s`` [n] is the time of the deciders' next decision, from which periodic messages arrive. Of
-        ``state``, only the learners' commands in ``wanted`` are changed, by ``actions`` [n, L]; L may be 0.
+        Args:
+            state: the worlds; only the learners' commands in ``wanted`` are changed.
+            rules: how worlds are advanced.
+            until_s: [n] times, s; a world that is not before its time stays.
+            decision_s: [n] time of the deciders' next decision, which periodic messages need, s.
+            actions: [n, L] actions of the learners; L may be 0.
+
         """
         n, wanted = len(state.motion), state.wanted
         clock, settings = np.zeros(state.clock.shape), rules.settings.copy()

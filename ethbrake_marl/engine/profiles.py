@@ -130,9 +130,10 @@ class ProfileProblem(NamedTuple):
         return first, total
 
     def check(self, profiles: Profiles) -> None:
-        """Raise ``InvalidInput`` for invalid profiles.
+        """Raise ``InvalidInput`` for profiles that do not fit this problem.
 
-        There must be one profile per world, with commands within the capacities and phases in order.
+        There must be one profile per world, with commands within the capacities, and phases that end in order, the last
+        one at the last decision.
         """
         n, C = self.n, len(self.vehicles)
         K = profiles.ends.shape[-1]

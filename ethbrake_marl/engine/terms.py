@@ -97,7 +97,7 @@ class Terms:
         return state
 
     def _outcome(self, step: Step, state: State, time_step_s: float) -> StepOutcome:
-        """Return the facts of a step from which measures are computed."""
+        """Return the facts of a step from which measures are computed; ``state`` is the state after it."""
         motion, params, column = state.motion, state.params, state.packed.column
         return StepOutcome(
             step.first_impact_harm,

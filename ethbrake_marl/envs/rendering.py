@@ -197,16 +197,18 @@ class _Pen:
         self._draw = draw
 
     def box(self, left: float, top: float, right: float, bottom: float, fill: str, edge: str | None = None) -> None:
-        """Draw a box with slightly round corners, filled with one colour; ``edge`` is the edge's colour, or None."""
+        """Draw a box with slightly round corners; ``fill`` is its colour, ``edge`` the colour of its edge, or None."""
         corners = [value * _FINE for value in (left, top, max(right, left + 1), max(bottom, top + 1))]
         self._draw.rounded_rectangle(corners, 2 * _FINE, fill=fill, outline=edge, width=_FINE * 2)
 
     def line(self, x1: float, y1: float, x2: float, y2: float, colour: str, width: float = 1.0) -> None:
-        """Draw a straight line from (x1, y1) to (x2, y2)."""
+        """Draw a straight line from (x1, y1) to (x2, y2), ``width`` pixels wide."""
         self._draw.line([x1 * _FINE, y1 * _FINE, x2 * _FINE, y2 * _FINE], fill=colour, width=round(width * _FINE))
 
     def shape(self, points: list[tuple[float, float]], fill: str, edge: str | None = None) -> None:
-        """Draw a polygon with these corners (x, y)."""
+        """Draw a polygon with these corners (x, y), in the colour ``fill``; ``edge`` is the colour of its edge, or
+        None.
+        """
         self._draw.polygon([(x * _FINE, y * _FINE) for x, y in points], fill=fill, outline=edge, width=_FINE)
 
 

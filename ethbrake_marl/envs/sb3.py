@@ -92,10 +92,11 @@ class EthBrakeVecEnv(Begun, VecEnv):
     Args:
         engine: the engine of the worlds; ``make_sb3_vec_env`` builds it.
         seed: seed of the stream of worlds.
-        horizon_is_end: as in ``make_sb3_vec_env``.
-        appended: as in ``make_sb3_vec_env``.
-        step_infos: as in ``make_sb3_vec_env``.
-        render_mode: as in ``make_sb3_vec_env``.
+        horizon_is_end: report no truncation at the horizon in the infos, as explained in ``make_sb3_vec_env``.
+        appended: numbers appended to each observation: ``number``, the learner's index among the learners; ``state``,
+            the full state of the line. None: nothing.
+        step_infos: fill the infos of every step, not only at the end of an episode.
+        render_mode: ``rgb_array`` or None.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -218,7 +219,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return arrays | {"return": self._return.copy(), "steps": self._steps.copy(), "begun": self._begun.copy()}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a ``snapshot`` of the same scenario and size, without a reset.
+        """Continue from ``arrays``, a ``snapshot`` of the same scenario and size, without a reset.
 
         Raises ``InvalidInput`` for a snapshot that does not fit.
         """
@@ -244,9 +245,9 @@ class EthBrakeVecEnv(Begun, VecEnv):
         setattr(self, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        """Call a method of the batch once, and return its result once per row.
+        """Call the method ``method_name`` of the batch once, and return its result once per row.
 
-        Raises ``InvalidInput`` if ``indices`` names only some rows.
+        ``args`` and ``kwargs`` are its arguments. Raises ``InvalidInput`` if ``indices`` names only some rows.
         """
         self._refuse_some_rows("env_method", indices)
         return [getattr(self, method_name)(*args, **kwargs)] * self.num_envs

@@ -160,9 +160,10 @@ class Trace:
         return (replace(last, start=last.start.assign(rows, alert), struck=struck, **columns),)
 
     def stepped(self, memory: Memory, before: Engine, after: Engine) -> Memory:
-        """Return the recorded motions after a step: the motion before it is closed, and the motion of the step begins.
+        """Return the recorded motions after a step, given those before (``memory``).
 
-        ``before`` and ``after`` are the engine before and after the step.
+        The motion before the step is closed, and the motion of the step begins. ``before`` and ``after`` are the engine
+        before and after the step.
         """
         last = memory[-1].closed(before)
         front_m, met = last.front_m, [last.struck]

@@ -181,7 +181,7 @@ def try_action(
 
 @compiled
 def tell_action(out: Floats, action: Floats, bound: float, margin: float) -> None:
-    """Write applied action, bound and margin of each shielded vehicle into ``out`` [K, 4].
+    """Write applied action, bound and margin of each shielded vehicle into ``out`` [K, 4]; ``action`` is [K].
 
     The bound is the harm that is guaranteed from now on, the margin the budget minus the harm found, both m2/s2. A
     vehicle whose proposal was rejected keeps the margin that is in ``out`` already.
@@ -325,8 +325,9 @@ def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Flo
 def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) -> None:
     """Simulate the ``plans`` [n, L, K] from now on and report how the episodes end.
 
-    Writes to ``rests`` [n] whether every possible world of a world comes to rest before the horizon and stays at rest,
-    and to ``borne`` [n * M, N] the harm that each vehicle bears by then, m2/s2 (an obstacle ahead bears none).
+    A plan holds one action for each decision; ``running`` holds n worlds with M possible worlds each. Writes to
+    ``rests`` [n] whether every possible world of a world comes to rest before the horizon and stays at rest, and to
+    ``borne`` [n * M, N] the harm that each vehicle bears by then, m2/s2 (an obstacle ahead bears none).
     """
     n, every = running.steps.shape[0], all_members(running)
     M = running.states.shape[0] // max(n, 1)

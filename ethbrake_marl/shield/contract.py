@@ -55,10 +55,10 @@ class ShieldMode(IntEnum):
 
 
 class Guarded(NamedTuple):
-    """Memory of a guard (the part of an engine that replaces actions) for n episodes."""
+    """Memory of a guard (the part of an engine that certifies or replaces actions) for n episodes."""
 
     shield: Any  # the mode's shield, a value with ``take(rows)``; in mode ``episode`` the memory of the HybridAgent
-    policies: dict[int, Memory]  # memory of each policy by shielded vehicle, front to rear; empty without policies
+    policies: dict[int, Memory]  # index of a shielded vehicle -> memory of its policy; empty without policies
 
     def take(self, rows: Ints) -> Guarded:
         """Return the memory of the episodes in the rows with the indices ``rows``, which may be repeated."""
@@ -168,7 +168,7 @@ class ShieldGuard(ABC):
         return last
 
     def _of_vehicles(self, infos: Mapping[str, Any], running: Engine) -> dict[str, NDArray[Any]]:
-        """Return the infos with every value expanded to all vehicles, [n, N].
+        """Return the ``infos`` with every value expanded to all vehicles of the engine, [n, N].
 
         A vehicle without a shield gets reason ``NO_DECISION``, and 0 in all other entries that have a column per
         learner.

@@ -19,9 +19,9 @@ from ethbrake_marl.shield.paper_hybrid import HybridAgent
 class ShieldedDriver(ByPolicy):
     """An agent or a team behind a shield that certifies every action: mode ``step``, or a mode of an extension.
 
-    At the alert the policy is rolled out (simulated to the end). Where it harms no more than the coupled optimum, it
-    drives without interventions and its harm is the bound. Elsewhere each action must be certified by the rest of the
-    plan, by a constant action, or by a rollout of the policy from the state after the action. A team's proposals are
+    At the alert the policy is simulated to the end. Where it harms no more than E-V2X-BM, it drives without
+    interventions and its harm is the bound. Elsewhere each action must be certified by the rest of the plan, by a
+    constant action, or by a rollout: a simulation of the policy from the state after the action. A team's proposals are
     decided together.
 
     Args:

@@ -134,8 +134,8 @@ class StepGuard(ShieldGuard):
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
         """Return the infos of a step by name: action, reason, bound, trust in the world, and the harm of each vehicle.
 
-        ``ruling`` is the decision in the step; None before the first one. Each value is a number or an array [n], [n,
-        L] or [n, N].
+        ``memory`` is the guard's memory, ``ruling`` the decision in the step, None before the first one. Each value is
+        a number or an array [n], [n, L] or [n, N].
         """
         shield: StepShield = memory.shield
         infos = self._of_step(ruling) | why(ruling)

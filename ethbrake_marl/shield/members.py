@@ -169,7 +169,7 @@ def within_caps(world: Members, m: int) -> bool:
 
 @compiled
 def worst_so_far(world: Members, states: Floats) -> float:
-    """Return the largest harm so far over the possible worlds in the ``states`` [M, S], m2/s2.
+    """Return the largest harm so far over the possible worlds ``world``, whose states are ``states`` [M, S], m2/s2.
 
     It is infinite if a vehicle bears more than its cap.
     """

@@ -30,17 +30,19 @@ class ShieldOptions:
     """Keywords of ``eb.shield``, ``HybridShield`` and the other wrappers. A mode of an extension adds its own.
 
     Args:
-        mode: ``step``: each action is certified or replaced. ``episode``: the paper's Algorithm 1, policy or E-V2X-BM
-            for a whole episode. None: ``step``, unless another setting belongs to one mode alone.
-        bound: the ``H*`` of mode ``episode``: ``coupled``, or the paper's ``pairwise``.
-        harm_count: the harm that is guaranteed, ``first`` or ``total``.
-        allowance: loosens the bound by that much (m2/s2), for fewer interventions; not in mode ``episode``.
-        cap: ``baseline``: no vehicle ever bears more harm than under the constant actions of least harm. None: only
-            the sum over the vehicles is bounded. Mode ``step`` alone.
+        mode: ``step``: each action is certified (some plan after it keeps the harm within the bound) or replaced.
+            ``episode``: the paper's Algorithm 1, policy or E-V2X-BM for a whole episode. None: ``step``, unless another
+            setting belongs to one mode alone.
+        bound: source of ``H*``, the harm of E-V2X-BM, in mode ``episode``: ``coupled``, the engine's physics, or
+            ``pairwise``, the paper's closed form.
+        harm_count: impacts whose harm is guaranteed: ``first`` (each pair's first) or ``total`` (all).
+        allowance: loosens the bound by that much (m2/s2), for fewer replaced actions; not in mode ``episode``.
+        cap: ``baseline``: no vehicle ever bears more harm than under the constant actions of least harm. None: only the
+            sum over the vehicles is bounded. Mode ``step`` alone.
         intervention_penalty: subtracted from the reward of a step in which the shield replaced the proposed action.
-        logging: keep every intervention in ``shield.log``; not in mode ``episode``.
-        shares: add to ``infos`` the harm that each vehicle bears under the current plan and under the baseline plan;
-            always added with a ``cap``. Costs a few percent of a step; not in mode ``episode``.
+        logging: keep every replaced action in ``shield.log``; not in mode ``episode``.
+        shares: add to ``infos`` the harm that each vehicle bears under the current plan and under the constant actions
+            of least harm; always added with a ``cap``. Costs a few percent of a step; not in mode ``episode``.
         where: name of the interface, for error messages.
 
     Raises ``InvalidInput`` naming a setting that does not fit, ``UnknownName`` for an unknown mode.
@@ -63,7 +65,7 @@ class ShieldOptions:
     where: str = field(default="shield", compare=False)
 
     def __new__(cls, mode: str | None = None, **settings: Any) -> ShieldOptions:
-        """Create an instance of the subclass that has these settings, as ``pathlib.Path`` does for its platform."""
+        """Create an instance of the subclass that has these settings: that of ``mode``, or else of another mode."""
         if cls is ShieldOptions:
             cls = _class_with("step" if mode is None else check_mode(mode), settings)
         return object.__new__(cls)

@@ -190,7 +190,7 @@ def proposed_actions(
 
 
 def proposed_action(policy: Agent, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-    """Return the actions [n] in [-1, 1] that a policy proposes for ``vehicle`` (index), and its new memory.
+    """Return the actions [n] in [-1, 1] that ``policy`` proposes for ``vehicle`` (index), and its new memory.
 
     A command that is NaN stays NaN.
     """

@@ -225,7 +225,12 @@ class StepShield:
     ) -> StepMemory:
         """Return the memory of new episodes, with the first plan and its bound in each world.
 
-        Arguments are as in ``begin``; ``possible`` are the possible worlds, M for each world.
+        Args:
+            worlds: n worlds at the alert.
+            rows: [n] rows of the batch in which the episodes start.
+            policy: the policy that proposes; for several vehicles, vehicle index -> policy; None: none.
+            possible: the possible worlds, M for each world, [n * M].
+
         """
         members, vehicles = possible.n // worlds.n, self.vehicles
         problem = self._problem(possible, members)
@@ -381,9 +386,9 @@ class StepShield:
         return decision
 
     def as_seen(self, seen: Floats) -> Floats:
-        """Return the observed worlds ``seen`` [n, columns] with the columns of the prediction.
+        """Return ``seen`` [n, columns], the observed worlds, with the columns that the prediction has.
 
-        Where the prediction has a column for an obstacle ahead that a world lacks, the predicted gap is filled in.
+        If the prediction has a column for an obstacle ahead, a world without obstacle gets the predicted gap there.
         """
         running = self.memory.running
         assert running is not None
@@ -418,10 +423,11 @@ class StepShield:
         return np.asarray((predicted[:, :, 2 * N - 1 : 3 * N - 2] == 1.0).any(axis=(1, 2)), np.bool_)
 
     def _compared(self, memory: StepMemory, seen: Floats, asked: Bools) -> StepMemory:
-        """Return the memory after a comparison of the observed worlds ``seen`` [n, columns] with the prediction.
+        """Return the shield's memory after it has compared the observed worlds with the prediction in ``memory``.
 
-        Only the worlds ``asked`` [n] are compared. Worlds that contradict the prediction are distrusted, and get a new
-        fallback plan from the observed state.
+        ``seen`` [n, columns] holds the observed worlds, as the first columns of ``Running.states``. Only the worlds
+        ``asked`` [n] are compared. Worlds that contradict the prediction are distrusted, and get a new plan from the
+        observed state.
         """
         running, backup, seen = memory.running, memory.backup, self.as_seen(seen)
         assert running is not None

@@ -117,9 +117,10 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
 
 
 def shielded_aec(env: ParallelEnv[str, Observations, NDArray[Any]], *args: Any, **settings: Any) -> Any:
-    """Return ``HybridShield`` with agents acting in turn (AEC), front to rear; arguments as for ``HybridShield``.
+    """Return a shielded environment with agents acting in turn (AEC), front to rear.
 
     ``env`` is the parallel environment: in AEC, the actions of a step are complete only after the last agent has acted.
+    ``args`` and ``settings`` are the further arguments of ``HybridShield``.
     """
     return InTurns.around(HybridShield(env, *args, **settings))
 
@@ -131,7 +132,7 @@ class ShieldedEnv(
 
     ``options`` are keywords of ``ShieldOptions``. The info reports each decision under ``shield_reason`` and other
     ``shield_...`` keys. ``policy``, required only in mode ``episode``, is simulated from each alert: where it harms no
-    more than the coupled optimum, its harm is the bound.
+    more than E-V2X-BM, its harm is the bound.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.ShieldedEnv(eb.EthBrakeEnv("paper-random"))
@@ -176,7 +177,7 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
     """``EthBrakeVectorEnv`` behind a shield, by default in mode ``step``: each row's action is certified, or replaced.
 
     ``options`` are keywords of ``ShieldOptions``. ``policy``, required only in mode ``episode``, is simulated from each
-    alert: where it harms no more than the coupled optimum, its harm is the bound. ``infos["shield_bound_harm"]`` and
+    alert: where it harms no more than E-V2X-BM, its harm is the bound. ``infos["shield_bound_harm"]`` and
     the other shield entries describe the same moment as the other infos: in a restarted row the new alert, while
     ``infos["final_info"]`` describes the last step. Raises ``InvalidInput`` for another environment.
 

@@ -152,7 +152,10 @@ def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -
 
 @compiled(within=True)
 def _simulate_one(line: Line, command: float, bound: float) -> int:
-    """Simulate one ``command`` (m/s2) in ``line.table``; return a status as ``simulate`` does."""
+    """Simulate one ``command`` (m/s2) in ``line.table``, until the harm reaches ``bound`` at the latest.
+
+    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    """
     table, duration = line.table, line.clock[DURATION]
     table[ROW.COMMAND, line.controlled] = command
     _copy_state(line.start, table)
@@ -251,7 +254,10 @@ def will_stay_apart(table: Floats) -> bool:
 
 @compiled(within=True)
 def _way_to_stop(speed: float, acceleration: float) -> float:
-    """Return the distance in which a vehicle stops, m; infinite for a moving vehicle with ``acceleration`` 0."""
+    """Return the distance in which a vehicle with this speed (m/s) stops, m; ``acceleration`` (m/s2) <= 0.
+
+    It is infinite for a moving vehicle with acceleration 0.
+    """
     return speed * speed / (2.0 * abs(acceleration)) if speed > 0.0 else 0.0
 
 

@@ -149,12 +149,12 @@ def _search_worlds(
     release_rate: Floats, pieces: Floats, restitution: Floats, vehicle: int, rows: Ints, total: bool, horizon: float,
     found: Floats, status: Ints,
 ) -> None:  # fmt: skip
-    """Search the best deceleration of ``vehicle`` in the worlds with the indices ``rows`` [m].
+    """Search the best deceleration of ``vehicle`` (index) in the worlds with the indices ``rows`` [m].
 
     Writes the deceleration, its harm and its harm under the other count to ``found`` [3, m], and the status of the
-    physics (``FLAG.DONE`` if sound) to ``status`` [m]. The other arrays have n rows, one per world, as for
-    ``make_line``; ``capacity`` and ``onset`` [n, N] are braking capacities (m/s2) and times until a vehicle may brake
-    (s).
+    physics (``FLAG.DONE`` if sound) to ``status`` [m]. ``capacity`` and ``onset`` [n, N] are braking capacities (m/s2)
+    and times until a vehicle may brake (s). The other arguments are those of ``make_line``, for n worlds along a new
+    first axis.
     """
     room, at, best = make_room(), np.empty(CANDIDATES), np.empty(3)
     for m in range(rows.shape[0]):
@@ -220,12 +220,15 @@ class EV2XBM:
         return {"deceleration_mps2": coupled.deceleration_mps2, "predicted_harm": coupled.harm}
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the command ``-a*``, [n] m/s2, and the unchanged memory."""
+        """Return the command ``-a*`` chosen at the alert, [n] m/s2, and the unchanged memory."""
         return -memory["deceleration_mps2"], memory
 
 
 def make_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
-    """Make E-V2X-BM. ``argument`` is ``pairwise``, ``coupled`` or None, which means ``coupled``."""
+    """Make E-V2X-BM with the horizon and harm count of ``settings``.
+
+    ``argument`` is ``pairwise``, ``coupled`` or None, which means ``coupled``.
+    """
     if argument not in (None, "coupled", "pairwise"):
         then = "".join(f", then {variant!r}" for variant in variants_of("e_v2x_bm"))
         raise InvalidInput(f"agent {settings.spec!r}: the argument must be 'coupled' or 'pairwise'{then}")

@@ -121,7 +121,8 @@ def minimise_over(
     """Return the deceleration of least predicted harm of vehicle ``i``, and this harm (m2/s2).
 
     Only the candidates ``at`` [6] (m/s2) are compared. If two of them, and the middle between them, have the least
-    harm, the middle is returned. The other arguments are as in ``find_breakpoints``.
+    harm, the middle is returned. ``gap`` [P] m, ``speed`` [N] m/s, ``capacity`` [N] m/s2 and ``onset`` [N] s (time
+    until a vehicle may brake) describe one world.
     """
     best, first, last = math.inf, 0.0, 0.0
     for k in range(at.shape[0]):
@@ -200,11 +201,17 @@ def closed_form(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
 
 
 def pairwise_harm(worlds: Worlds, deceleration_mps2: ArrayLike) -> Floats:
-    """Return the predicted harm of each pair on its own, [n, P] (m2/s2), under constant decelerations [n, N].
+    """Return the predicted harm of each pair on its own, [n, P] m2/s2.
 
     Every vehicle coasts until its latency has elapsed and then brakes to rest. E-V2X-BM's prediction is the sum over
-    the controlled vehicle's pairs. Raises ``InvalidInput`` for a deceleration that is negative or not finite, and if
-    brakes build up.
+    the controlled vehicle's pairs.
+
+    Args:
+        worlds: n worlds.
+        deceleration_mps2: constant deceleration of each vehicle, [n, N] m/s2 or a shape that broadcasts to it.
+
+    Raises ``InvalidInput`` for a deceleration that is negative or not finite, and if brakes build up.
+
     """
     worlds.refuse_build_up("the closed form of E-V2X-BM and planner")
     onset = onset_s(worlds, 0)

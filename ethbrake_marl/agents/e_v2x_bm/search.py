@@ -74,7 +74,7 @@ class Room(NamedTuple):
 
 @compiled
 def make_room() -> Room:
-    """Allocate the workspace for searches."""
+    """Return uninitialised workspace for searches."""
     return Room(
         make_samples(_MOST), make_samples(_MOST), make_samples(_MOST), make_samples(_FEW), np.empty(_MOST),
         np.empty(CELLS, np.int64), np.empty(BORDERS, np.int64), np.empty(MINIMA, np.int64),
@@ -111,7 +111,7 @@ def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, ou
 
 @compiled(apart=True, bare=True)
 def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) -> int:
-    """Step 1: simulate an even grid of decelerations and the ``breakpoints`` [CANDIDATES] (m/s2).
+    """Step 1: simulate an even grid of decelerations and the ``breakpoints`` [CANDIDATES] (m/s2) in the world ``line``.
 
     The grid is left in ``room.one``, grid and breakpoints sorted in ``room.two``. ``capacity`` is the largest
     deceleration, m/s2. Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
@@ -202,9 +202,10 @@ def locate_borders(line: Line, room: Room) -> int:
 
 @compiled(bare=True)
 def _cut(line: Line, few: Samples) -> int:
-    """Bring samples 0 and 5 of ``few``, on the two sides of a border, to a distance of 1e-9 m/s2; return a status.
+    """Bring samples 0 and 5 of ``few``, on the two sides of a border, to a distance of 1e-9 m/s2.
 
-    A border is a deceleration at which the number of impacts changes. Each round divides the distance by five.
+    A border is a deceleration at which the number of impacts changes. Each round divides the distance by five. Returns
+    a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
     """
     while few.at[5] - few.at[0] > NARROWEST_MPS2:
         low, width = few.at[0], few.at[5] - few.at[0]
@@ -225,7 +226,10 @@ def _cut(line: Line, few: Samples) -> int:
 
 @compiled(apart=True, bare=True)
 def narrow_minima(line: Line, room: Room) -> int:
-    """Step 4: locate the lowest local minima to 1e-9 m/s2, and append them to ``room.two``; return a status."""
+    """Step 4: locate the lowest local minima of the harm to 1e-9 m/s2, and append them to ``room.two``.
+
+    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    """
     found, minima, last = room.two, room.minima, _NARROWED - 1
     find_minima(found, _NARROWED, room.values, minima)
     for m in range(MINIMA):
@@ -281,8 +285,17 @@ def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, t
 def step_back(line: Line, around: Samples, best: float, capacity: float, out: Floats) -> int:
     """Step 5: if ``best`` (m/s2) lies within 1e-9 m/s2 of a jump of the harm, move it to the lower side.
 
-    Otherwise the last bits, which differ if the same motion is advanced step by step, would decide the harm. Writes the
-    deceleration, its harm and its harm under the other count to ``out`` [3]. ``around`` is workspace. Returns a status.
+    Otherwise the last bits, which differ if the same motion is advanced step by step, would decide the harm.
+
+    Args:
+        line: the world.
+        around: workspace.
+        best: best deceleration found, m/s2.
+        capacity: braking capacity of the vehicle, m/s2.
+        out: [3] receives the deceleration, its harm, and its harm under the other count.
+
+    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+
     """
     for k in range(5):
         around.at[k] = min(max(best + NARROWEST_MPS2 * (k - 2.0), 0.0), capacity)
