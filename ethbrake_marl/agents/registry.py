@@ -75,7 +75,7 @@ class Entry:
 
 
 def around_entry(each: str) -> Entry:
-    """Return the entry of a shield or search, given as it is written after a ``+``, for example ``episode:pairwise``."""
+    """Return the entry of a shield or search, given as it is written after a ``+``, such as ``episode:pairwise``."""
     return SHIELDS[each.partition(":")[0]]
 
 

@@ -109,8 +109,9 @@ class Guard(Protocol):
         """
 
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
-        """Return the guard's infos about the last step of ``running``, or before it about the alert: name -> values [n,
-        N].
+        """Return the guard's infos about the last step: name -> values [n, N].
+
+        Before the first step of an episode, they are about the alert. ``running`` is the engine.
         """
 
 
@@ -132,8 +133,9 @@ class Now(NamedTuple):
         return self._replace(state=self.state.copy(), roster=self.roster.apart(), stream=copy.copy(self.stream))
 
     def kept(self, packed: Packed) -> Packed:
-        """Return ``packed`` worlds with the columns that all rows here have, also for an obstacle or messages if need
-        be.
+        """Return packed worlds with the columns that all rows here have.
+
+        These may include columns for an obstacle and for messages that the worlds themselves do not need.
         """
         return packed.widened(self.obstacle, self.by_link)
 
@@ -626,7 +628,7 @@ class Engine:
         return self.state.copy()
 
     def first_moments(self, count: int) -> tuple[Worlds, State]:
-        """Return the first ``count`` worlds of the training stream: at the alert, and as a state at the first decision."""
+        """Return the first ``count`` worlds of the training stream: at the alert, and at the first decision."""
         stream = copy.copy(self._now.stream)
         stream.restart(self.seed)
         alert, new = stream.take(count).alert, self._unwatched(count, self._now)

@@ -212,7 +212,10 @@ def ask_script(script: Script, worlds: Worlds, memory: Memory, vehicle: int) -> 
 
 @contextmanager
 def _as_it_was(script: Script, vehicle: int) -> Iterator[None]:
-    """Raise ``InvalidInput`` if a script changes its own attributes, which all episodes share, in the ``with`` block."""
+    """Raise ``InvalidInput`` if a script changes its own attributes, which all episodes share, in the block.
+
+    For use in a ``with`` statement.
+    """
     before = dict(getattr(script, "__dict__", {}))
     yield
     for name in {**before, **getattr(script, "__dict__", {})}:

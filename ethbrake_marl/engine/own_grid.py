@@ -171,8 +171,7 @@ class OwnGrid:
     def _look_ahead(
         self, state: State, rules: Rules, until_s: Floats, decision_s: Floats, actions: Floats
     ) -> tuple[Packed, Floats, Floats]:
-        """Return copies of the worlds advanced to ``until_s`` [n], their reward [n, N] and outcome [OUTCOME_ROWS, n] up
-        to then.
+        """Return copies of the worlds at ``until_s``, their reward [n, N] and outcome [OUTCOME_ROWS, n] up to then.
 
         Args:
             state: the worlds; only the learners' commands in ``wanted`` are changed.

@@ -237,9 +237,7 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
 
 
 def _agent_vehicles(engine: Engine, agents: WhoIsAgent) -> Ints:
-    """Return the indices of the vehicles that are ``agents``: all or the learners; raise ``InvalidInput`` for another
-    word.
-    """
+    """Return the indices of the vehicles that are agents; raise ``InvalidInput`` unless ``agents`` is a known word."""
     if agents not in get_args(WhoIsAgent):
         raise InvalidInput(f"agents = {agents!r}: must be 'all' or 'learners'")
     if agents == "all":

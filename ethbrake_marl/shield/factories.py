@@ -11,10 +11,10 @@ from ethbrake_marl.shield.paper_hybrid import Bound, HybridAgent
 
 
 def shield_episodes(policy: Agent, argument: str | None, settings: AgentSettings) -> HybridAgent:
-    """Return ``policy`` behind the paper's Algorithm 1 (``+episode``), with which it or E-V2X-BM drives a whole
-    episode.
+    """Return ``policy`` behind the paper's Algorithm 1 (``+episode``).
 
-    ``argument`` is None, or ``pairwise`` for the paper's closed form of E-V2X-BM. ``settings`` must have a scenario.
+    At the alert the better of policy and E-V2X-BM is chosen for the whole episode. ``argument`` is None, or
+    ``pairwise`` for the paper's closed form of E-V2X-BM. ``settings`` must have a scenario.
     """
     bound: Bound = "coupled" if argument is None else "pairwise"
     return HybridAgent(policy, settings.needed_scenario(), bound=bound, harm_count=settings.harm_count)

@@ -51,9 +51,7 @@ def best_constants(
     others[:, vehicles] = -worlds.vehicles.braking_capacity_mps2[:, vehicles]
 
     def optimum(i: int) -> Floats:
-        """Return E-V2X-BM's deceleration of vehicle ``i`` as an action [n], while the other shielded vehicles brake
-        fully.
-        """
+        """Return E-V2X-BM's deceleration of vehicle ``i`` as an action [n]; other shielded vehicles brake fully."""
         best = optimise_coupled(worlds, i, harm_count=harm_count, horizon_s=scenario.horizon_s, others_mps2=others)
         return command_to_action(-best.deceleration_mps2, worlds.vehicles, i)
 

@@ -32,8 +32,9 @@ _NONE = -1.0
 
 @compiled
 def stopping_time(speed: float, deceleration: float) -> float:
-    """Return the time in which a vehicle stops, s: ``speed / deceleration`` (m/s, m/s2); 0 at rest, inf without
-    braking.
+    """Return the time in which a vehicle stops, s; 0 at rest, inf without braking.
+
+    It is ``speed / deceleration``, in m/s and m/s2.
     """
     if speed == 0.0:
         return 0.0
@@ -42,7 +43,10 @@ def stopping_time(speed: float, deceleration: float) -> float:
 
 @compiled
 def stopping_distance(speed: float, deceleration: float) -> float:
-    """Return the distance in which a vehicle stops, m: ``speed^2 / (2 deceleration)``; 0 at rest, inf without braking."""
+    """Return the distance in which a vehicle stops, m; 0 at rest, inf without braking.
+
+    It is ``speed^2 / (2 deceleration)``, in m/s and m/s2.
+    """
     if speed == 0.0:
         return 0.0
     return speed * speed / (2.0 * deceleration)
