@@ -157,9 +157,9 @@ def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: 
 def make_from_file(argument: str | None, settings: AgentSettings) -> Driver:
     """Call the function in a Python file that ``settings.spec`` names (``FILE.py:FUNCTION``), and return its result.
 
-    The function is called with ``argument`` (the text after the second colon, or None) and ``settings``. A function
-    without parameters is called without. Raises ``InvalidInput`` if such a function is given an argument or a policy,
-    and if the file cannot be loaded.
+    The function is called with ``argument`` (the text after the second colon, or None) and ``settings``; a function
+    without parameters is called without arguments. Raises ``InvalidInput`` if such a function is given an argument or a
+    policy, and if the file cannot be loaded.
     """
     named = parse_spec(settings.spec).file
     assert named is not None

@@ -92,7 +92,7 @@ def split_names(text: str, is_one: Callable[[str], bool] = os.path.lexists) -> l
 
 
 def split_specs(text: str) -> list[str]:
-    """Split a comma-separated list of agent specifications; commas in paths that exist are kept."""
+    """Split a comma-separated list of agent specifications, such as ``coast,ppo@shipped``; existing paths stay whole."""
     return split_names(text, _is_one_spec)
 
 

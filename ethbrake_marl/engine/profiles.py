@@ -89,10 +89,11 @@ class ProfileProblem(NamedTuple):
         return self.clock[:, CLOCK.LAST_STEP].astype(np.int64)
 
     def constant(self, commands_mps2: Floats) -> Profiles:
-        """Return profiles that hold constant commands, one per world and command.
+        """Return profiles that hold constant commands.
 
-        ``commands_mps2`` [n, Q, C] are Q constant commands for each world. The n * Q profiles are in the order of its
-        first two axes, and divided into ``MOST_PHASES`` equal-command phases, which a search can change later.
+        ``commands_mps2`` [n, Q, C] are Q constant commands for each world and controlled vehicle. The result has n * Q
+        profiles, in the order of the first two axes. Each is divided into ``MOST_PHASES`` phases, all with the same
+        command, so that a search can change them later.
         """
         n, Q, C = commands_mps2.shape
         borders = np.array([2, 5, 9, 14, 20] + (MOST_PHASES - 5) * [np.iinfo(np.int64).max])

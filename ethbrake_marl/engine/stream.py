@@ -74,7 +74,10 @@ class Roster:
         return new
 
     def renew(self, rows: Ints, first: int) -> None:
-        """Record that the worlds ``first``, ``first + 1``, ... of the stream now run in the rows ``rows``."""
+        """Record that new worlds run in the rows with the indices ``rows``.
+
+        They are the worlds ``first``, ``first + 1``, ... of the stream.
+        """
         self.numbers[rows] = first + np.arange(len(rows))
         for row in self.failed.keys() & rows.tolist() if self.failed else ():
             del self.failed[row]

@@ -206,7 +206,7 @@ class _Pen:
         self._draw.line([x1 * _FINE, y1 * _FINE, x2 * _FINE, y2 * _FINE], fill=colour, width=round(width * _FINE))
 
     def shape(self, points: list[tuple[float, float]], fill: str, edge: str | None = None) -> None:
-        """Draw a polygon with these corners (x, y); ``fill`` is its colour, ``edge`` the colour of its edge, or None."""
+        """Draw a polygon with these corners (x, y); ``fill`` and ``edge`` are colours, ``edge`` may be None."""
         self._draw.polygon([(x * _FINE, y * _FINE) for x, y in points], fill=fill, outline=edge, width=_FINE)
 
 

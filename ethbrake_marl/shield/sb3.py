@@ -20,10 +20,10 @@ class ShieldedVecEnv(SeededInside, VecEnvWrapper):
     """``make_sb3_vec_env`` behind a shield, by default in mode ``step``. The rows of one world are decided together.
 
     ``options`` are keywords of ``ShieldOptions``. ``policy`` is simulated from each alert: its harm is the bound where
-    it is lower than E-V2X-BM's; None: the bound is always the latter. The intervention penalty does not
-    enter the return in ``infos[row]["episode"]``. Each row's infos contain ``shield_bound_harm`` and the other shield
-    entries at every step; ``reset_infos`` contains them at the alert. Raises ``InvalidInput`` for another environment,
-    or for several learners in another mode than ``step``.
+    it is lower than E-V2X-BM's; None: the bound is always the latter. The intervention penalty does not enter the
+    return in ``infos[row]["episode"]``. Each row's infos contain ``shield_bound_harm`` and the other shield entries at
+    every step; ``reset_infos`` contains them at the alert. Raises ``InvalidInput`` for another environment, or for
+    several learners in another mode than ``step``.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np

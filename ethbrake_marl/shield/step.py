@@ -386,9 +386,10 @@ class StepShield:
         return decision
 
     def as_seen(self, seen: Floats) -> Floats:
-        """Return ``seen`` [n, columns], the observed worlds, with the columns that the prediction has.
+        """Return ``seen`` [n, columns], the observed worlds, in a form that can be compared with the prediction.
 
-        If the prediction has a column for an obstacle ahead, a world without obstacle gets the predicted gap there.
+        If the prediction has a column for the gap to an obstacle ahead, worlds without obstacle (an infinite gap) get
+        the predicted gap there. Otherwise ``seen`` is returned unchanged.
         """
         running = self.memory.running
         assert running is not None

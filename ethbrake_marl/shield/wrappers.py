@@ -50,7 +50,7 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
     Args:
         env: ``eb.parallel_env(...)`` with one learner (mode ``step``: one or more), or a wrapper around it.
         policy: an agent or a policy, a ``Team``, or a mapping from learner name to policy. Mode ``episode`` needs one.
-            In the other modes, its harm is the bound where that is lower.
+            In the other modes, its harm is the bound (the guaranteed harm) where it is lower than that of E-V2X-BM.
         agents: names of the shielded learners; must be all learners, which is also the meaning of None.
         options: keywords of ``ShieldOptions``, including ``mode``.
 
@@ -177,8 +177,8 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
     """``EthBrakeVectorEnv`` behind a shield, by default in mode ``step``: each row's action is certified, or replaced.
 
     ``options`` are keywords of ``ShieldOptions``. ``policy``, required only in mode ``episode``, is simulated from each
-    alert: where it harms no more than E-V2X-BM, its harm is the bound. ``infos["shield_bound_harm"]`` and
-    the other shield entries describe the same moment as the other infos: in a restarted row the new alert, while
+    alert: where it harms no more than E-V2X-BM, its harm is the bound. ``infos["shield_bound_harm"]`` and the other
+    shield entries describe the same moment as the other infos: in a restarted row the new alert, while
     ``infos["final_info"]`` describes the last step. Raises ``InvalidInput`` for another environment.
 
     >>> import ethbrake_marl as eb
@@ -229,8 +229,8 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
             interface, or Stable-Baselines3's ``VecEnv``. Inner wrappers may change actions: the action that reaches the
             engine is certified. Or an agent or a team, which needs ``scenario``, the scenario in which actions are
             certified.
-        policy: proposes where the caller gives no action, and lowers the bound to its own harm where that is lower.
-            Mode ``episode`` needs it.
+        policy: proposes where the caller gives no action, and lowers the bound (the harm that the shield guarantees) to
+            its own harm where that is lower. Mode ``episode`` needs it. None: nobody.
         mode: ``step``, ``episode``, or a mode of an extension. None: ``step``, unless the options belong to another
             mode.
         options: further keywords of ``ShieldOptions``.
