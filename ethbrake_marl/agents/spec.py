@@ -92,7 +92,10 @@ def split_names(text: str, is_one: Callable[[str], bool] = os.path.lexists) -> l
 
 
 def split_specs(text: str) -> list[str]:
-    """Split a comma-separated list of agent specifications, such as ``coast,ppo@shipped``; existing paths stay whole."""
+    """Split a comma-separated list of agent specifications, such as ``coast,ppo@shipped``.
+
+    Commas in paths that exist do not split.
+    """
     return split_names(text, _is_one_spec)
 
 

@@ -460,7 +460,7 @@ class Engine:
 
         Args:
             vehicles: indices of the vehicles (0 = front); None: all learners.
-            rows: indices of the worlds, which the first axis then has; None: all.
+            rows: indices of the worlds to observe, in place of all n; None: all.
 
         Raises ``InvalidInput`` if these vehicles observe different features.
 

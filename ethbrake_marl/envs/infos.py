@@ -80,7 +80,7 @@ class Report(NamedTuple):
     terms: dict[str, Floats]  # name of a reward term -> its value in the step, [n] or [n, N]; 0 after a reset
     world_seed: int  # seed of the stream of worlds
     world: Ints  # [n] number of each world in the stream of that seed
-    known_from_s: Floats | None  # [n, N, N] time from which vehicle i acts on news of vehicle j (s); None: no channel
+    known_from_s: Floats | None  # [n, N, N] time from which vehicle i may use messages about j (s); None: no channel
     age_s: Floats | None  # [n, N, N] age of vehicle i's newest sample of vehicle j (s); None: no periodic messages
     shield: Columns  # name -> info of the shield, [n, N]; empty without a shield
 

@@ -270,7 +270,7 @@ def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[s
 def env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
     """Return the environment with agents acting in turn (AEC), the same as ``raw_env``.
 
-    Arguments are as for ``parallel_env``. Actions are not clipped, and nothing ends an episode early: an invalid action
-    raises ``InvalidInput`` in its agent's turn, and the turn stays with that agent.
+    ``scenario`` and ``settings`` are the arguments of ``parallel_env``. Actions are not clipped, and nothing ends an
+    episode early: an invalid action raises ``InvalidInput`` in its agent's turn, and the turn stays with that agent.
     """
     return raw_env(scenario, **settings)

@@ -71,7 +71,7 @@ class ShieldedDriver(ByPolicy):
 
     @property
     def adds(self) -> Source:
-        """Knowledge that the shield uses to certify, in addition to what the policy knows."""
+        """Knowledge (``Source``) that the shield uses to certify actions, in addition to what the policy knows."""
         return self.options.adds
 
     @property

@@ -20,7 +20,7 @@ from ethbrake_marl.shield.step import StepShield
 
 
 class MovingAtHorizon(UserWarning):
-    """Warning: something may still be moving at the horizon, where a shield's bound ends."""
+    """Warning: some vehicle may still be moving at the horizon; the shield guarantees nothing after it."""
 
 
 class StepGuard(ShieldGuard):

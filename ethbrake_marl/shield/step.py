@@ -371,9 +371,9 @@ class StepShield:
     def _also_certified(
         self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
     ) -> Decision:
-        """Return the decision to apply, given one that is sound in every possible world.
+        """Return the decision to apply, given a decision that keeps the budget in every possible world.
 
-        Here it is returned unchanged; a subclass may reject more.
+        Here it is returned unchanged; a subclass may replace more actions.
 
         Args:
             now: the episodes before the decision.

@@ -156,7 +156,10 @@ class ShieldedEnv(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode; return observation and info. ``info["shield_bound_harm"]`` already holds the bound."""
+        """Start an episode; return observation and info.
+
+        ``seed`` and ``options`` are the environment's. ``info["shield_bound_harm"]`` already holds the bound.
+        """
         self.attached.check_open()
         begun = self.env.reset(seed=seed, options=options)
         self.attached.check_open()  # a wrapper inside may have put another environment there
@@ -203,7 +206,7 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode in every row; return observations [rows, F] and infos.
 
-        ``infos["shield_bound_harm"]`` already holds the bounds.
+        ``seed`` and ``options`` are the environment's. ``infos["shield_bound_harm"]`` already holds the bounds.
         """
         self.attached.check_open()
         begun = self.env.reset(seed=seed, options=options)

@@ -90,7 +90,7 @@ def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, ou
         room: workspace, overwritten.
         breakpoints: [CANDIDATES] decelerations that are simulated in addition to an even grid, m/s2.
         capacity: braking capacity of the vehicle, m/s2.
-        out: [3] receives the deceleration, its harm, and its harm under the other count.
+        out: [3] receives the deceleration (m/s2), its harm, and its harm under the other count (m2/s2).
 
     Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
 
