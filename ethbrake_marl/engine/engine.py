@@ -512,7 +512,7 @@ class Engine:
         step.outcome[TRUNCATED, cut] = self._now.state.clock[cut, ENDED] = 1.0
 
     def segments(self, before: Worlds, last_mps2: Floats) -> Iterator[tuple[Worlds, Floats, Floats]]:
-        """Yield the parts of the last step, which scripts that decide within a step divide; usually there is one part.
+        """Yield the parts of the last step: usually one, but a script that decides within the step begins a new one.
 
         Right after a reset, the parts lead from the alert to the first step. Each part is a tuple: the worlds at its
         start, the commands that the vehicles followed [n, N] m/s2, and the time at its end [n] s.

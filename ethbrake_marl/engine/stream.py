@@ -134,7 +134,7 @@ class Stream:
         return self._drawn - (0 if self._pool is None else len(self._pool.clock) - self._next)
 
     def take(self, count: int) -> Start:
-        """Return the next ``count`` worlds and move on in the stream."""
+        """Return the next ``count`` worlds at their first decision, and move on in the stream."""
         if self._pool is None or self._next + count > len(self._pool.clock):
             self._fill(count)
         assert self._pool is not None

@@ -391,7 +391,7 @@ class Decision(NamedTuple):
 
     @property
     def reason_names(self) -> NDArray[np.str_]:
-        """Reasons in words, such as "no certificate", [n] or [n, K]."""
+        """Why each proposal was accepted or replaced, in words such as "no certificate", [n] or [n, K]."""
         texts = [ShieldReason(code).text for code in self.reason.ravel().tolist()]
         return np.array(texts).reshape(self.reason.shape)
 

@@ -121,7 +121,7 @@ class ShieldOptions:
     def check_in(self, scenario: Scenario, *, several: bool) -> None:
         """Raise ``InvalidInput`` if a shield with these settings cannot be used in the scenario.
 
-        ``several`` says that a team is shielded, which is checked only later, when its guard is made.
+        With ``several`` (a team is shielded) nothing is checked here; that happens when the guard is made.
         """
         if not several:
             self.shield(scenario, one_learner(scenario) or 0)

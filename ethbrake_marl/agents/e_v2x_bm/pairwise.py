@@ -226,9 +226,10 @@ def pairwise_harm(worlds: Worlds, deceleration_mps2: ArrayLike) -> Floats:
 
 
 def onset_s(worlds: Worlds, vehicle: int) -> Floats:
-    """Return the time from now until each vehicle may brake, [n, N] s.
+    """Return the time from the worlds' present time until each vehicle may brake, [n, N] s; 0 if it may brake now.
 
-    Raises ``InvalidInput`` if the closed form does not apply: an unknown vehicle, or a negative speed.
+    Raises ``InvalidInput`` if the closed form does not apply: no vehicle has the index ``vehicle``, or a speed is
+    negative.
     """
     if not 0 <= vehicle < worlds.N:
         raise InvalidInput(f"vehicle {vehicle}: must be an index in 0..{worlds.N - 1}")
