@@ -1,4 +1,4 @@
-"""The draws behind the worlds of an environment: every quantity at the alert, type and scenario, as flat columns.
+"""The random draws behind the worlds of an environment: initial states, vehicle types and scenarios, as columns.
 
 Worlds are pure functions of scenario, seed and number. So nothing is stored while episodes run; the worlds are drawn
 again on request.
@@ -24,7 +24,7 @@ Columns = dict[str, NDArray[Any]]
 
 
 def describe_worlds(engine: Engine) -> Columns:
-    """Return the draw of each running world: column -> values [n].
+    """Return the random draw of each running world: column name -> values [n].
 
     The columns are: the quantities of the world at the alert, named as in a table of initial states (``gap_1_m``,
     ``mass_2_t``); ``scenario`` in a mixture, and ``vehicle_2_type`` with vehicle types; and ``world_seed`` and
@@ -56,9 +56,9 @@ def describe_worlds(engine: Engine) -> Columns:
 
 
 def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
-    """Draw these worlds of the training stream again, in the order of ``numbers``.
+    """Return the worlds with the numbers ``numbers`` in the training stream, drawn again, in this order.
 
-    Raises ``InvalidInput`` if the running worlds are different ones.
+    Raises ``InvalidInput`` if the engine's running worlds are different ones.
     """
     ordered, places = np.unique(numbers, return_inverse=True)
     breaks = np.flatnonzero(np.diff(ordered) > _MOST_APART) + 1
