@@ -16,7 +16,10 @@ from ethbrake_marl.shield.factories import shield_episodes
 
 
 def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make the shield ``+robust`` or ``+robust:interior`` against the uncertainty of the settings."""
+    """Make the shield ``+robust`` or ``+robust:interior`` against the uncertainty of the settings.
+
+    ``policy`` is the agent to shield; ``argument`` is ``corners``, ``interior`` or None (``corners``).
+    """
     where = f"agent {settings.spec!r}"
     robust, uncertainty = checked_robust(argument or CORNERS, where), settings.uncertainty
     return ShieldedDriver(
@@ -26,7 +29,11 @@ def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings
 
 
 def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make ``+robust:believed`` or ``+robust:interior:believed``: robust against everything that was not received."""
+    """Make the shield ``+robust:believed`` or ``+robust:interior:believed``: robust against everything that was not
+    received.
+
+    ``policy`` is the agent to shield; ``argument`` is ``corners``, ``interior`` or None (``corners``).
+    """
     where = f"agent {settings.spec!r}"
     return ShieldedDriver(
         policy, settings.needed_scenario(), mode="robust", harm_count=settings.harm_count, where=where,
@@ -35,7 +42,10 @@ def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: 
 
 
 def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make ``+step:believed``: every action is certified in the estimated world."""
+    """Make the shield ``+step:believed``: every action of ``policy`` is certified in the estimated world.
+
+    ``argument`` is not used. Raises ``InvalidInput`` for a team or several learners.
+    """
     scenario = settings.needed_scenario()
     if isinstance(policy, Team) or len(scenario.learners) > 1:
         raise InvalidInput(f"agent {settings.spec!r}: :believed shields one learner, not several; take +step")
@@ -43,7 +53,13 @@ def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: Ag
 
 
 def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """Make ``+episode:believed`` or ``+episode:pairwise:believed``: Algorithm 1 compares in the estimated world."""
+    """Make ``+episode:believed`` or ``+episode:pairwise:believed``: Algorithm 1 makes its comparison in the estimated
+    world.
+
+    ``policy`` is the agent to shield; ``argument`` is ``pairwise`` or None. Raises ``InvalidInput`` for an agent that
+    already
+    decides on received information.
+    """
     hybrid = shield_episodes(policy, argument, settings)
     if isinstance(policy, Believing):
         raise InvalidInput(f"agent {settings.spec!r}: {policy.name} decides on what was received itself; take +step")
@@ -51,7 +67,10 @@ def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: 
 
 
 def make_estimating_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
-    """Make ``e_v2x_bm:believed`` or ``e_v2x_bm:pairwise:believed``: E-V2X-BM in the estimated world."""
+    """Make the agent ``e_v2x_bm:believed`` or ``e_v2x_bm:pairwise:believed``: E-V2X-BM in the estimated world.
+
+    ``argument`` is ``pairwise`` or None.
+    """
     return Believing(make_e_v2x_bm(argument, settings), settings.needed_scenario())
 
 
