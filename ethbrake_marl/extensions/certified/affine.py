@@ -27,9 +27,7 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 @compiled(apart=True)
 def radius(x: Floats) -> float:
-    """Return the largest distance of an affine form's values from its centre: |g_1| + ... + |g_K| + r, for ``x``
-    [W].
-    """
+    """Return the largest distance of a value of the affine form ``x`` [W] from its centre."""
     whole: float = x[-1]
     for k in range(1, x.shape[0] - 1):
         whole += abs(x[k])
@@ -50,8 +48,9 @@ def high(x: Floats) -> float:
 
 @compiled(apart=True)
 def add(out: Floats, share: float, x: Floats) -> None:
-    """Add ``share * x`` to ``out`` in place, for affine forms ``x``, ``out`` [W] and a number ``share``; exact except
-    for rounding.
+    """Add ``share * x`` to ``out`` in place; exact except for rounding.
+
+    ``x`` and ``out`` are affine forms [W], ``share`` is any number.
     """
     for k in range(x.shape[0] - 1):
         out[k] += share * x[k]
@@ -82,8 +81,9 @@ def between(least: float, most: float, width: int) -> Floats:
 
 @compiled(apart=True)
 def product(x: Floats, y: Floats) -> Floats:
-    """Return an affine form [W] that encloses the product ``x * y`` of two affine forms. The second-order part goes to
-    the remainder.
+    """Return an affine form [W] that encloses ``x * y``, for two affine forms.
+
+    The second-order part of the product goes to the remainder.
     """
     out = np.empty_like(x)
     for k in range(x.shape[0] - 1):
@@ -95,8 +95,9 @@ def product(x: Floats, y: Floats) -> Floats:
 
 @compiled(apart=True)
 def square(x: Floats) -> Floats:
-    """Return an affine form [W] that encloses ``x * x``. Its remainder is half of that of ``product(x, x)``, because a
-    square is never negative.
+    """Return an affine form [W] that encloses ``x * x``.
+
+    Its remainder is half of that of ``product(x, x)``, because a square is never negative.
     """
     out = np.empty_like(x)
     for k in range(x.shape[0] - 1):
@@ -149,8 +150,9 @@ def reciprocal(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def positive_part(x: Floats) -> Floats:
-    """Return an affine form [W] that encloses ``max(x, 0)``. It lies between its chord and the parallel line
-    through 0.
+    """Return an affine form [W] that encloses ``max(x, 0)``.
+
+    The function lies between its chord and the parallel line through 0.
     """
     least, most = low(x), high(x)
     if least >= 0.0:
@@ -331,7 +333,7 @@ def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
     that it would have reached.
 
     Args:
-        speed: [W] speed at the start of the piece, m/s.
+        speed: affine form [W] of the speed at the start of the piece, m/s.
         i: index of the vehicle.
         length: length of the piece (time interval of constant command), s.
         motion: motion of all vehicles in the piece; ``onward`` and ``reach`` of vehicle ``i`` are changed.
@@ -414,8 +416,9 @@ def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def since(cell: Cell, i: int, time: float) -> Floats:
-    """Return for how long the command of vehicle ``i`` has acted at ``time`` (s after the first decision): [W] s, at
-    least 0.
+    """Return for how long the command of vehicle ``i`` has acted at ``time``, as an affine form [W] in s, at least 0.
+
+    ``time`` counts from the first decision, in s. ``cell`` is the box of worlds.
     """
     since = negative(cell.onset[i])
     since[0] += time
@@ -428,7 +431,7 @@ def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> 
 
     Args:
         moving: True if the command of any vehicle builds up.
-        speed: [W] speed at the start of the piece, m/s.
+        speed: affine form [W] of the speed at the start of the piece, m/s.
         i: index of the vehicle.
         length: length of the piece (time interval of constant command), s.
         motion: receives ``rest``, ``speed`` and ``way`` of vehicle ``i``; its other fields are read.
@@ -453,7 +456,7 @@ def deceleration(pull: Floats, vague: float) -> Floats:
     """Return the affine form [W] of the mean deceleration over any part of a piece, m/s2.
 
     Args:
-        pull: [W] mean acceleration in the piece (time interval of constant command), m/s2.
+        pull: affine form [W] of the mean acceleration in the piece (time interval of constant command), m/s2.
         vague: largest deviation of the acceleration from ``pull``, m/s2.
 
     """

@@ -188,8 +188,8 @@ def _stopping_way(moving: bool, speed: Floats, pull: Floats, vague: float, lengt
 
     Args:
         moving: True if the command of any vehicle builds up.
-        speed: [W] speed at the start of the piece, m/s.
-        pull: [W] mean acceleration, m/s2.
+        speed: affine form [W] of the speed at the start of the piece, m/s.
+        pull: affine form [W] of the mean acceleration, m/s2.
         vague: largest deviation of the acceleration from ``pull``, m/s2.
         length: length of the piece, s.
 

@@ -34,8 +34,8 @@ def spring_apart(
         motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         how: closing speed and time of the contact (from ``approach``).
-        jump: [W] change of the pair's relative speed by the impact, m/s.
-        left: [W] time from the impact to the end of the piece, s.
+        jump: affine form [W] of the change of the pair's relative speed by the impact, m/s.
+        left: affine form [W] of the time from the impact to the end of the piece, s.
         after: receives the speeds at the end of the piece.
         way: [N, W] receives the distances travelled in the piece, m.
 
@@ -65,11 +65,11 @@ def stand_still(cell: Cell, pull: Floats, vague: float, left: float, speed: Floa
 
     Args:
         cell: the box of worlds.
-        pull: [W] mean acceleration after the impact, m/s2.
+        pull: affine form [W] of the mean acceleration after the impact, m/s2.
         vague: largest deviation of the acceleration from ``pull``, m/s2.
         left: longest time from the impact to the end of the piece (time interval of constant command), s.
-        speed: [W] speed at the end of the piece, m/s; corrected in place.
-        way: [W] distance travelled in the piece, m; corrected in place.
+        speed: affine form [W] of the speed at the end of the piece, m/s; corrected in place.
+        way: affine form [W] of the distance travelled in the piece, m; corrected in place.
 
     """
     least = low(speed)
@@ -99,8 +99,8 @@ def stay(
         motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         how: closing speed and time of the contact (from ``approach``).
-        speed: [W] closing speed at the impact, m/s.
-        left: [W] time from the impact to the end of the piece, s.
+        speed: affine form [W] of the closing speed at the impact, m/s.
+        left: affine form [W] of the time from the impact to the end of the piece, s.
         after: receives the speeds at the end of the piece and the state of the pair in contact.
         way: [N, W] receives the distances travelled in the piece, m.
 

@@ -157,7 +157,7 @@ def build_up(cell: Cell, i: int, late: Floats, rates: Floats) -> None:
     Args:
         cell: the box of worlds; only its ``forces`` change.
         i: index of the vehicle.
-        late: [W] time from the alert to the first piece, s.
+        late: affine form [W] of the time from the alert to the first piece, s.
         rates: [2, W] rates at which the brakes build up (0) and release (1), m/s3.
 
     """
@@ -210,13 +210,13 @@ def ramp(
     ``m t (d + e) / 2 - m^2 (d + 2 e) / 6``. Returns whether the force has reached ``wanted`` at the end in every world.
 
     Args:
-        force: [W] acceleration at the start, m/s2; becomes the acceleration at the end.
-        wanted: [W] acceleration that the command asks for, m/s2.
-        duration: [W] time for which the command acts, s.
+        force: affine form [W] of the acceleration at the start, m/s2; becomes the acceleration at the end.
+        wanted: affine form [W] of the acceleration that the command asks for, m/s2.
+        duration: affine form [W] of the time for which the command acts, s.
         longest: upper limit of ``duration``, s.
         rates: [2, W] rates at which the brakes build up (0) and release (1), m/s3.
-        rise: [W] change of speed, m/s; increased in place.
-        gain: [W] distance beyond the starting speed times the time, m; increased in place.
+        rise: affine form [W] of the change of speed, m/s; increased in place.
+        gain: affine form [W] of the distance beyond the starting speed times the time, m; increased in place.
         swing: [2] receives the largest deviation of the acceleration from its mean where it falls (0) and rises (1),
             m/s2.
 
@@ -606,8 +606,9 @@ def _refusal(what: str) -> InvalidInput:
 
 
 def checked_robust(robust: object, where: str) -> str:
-    """Return ``robust`` if it is ``corners`` or ``interior``; raise ``UnknownName`` otherwise. ``where`` begins the
-    error message.
+    """Return ``robust`` if it is ``corners`` or ``interior``; raise ``UnknownName`` otherwise.
+
+    ``where`` names the setting at the start of the error message.
     """
     if robust not in CERTAINTIES:
         raise unknown_name(f"{where}: robust", robust, CERTAINTIES)

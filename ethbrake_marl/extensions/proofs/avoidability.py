@@ -36,10 +36,18 @@ REASON, MARGIN, SPARE, DRIVE, TOUCH, FOLLOW, RESULT_WIDTH = range(7)  # columns 
 
 @compiled
 def spare_gap(gap: float, v_l: float, a_l: float, v_f: float, a_f: float) -> float:
-    """Return the part of the gap that full braking from now does not need to stay behind the braking leader. [m]
+    """Return the part of the gap that full braking from now does not need to stay behind the braking front vehicle, m.
 
     A negative value means that the two meet. If the follower stops last, the stopping distances decide, else the moment
     of equal speeds.
+
+    Args:
+        gap: gap between the two vehicles, m.
+        v_l: speed of the front vehicle (leader), m/s.
+        a_l: its braking capacity, m/s2.
+        v_f: speed of the follower, m/s.
+        a_f: its braking capacity, m/s2.
+
     """
     if v_f * a_l >= v_l * a_f:
         return gap - max(0.0, v_f * v_f / (2.0 * a_f) - v_l * v_l / (2.0 * a_l))
@@ -52,11 +60,21 @@ def spare_gap(gap: float, v_l: float, a_l: float, v_f: float, a_f: float) -> flo
 def drive_before_braking(
     gap: float, v_l: float, a_l: float, v_f: float, a_f: float, u: float
 ) -> tuple[float, float, bool]:
-    """Return the longest drive with constant ``u >= 0`` after which full braking still stays behind the braking leader.
+    """Return how long a vehicle may drive with constant ``u >= 0`` so that full braking still keeps it behind the
+    leader.
 
     Returns its duration, the time at which the gap becomes 0, and whether both vehicles move at that time (then
     ``a_f > a_l`` and the speeds are equal; else the follower stops at the standing leader). Infinite if the follower
     never moves. Assumes ``spare_gap >= 0``.
+
+    Args:
+        gap: gap to the leader (the vehicle in front, which brakes from now on), m.
+        v_l: speed of the leader, m/s.
+        a_l: braking capacity of the leader, m/s2.
+        v_f: speed of the following vehicle, m/s.
+        a_f: its braking capacity, m/s2.
+        u: its driving acceleration, m/s2.
+
     """
     w, closing, relief = v_f - v_l, u + a_l, a_f - a_l
     if relief > 0.0 and v_l > 0.0:
@@ -82,7 +100,12 @@ def drive_before_braking(
 def largest_behind(
     gap: float, v_l: float, a_l: float, v_f: float, a_f: float, u: float, limit: float
 ) -> tuple[float, float, bool]:
-    """Return the values of ``drive_before_braking`` for a vehicle that stops driving at its speed limit."""
+    """Return the values of ``drive_before_braking`` for a vehicle that stops driving at its speed limit ``limit``, m/s.
+
+    These are the duration of the longest drive (s), the time at which the gap becomes 0 (s), and whether both vehicles
+    move
+    then. The other arguments are those of ``drive_before_braking``.
+    """
     cap = time_to_limit(v_f, u, limit)
     if cap > 0.0:
         found = drive_before_braking(gap, v_l, a_l, v_f, a_f, u)
@@ -97,9 +120,18 @@ def largest_behind(
 
 @compiled
 def lowest_while_coasting(gap: float, v_f: float, v_r: float, a_r: float, onset_r: float, until: float) -> float:
-    """Return the smallest gap behind a vehicle that coasts until ``until``. [m]
+    """Return the smallest gap between a vehicle that coasts until ``until`` and the vehicle behind it, m.
 
     The gap is convex, so its minimum is at equal speeds or at an end.
+
+    Args:
+        gap: gap now, m.
+        v_f: speed of the coasting vehicle, m/s.
+        v_r: speed of the vehicle behind, m/s.
+        a_r: its braking capacity, m/s2.
+        onset_r: time from which on it brakes, s.
+        until: end of the coasting, s.
+
     """
     w = v_r - v_f
     if w <= 0.0:
@@ -111,7 +143,7 @@ def lowest_while_coasting(gap: float, v_f: float, v_r: float, a_r: float, onset_
 
 @compiled
 def met(gap: float, closing: float) -> bool:
-    """Return whether a pair with this gap and closing speed has had an impact, or has one at this moment."""
+    """Return whether a pair with this gap (m) and closing speed (m/s) has had an impact, or has one at this moment."""
     return gap < -ROUNDING_M or (gap <= 0.0 and closing > BOUND.TOUCH_SPEED_MPS)
 
 
@@ -119,9 +151,19 @@ def met(gap: float, closing: float) -> bool:
 def leader_at_onset(
     gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, start: float
 ) -> tuple[float, float]:
-    """Return the gap to the leader and its speed at ``start``, when the coasting follower may act.
+    """Return the gap to the leader (m) and its speed (m/s) at ``start``, when the follower may act; it coasts until
+    then.
 
     The leader brakes by then. The gap is concave until then: if it is not negative at the end, it never was.
+
+    Args:
+        gap: gap now, m.
+        v_l: speed of the leader (front vehicle), m/s.
+        a_l: its braking capacity, m/s2.
+        onset_l: time from which on it brakes, s.
+        v_f: speed of the follower, m/s.
+        start: time at which the follower may act, s.
+
     """
     after, way, _ = solo_motion(v_l, -a_l, onset_l, math.inf, start)
     return gap + (way - v_f * start), after
@@ -129,9 +171,17 @@ def leader_at_onset(
 
 @compiled
 def decide_front(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: int, out: Floats) -> bool:
-    """Decide the front pair of vehicle ``i`` without a drive. Return False if the pair certainly meets.
+    """Decide whether vehicle ``i`` stays behind the front vehicle by full braking. Return False if the pair certainly
+    meets.
 
-    REASON, MARGIN and SPARE go to ``out``.
+    Args:
+        gap: [P] gaps, m.
+        speed: [N] speeds, m/s.
+        onset: [N] times from which on the vehicles may brake, s.
+        braking: [N] braking capacities, m/s2.
+        i: index of the controlled vehicle, at least 1.
+        out: [RESULT_WIDTH] receives columns REASON, MARGIN and SPARE.
+
     """
     a_l, v_f, a_f = braking[i - 1], speed[i], braking[i]
     ahead, v_l = leader_at_onset(gap[i - 1], speed[i - 1], a_l, onset[i - 1], v_f, onset[i])
@@ -151,9 +201,21 @@ def plan_behind(
     gap: Floats, speed: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, keep: float,
     plan: Floats, out: Floats,
 ) -> None:  # fmt: skip
-    """Write the largest trajectory that stays ``keep`` metres behind the leader, if any, to ``plan`` and ``out``.
+    """Write the trajectory that is farthest ahead at all times, but stays ``keep`` metres behind the front vehicle, to
+    ``plan``.
 
-    It is the trajectory that is farthest ahead at all times.
+    Args:
+        gap: [P] gaps, m.
+        speed: [N] speeds, m/s.
+        onset: [N] times from which on the vehicles may act, s.
+        braking: [N] braking capacities, m/s2.
+        driving: [N] driving capacities, m/s2.
+        limit: [N] speed limits, m/s.
+        i: index of the controlled vehicle.
+        keep: distance to keep to the front vehicle, m.
+        plan: [2, PIECES] receives the trajectory as a braking profile.
+        out: [RESULT_WIDTH] receives columns DRIVE, TOUCH and FOLLOW.
+
     """
     a_f, u = braking[i], driving[i]
     if i > 0:
@@ -168,9 +230,16 @@ def plan_behind(
 
 @compiled
 def meets_rear_early(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: int, out: Floats) -> bool:
-    """Return whether the rear pair of vehicle ``i`` meets before the vehicle may act.
+    """Return whether the vehicle behind vehicle ``i`` meets it before vehicle ``i`` may act.
 
-    The reason then goes to ``out``.
+    Args:
+        gap: [P] gaps, m.
+        speed: [N] speeds, m/s.
+        onset: [N] times from which on the vehicles may act, s.
+        braking: [N] braking capacities, m/s2.
+        i: index of the controlled vehicle.
+        out: [RESULT_WIDTH] receives columns REASON and MARGIN if they meet.
+
     """
     v_f, v_r, a_r, start = speed[i], speed[i + 1], braking[i + 1], onset[i]
     lowest = lowest_while_coasting(gap[i], v_f, v_r, a_r, onset[i + 1], start)
@@ -186,9 +255,22 @@ def decide_world(
     gap: Floats, speed: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, plan: Floats,
     rear: Floats, out: Floats,
 ) -> None:  # fmt: skip
-    """Write the verdict on one world to ``out`` [RESULT_WIDTH].
+    """Decide whether vehicle ``i`` can avoid contact in one world, and write the verdict to ``out``.
 
-    ``plan`` and ``rear`` are working memory. Times count from the onset of vehicle ``i``.
+    DRIVE and TOUCH in the verdict count from the time at which vehicle ``i`` may act.
+
+    Args:
+        gap: [P] gaps, m.
+        speed: [N] speeds, m/s.
+        onset: [N] times from which on the vehicles may act, s.
+        braking: [N] braking capacities, m/s2.
+        driving: [N] driving capacities, m/s2.
+        limit: [N] speed limits, m/s.
+        i: index of the controlled vehicle.
+        plan: [2, PIECES] working memory.
+        rear: [2, PIECES] working memory.
+        out: [RESULT_WIDTH] receives the verdict (columns REASON to FOLLOW).
+
     """
     out[REASON], out[MARGIN], out[SPARE] = AVOIDABLE, math.inf, math.inf
     out[DRIVE], out[TOUCH], out[FOLLOW] = math.inf, math.inf, -braking[i]
@@ -220,7 +302,20 @@ def decide_world(
 def decide_worlds(
     gaps: Floats, speeds: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, out: Floats
 ) -> None:
-    """Write the verdict on every world to ``out`` [n, RESULT_WIDTH]."""
+    """Decide for each of ``n`` worlds whether vehicle ``i`` can avoid contact; write the verdicts to ``out`` [n,
+    RESULT_WIDTH].
+
+    Args:
+        gaps: [n, P] gaps, m.
+        speeds: [n, N] speeds, m/s.
+        onset: [n, N] times from which on the vehicles may act, s.
+        braking: [n, N] braking capacities, m/s2.
+        driving: [n, N] driving capacities, m/s2.
+        limit: [n, N] speed limits, m/s.
+        i: index of the controlled vehicle.
+        out: [n, RESULT_WIDTH] receives columns REASON to FOLLOW.
+
+    """
     plan, rear = empty_plan(), empty_plan()
     for k in range(gaps.shape[0]):
         decide_world(gaps[k], speeds[k], onset[k], braking[k], driving[k], limit[k], i, plan, rear, out[k])
@@ -244,14 +339,14 @@ class Avoidability:
     physics. Each command applies from its absolute time to the next (infinite: never). NaN if contact is unavoidable.
     """
 
-    reason: Ints
-    margin_m: Floats
-    switch_s: Floats  # [n, 3]
-    command_mps2: Floats  # [n, 3]
+    reason: Ints  # [n] 0 avoidable, 1 early, 2 front, 3 rear
+    margin_m: Floats  # [n] smallest gap to the rear vehicle, m; negative if contact is unavoidable
+    switch_s: Floats  # [n, 3] times from which on the commands of the witness apply, s
+    command_mps2: Floats  # [n, 3] commands of the witness, m/s2
 
     @property
     def avoidable(self) -> Bools:
-        """Whether some profile avoids all contact, and so every impact, [n]."""
+        """True for worlds in which some command profile avoids all contact, and so every impact, [n]."""
         return np.asarray(self.reason == 0, np.bool_)
 
     @property
@@ -292,7 +387,14 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
 
 
 def check_covered(worlds: Worlds, vehicle: int, scripts: Mapping[int, str] | None) -> None:
-    """Raise ``InvalidInput`` for worlds that ``avoidability`` does not cover. Brake build-up is not checked."""
+    """Raise ``InvalidInput`` for worlds that ``avoidability`` does not cover. Brake build-up is not checked.
+
+    Args:
+        worlds: the worlds, [n].
+        vehicle: index of the controlled vehicle.
+        scripts: name of each other vehicle's script by index; None: all brake fully.
+
+    """
     # An obstacle that Vehicle 1 does not reach under full braking has no effect: only a push could bring the vehicle
     # there, and a push is an impact already.
     check_whole_number("avoidability: vehicle", vehicle, 0, worlds.N - 1)

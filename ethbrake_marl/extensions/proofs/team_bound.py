@@ -43,9 +43,17 @@ def _combined_bound_of_line(
 ) -> Floats:
     """Return the combined bound of the first two pairs, [n] m2/s2, or 0 if nothing is proven.
 
-    It covers ``until`` [n] s from now. ``onset`` [n, N] counts from now. ``counts`` [n, P] marks pairs whose next
-    impact counts and whose vehicles move forward. The first vehicle must brake by now. The second one, one of
-    ``chosen``, is treated as if it may act from now on. ``pairs`` [n, 2] are the bounds of both pairs alone.
+    The first vehicle must brake by now. The second one is treated as if it may act from now on.
+
+    Args:
+        now: the worlds now, [n].
+        onset: [n, N] time from now at which each vehicle may act, s.
+        counts: [n, P] True for pairs whose next impact counts and whose vehicles move forward.
+        chosen: indices of the controlled vehicles; the second vehicle is one of them.
+        until: [n] horizon, s from now.
+        pairs: [n, 2] bounds of both pairs alone, m2/s2.
+        time_step_s: time between two decisions, s; None: commands may change at any time.
+
     """
     v = now.vehicles
     stops = (
@@ -95,15 +103,17 @@ def _combined_bound_of_line(
 class TeamBound:
     """Proven bounds on each world, [n] m2/s2."""
 
-    harm: Floats  # bound on the total: no joint command does less harm than this
+    harm: Floats  # lower bound on the total harm: no joint command does less
     early: Floats  # harm before any controlled vehicle may act
-    obstacle: Floats  # bound of Vehicle 1 and the obstacle ahead
-    pairs: Floats  # [n, P] bound of each pair alone, from then on
+    obstacle: Floats  # bound of Vehicle 1 and the obstacle ahead, from that moment on
+    pairs: Floats  # [n, P] bound of each pair alone, from that moment on
     combined: Floats  # bound of the first two pairs together (see ``team_bound``); 0 if nothing is proven
 
     @property
     def impact_proven(self) -> Bools:
-        """Whether every joint command certainly has an impact, [n]. False means that none is proven."""
+        """True for worlds in which every joint command certainly has an impact, [n]. False means that none is
+        proven.
+        """
         return np.asarray(self.harm > 0.0, np.bool_)
 
 
@@ -201,9 +211,13 @@ def team_bound(
 
 
 def _pair_bound(columns: Mapping[int, Floats | float], until: Floats, counts: Bools) -> Floats:
-    """Return the bound of one pair alone, [n]; 0 where its next impact does not count.
+    """Return the bound on the harm of one pair alone, [n] m2/s2; 0 where its next impact does not count.
 
-    ``columns`` holds the nonzero columns of the pair.
+    Args:
+        columns: maps a column of a pair (``PAIR_GAP`` to ``FOLLOWER_A``) to its values; missing columns are 0.
+        until: [n] horizon, s.
+        counts: [n] True for worlds in which the next impact of the pair counts.
+
     """
     at, found, out = np.zeros((len(until), PAIR_WIDTH)), np.zeros(len(until)), np.empty(int(counts.sum()))
     for column, values in columns.items():
