@@ -17,15 +17,15 @@ class _Line(NamedTuple):
     """
 
     GAP_L: int = 0  # gap to the front vehicle, m
-    V_L: int = 1
-    A_L: int = 2
-    V_F: int = 3
-    A_F: int = 4
-    U_F: int = 5
+    V_L: int = 1  # speed of the front vehicle, m/s
+    A_L: int = 2  # braking capacity of the front vehicle, m/s2
+    V_F: int = 3  # speed of the controlled vehicle, m/s
+    A_F: int = 4  # braking capacity of the controlled vehicle, m/s2
+    U_F: int = 5  # driving capacity of the controlled vehicle, m/s2
     LIMIT_F: int = 6  # speed limit of the controlled vehicle, m/s
     GAP_R: int = 7  # gap to the rear vehicle, m
-    V_R: int = 8
-    A_R: int = 9
+    V_R: int = 8  # speed of the rear vehicle, m/s
+    A_R: int = 9  # braking capacity of the rear vehicle, m/s2
     ONSET_R: int = 10  # time from which on the rear vehicle brakes, s
     FRONT_SHARE: int = 11  # m_l / (m_l + m_f), with the masses m
     REAR_SHARE: int = 12  # m_r / (m_f + m_r), with the masses m
