@@ -46,15 +46,20 @@ _ALONE, _REALISED, _AS_PRINTED = "policy alone", "hybrid, realised H*", "hybrid,
 
 
 def _drive_hybrid(name: str, settings: Reproduction, reading: Reading) -> Evaluation:
-    """Evaluate the strategies on the worlds of a scenario."""
+    """Evaluate E-V2X-BM, a policy that has not converged, and the paper's hybrid of both on a list of worlds.
+
+    The *hybrid* is the paper's Algorithm 1: it chooses one of the two at the alert. ``name`` is a shipped scenario,
+    ``reading`` the assumption on when Vehicle 2 may act.
+    """
     return _driven_hybrid(name, settings, reading, unconverged_policy(settings)[1])
 
 
 @lru_cache(maxsize=2 * len(READINGS))  # figure and table share the evaluations
 def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: str) -> Evaluation:
-    """Evaluate the strategies with the unconverged policy that ``about`` describes.
+    """Evaluate the strategies of ``_drive_hybrid``, once for each set of arguments.
 
-    ``about`` is part of the cache key, so that a training that ends meanwhile replaces a shipped policy.
+    ``about`` describes the policy that has not converged. It is part of the cache key, so that a training that ends
+    meanwhile replaces a shipped policy.
     """
     scenario, (policy, _) = reading.scenario(name), unconverged_policy(settings)
     agents: dict[str, Agent] = {
@@ -67,10 +72,12 @@ def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: s
 
 
 def reproduce_illustration(settings: Reproduction) -> Made:
-    """Reproduce the harm of E-V2X-BM, an unconverged policy and the hybrid over the total distance.
+    """Reproduce the harm of E-V2X-BM, a policy that has not converged, and the hybrid of both against the sum of both
+    gaps.
 
-    The paper's claim that the hybrid "consistently selects the strategy that results in lower harm" is judged in each
-    world and in each group.
+    The *hybrid* is the paper's Algorithm 1: it chooses one of the two at the alert. The paper's claim that it
+    "consistently
+    selects the strategy that results in lower harm" is judged in each world and in each group.
     """
     found, verdicts = {}, []
     for reading in READINGS:
@@ -96,7 +103,7 @@ def reproduce_illustration(settings: Reproduction) -> Made:
 
 
 def reproduce_hybrid_table(settings: Reproduction) -> Made:
-    """Reproduce the paper's table of 5,000 episodes, with both readings of its initial speeds."""
+    """Reproduce the paper's table of 5,000 episodes (``Table:hybrid``), with both possible sets of initial speeds."""
     ours = {
         "E-V2X-BM": (NAMES[PAIRWISE], NAMES[COUPLED]),
         "Standalone DRL": (_ALONE,),
