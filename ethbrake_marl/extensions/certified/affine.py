@@ -123,8 +123,8 @@ def linear(x: Floats, slope: float, start: float, error: float) -> Floats:
 def square_root(x: Floats) -> Floats:
     """Return an affine form [W] that encloses the square root of ``x`` where ``x >= 0``. Needs ``high(x) >= 0``.
 
-    Where ``x`` is negative the result means nothing. On [a, b] the root lies between its chord, with slope
-    1 / (sqrt a + sqrt b), and the parallel tangent.
+    Where ``x`` is negative the result means nothing. On [a, b] the root lies between its chord, with slope 1 / (sqrt a
+    + sqrt b), and the parallel tangent.
     """
     least, most = math.sqrt(max(low(x), 0.0)), math.sqrt(high(x))
     if most <= 0.0:
@@ -230,7 +230,7 @@ class Cell(NamedTuple):
 
 
 class Path(NamedTuple):
-    """The worlds of a box (``Cell``) that had the same sequence of impacts and contacts so far, with their present
+    """Worlds of a box (``Cell``) that had the same sequence of impacts and contacts so far, with their present
     state.
     """
 
@@ -245,9 +245,7 @@ class Path(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Motion of each vehicle, as if alone, through one piece (time interval of constant command); ``move_alone`` fills
-    it in.
-    """
+    """Motion of each vehicle, as if alone, through one piece (time interval of constant command)."""
 
     pull: Floats  # [N, W] acceleration by the command, m/s2
     onward: Floats  # [N, W] speed at the end under the command alone, m/s, as if the vehicle never stopped
@@ -260,9 +258,7 @@ class Motion(NamedTuple):
 
 @compiled(apart=True)
 def new_motion(N: int, width: int) -> Motion:
-    """Return a ``Motion`` of zeros for ``N`` vehicles and affine forms of length ``width``, for ``move_alone`` to fill
-    in.
-    """
+    """Return a ``Motion`` of zeros for ``N`` vehicles and affine forms of length ``width``."""
     return Motion(
         np.zeros((N, width)), np.zeros((N, width)), np.zeros((N, width)), np.zeros((N, width)), np.zeros((N, width)),
         np.zeros(N, np.int64), np.zeros(N),
@@ -326,8 +322,7 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
-    """Widen the motion of vehicle ``i``, in place, for brakes that hold it at rest while they are released in this
-    piece.
+    """Widen the motion of vehicle ``i``, in place, for brakes that hold it at rest while they are released in a piece.
 
     The vehicle may stand until its force is above 0. It is then faster, and further on, by at most the negative speed
     that it would have reached.
@@ -356,8 +351,8 @@ def between_shifted(x: Floats, shift: float) -> Floats:
 
 @compiled(apart=True)
 def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
-    """Set ``motion.pull`` of vehicle ``i`` to the acceleration by its command in a piece; it is 0 before the latency
-    has elapsed.
+    """Set ``motion.pull`` of vehicle ``i`` to the acceleration by its command in a piece; 0 before its latency has
+    elapsed.
 
     ``motion.rest`` and ``motion.vague`` of the vehicle are set too.
 

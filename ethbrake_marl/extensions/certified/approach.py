@@ -72,10 +72,10 @@ def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
 
 @compiled(apart=True)
 def pressing(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the least and the largest closing acceleration of pair ``p`` in a piece (time interval of constant
-    command), m/s2.
+    """Return the least and the largest closing acceleration of pair ``p`` in a piece, m/s2.
 
-    Either vehicle may stop in it. ``motion`` is the motion of all vehicles in the piece.
+    Either vehicle may stop in it. ``motion`` is the motion of all vehicles in the piece (time interval of constant
+    command).
     """
     front_low, front_high = low(motion.pull[p]) - motion.vague[p], high(motion.pull[p]) + motion.vague[p]
     rear_low, rear_high = low(motion.pull[p + 1]) - motion.vague[p + 1], high(motion.pull[p + 1]) + motion.vague[p + 1]
@@ -183,8 +183,7 @@ def approach(
 
 @compiled(apart=True)
 def _stopping_way(moving: bool, speed: Floats, pull: Floats, vague: float, length: float) -> Floats:
-    """Return the stopping distance [W] (m) of a braking vehicle that stops within a piece (time interval of constant
-    command).
+    """Return the stopping distance, an affine form [W] in m, of a braking vehicle that stops within a piece.
 
     Args:
         moving: True if the command of any vehicle builds up.

@@ -89,11 +89,9 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
     """Return the cell of a box, and the time from the alert to the first piece (s) as an affine form [W].
 
     A *cell* is the box as affine forms, with the commands cut into pieces (time intervals of constant command). Time
-    counts
-    from the first decision, because that decision falls at a different time in each world if the shielded vehicle's
-    latency
-    is uncertain. The first piece starts before it by the shortest time that any world needs from the alert to the first
-    decision.
+    counts from the first decision, because that decision falls at a different time in each world if the shielded
+    vehicle's latency is uncertain. The first piece starts before it by the shortest time that any world needs from the
+    alert to the first decision.
 
     Args:
         low_: [Q] least values of the box.
@@ -206,8 +204,8 @@ def ramp(
     """Move a force towards its target during a time, and add its effect on speed and distance.
 
     For a difference d to ``wanted`` at the start and e at the end, and a time m during which the force changes, the
-    speed changes by ``m (d + e) / 2`` more than under ``wanted`` alone in the duration t, and the distance by
-    ``m t (d + e) / 2 - m^2 (d + 2 e) / 6``. Returns whether the force has reached ``wanted`` at the end in every world.
+    speed changes by ``m (d + e) / 2`` more than under ``wanted`` alone in the duration t, and the distance by ``m t (d
+    + e) / 2 - m^2 (d + 2 e) / 6``. Returns whether the force has reached ``wanted`` at the end in every world.
 
     Args:
         force: affine form [W] of the acceleration at the start, m/s2; becomes the acceleration at the end.
@@ -286,11 +284,11 @@ def wait(cell: Cell, late: Floats) -> bool:
 
 @compiled(apart=True)
 def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
-    """Return the acceleration [W] (m/s2) of vehicle ``i`` from the alert until ``late``, and whether it is certain.
+    """Return the acceleration of vehicle ``i`` from the alert until ``late``, and whether it is certain.
 
-    It is not certain if the vehicle's command may take effect within that time. It is 0 for the shielded vehicle.
-    ``late``
-    [W] is the time from the alert to the first piece (time interval of constant command), s.
+    The acceleration is an affine form [W] in m/s2; it is 0 for the shielded vehicle. It is not certain if the vehicle's
+    command may take effect within that time. ``cell`` is the box of worlds; ``late`` [W] is the time from the alert to
+    the first piece (time interval of constant command), s.
     """
     pull = np.zeros_like(late)
     if i == cell.vehicle:
@@ -308,8 +306,9 @@ def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
 
 @compiled(apart=True)
 def pieces(known: Known, onset: Floats, earliest: float, plan: Floats) -> tuple[Floats, Floats]:
-    """Return the J pieces (time intervals of constant command): their limits [J + 1] (s after the first decision) and
-    the action in each, [J].
+    """Return the J pieces (time intervals of constant command): their limits [J + 1], and the action in each, [J].
+
+    The limits are in s after the first decision.
 
     Args:
         known: the certain quantities.

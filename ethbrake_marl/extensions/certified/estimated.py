@@ -44,8 +44,7 @@ OF_OTHERS = (
 
 
 class Told(NamedTuple):
-    """The information that one vehicle has received about the others by now. Columns of unknown vehicles are
-    meaningless.
+    """Information that one vehicle has received about the others by now. Columns of unknown vehicles are meaningless.
 
     A vehicle is *known* if its message has arrived or it is in sight.
     """
@@ -108,8 +107,9 @@ class Told(NamedTuple):
 
 
 def _places_of(worlds: Worlds, vehicle: int) -> Floats:
-    """Return the position of each vehicle ahead of ``vehicle``, [n, N] m; negative behind it. Direct neighbours are one
-    exact gap away.
+    """Return the position of each vehicle ahead of ``vehicle``, [n, N] m; negative behind it.
+
+    The positions come from the gaps of ``worlds``. Direct neighbours are exactly one gap away.
     """
     ahead = np.concatenate([np.zeros((worlds.n, 1)), -np.cumsum(worlds.gaps_m, axis=1)], axis=1)
     place: Floats = ahead - ahead[:, [vehicle]]
@@ -125,8 +125,7 @@ class Ranges:
 
     Keys of the mappings: ``place`` (position ahead of the vehicle's own position at the alert, m), ``speeds_mps``,
     ``braking_capacity_mps2``, ``mass_t``, ``latency_s`` (a vehicle's own part of the latency) and ``news_s`` (time at
-    which
-    a vehicle has received the alert, before which it does not react; 0 without a channel). Each value is [N].
+    which a vehicle has received the alert, before which it does not react; 0 without a channel). Each value is [N].
     """
 
     vehicle: int  # index of the estimating vehicle
@@ -142,8 +141,7 @@ class Ranges:
         them.
 
         ``others`` are the scripts of the other vehicles by index; None: the scenario's scripts. Raises ``InvalidInput``
-        for a
-        mixture of scenarios, because an unknown vehicle could belong to any of them.
+        for a mixture of scenarios, because an unknown vehicle could belong to any of them.
         """
         if scenario.members:
             names = ", ".join(member.name for member in scenario.members)

@@ -41,8 +41,8 @@ SURPRISE = 1e-6  # tolerance (m, m/s) between a measurement and its prediction
 
 
 def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
-    """Restore the harm so far after a restart of the shield in ``rows``, and keep the rest of the old plan if it harms
-    no more.
+    """Restore the harm so far after a restart of the shield in ``rows``; keep the rest of the old plan if it harms no
+    more.
 
     ``shield`` was just restarted and is changed; ``before`` is its copy from before the restart.
     """
@@ -263,8 +263,7 @@ class BelievedShield:
         """Return a mask [n, N] of the vehicles whose predicted state is better than their received state.
 
         These are unknown vehicles, and known vehicles without a message since their last predicted impact or contact.
-        ``told``
-        is the received information, ``time_s`` [n] the present time.
+        ``told`` is the received information, ``time_s`` [n] the present time.
         """
         running = self.shield.memory.running
         if running is None:
@@ -281,7 +280,9 @@ class BelievedShield:
         return keeps
 
     def _note_impacts(self, worlds: Worlds) -> None:
-        """Store the present time for vehicles that had an impact in any certified world since the last decision."""
+        """Store the present time of ``worlds`` for vehicles that had an impact in any certified world since the last
+        decision.
+        """
         running = self.shield.memory.running
         assert running is not None
         pairs = running.problem.mass.shape[1] - 1
@@ -294,8 +295,12 @@ class BelievedShield:
         self._totals = totals.copy()
 
     def _is_surprised(self, believed: Worlds, heard: Bools) -> Bools:
-        """Return a mask [n] of the worlds in which a vehicle of ``heard`` [n, N] is outside the range of its predicted
-        states.
+        """Return a mask [n] of the worlds in which a vehicle is outside the range of its predicted states.
+
+        Args:
+            believed: the estimated worlds now, [n].
+            heard: [n, N] True for vehicles whose received state is compared.
+
         """
         running = self.shield.memory.running
         assert running is not None

@@ -26,9 +26,7 @@ class Odometer(NamedTuple):
 
     @classmethod
     def begun(cls, alert: Worlds, vehicle: int) -> Odometer:
-        """Return the odometer of the vehicle with index ``vehicle`` at the start of episodes in the worlds
-        ``alert``.
-        """
+        """Return the odometer of vehicle ``vehicle`` (index) at the start of episodes in the worlds ``alert``, [n]."""
         return cls(np.zeros(alert.n), alert.time_s.copy(), alert.speeds_mps[:, vehicle].copy())
 
     def look(self, worlds: Worlds, vehicle: int) -> Odometer:
@@ -48,9 +46,8 @@ class Believing(AgentAround):
     """Agent that lets another agent, ``policy``, control its vehicle in the estimated world.
 
     The policy starts when it is first asked, on the information received by then. It starts again in worlds where
-    another
-    vehicle becomes known, or where a message over a channel says that it reacts. In the estimate, the others follow the
-    scenario's scripts. ``predicted_harm`` [n] is the harm that the policy expected when it was first asked.
+    another vehicle becomes known, or where a message over a channel says that it reacts. In the estimate, the others
+    follow the scenario's scripts. ``predicted_harm`` [n] is the harm that the policy expected when it was first asked.
 
     Args:
         policy: any agent that reads the state of the line.
@@ -114,9 +111,10 @@ class Believing(AgentAround):
         return believed
 
     def _heard(self, worlds: Worlds, vehicle: int) -> Floats:
-        """Return flags [n, 2 N], 0 or 1: whether each vehicle is known, and whether it sent that it reacts.
+        """Return flags [n, 2 N], 0 or 1: whether ``vehicle`` knows each vehicle, and whether that one sent that it
+        reacts.
 
-        Where a flag changes, the policy starts again.
+        Where a flag changes, the policy starts again. ``worlds`` are the true worlds now.
         """
         told = Told.to(worlds, vehicle)
         unforetold = told.reacts & self.scenario.v2x.by_link  # without a channel a reaction is predicted by its latency
@@ -129,8 +127,9 @@ class Believing(AgentAround):
 
 
 class BelievingHybrid(Believing):
-    """The paper's Algorithm 1 in the estimated world: at the first decision it chooses the policy or E-V2X-BM,
-    whichever predicts less harm.
+    """The paper's Algorithm 1 in the estimated world: the first decision chooses between the policy and E-V2X-BM.
+
+    The one that predicts less harm controls the vehicle for the whole episode.
     """
 
     policy: HybridAgent
@@ -141,8 +140,8 @@ class BelievingHybrid(Believing):
         return Knowledge.of(self.policy.policy, also=Source.BELIEFS)
 
     def _shown_at_first(self, believed: Worlds) -> Worlds:
-        """Return the estimated worlds with their clock set to 0 and without past impacts, as the rollouts of the
-        comparison need them.
+        """Return the estimated worlds with their clock at 0 and without past impacts, as the comparison's rollouts need
+        them.
         """
         v, n = believed.vehicles, believed.n
         latency = np.maximum(v.latency_s - believed.time_s[:, np.newaxis], 0.0)

@@ -18,7 +18,11 @@ from ethbrake_marl.shield.factories import shield_episodes
 def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
     """Make the shield ``+robust`` or ``+robust:interior`` against the uncertainty of the settings.
 
-    ``policy`` is the agent to shield; ``argument`` is ``corners``, ``interior`` or None (``corners``).
+    Args:
+        policy: the agent to shield.
+        argument: ``corners``, ``interior``, or None for ``corners``.
+        settings: scenario, uncertainty, harm to bound, and the agent's spec for error messages.
+
     """
     where = f"agent {settings.spec!r}"
     robust, uncertainty = checked_robust(argument or CORNERS, where), settings.uncertainty
@@ -29,10 +33,13 @@ def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings
 
 
 def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make the shield ``+robust:believed`` or ``+robust:interior:believed``: robust against everything that was not
-    received.
+    """Make the shield ``+robust:believed`` or ``+robust:interior:believed``: robust against all that was not received.
 
-    ``policy`` is the agent to shield; ``argument`` is ``corners``, ``interior`` or None (``corners``).
+    Args:
+        policy: the agent to shield.
+        argument: ``corners``, ``interior``, or None for ``corners``.
+        settings: scenario, harm to bound, and the agent's spec for error messages.
+
     """
     where = f"agent {settings.spec!r}"
     return ShieldedDriver(
@@ -44,7 +51,13 @@ def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: 
 def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: AgentSettings) -> Driver:
     """Make the shield ``+step:believed``: every action of ``policy`` is certified in the estimated world.
 
-    ``argument`` is not used. Raises ``InvalidInput`` for a team or several learners.
+    Raises ``InvalidInput`` for a team or several learners.
+
+    Args:
+        policy: the agent to shield.
+        argument: not used.
+        settings: scenario, harm to bound, and the agent's spec for error messages.
+
     """
     scenario = settings.needed_scenario()
     if isinstance(policy, Team) or len(scenario.learners) > 1:
@@ -53,12 +66,15 @@ def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: Ag
 
 
 def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """Make ``+episode:believed`` or ``+episode:pairwise:believed``: Algorithm 1 makes its comparison in the estimated
-    world.
+    """Make ``+episode:believed`` or ``+episode:pairwise:believed``: Algorithm 1 compares in the estimated world.
 
-    ``policy`` is the agent to shield; ``argument`` is ``pairwise`` or None. Raises ``InvalidInput`` for an agent that
-    already
-    decides on received information.
+    Raises ``InvalidInput`` for an agent that already decides on received information.
+
+    Args:
+        policy: the agent that E-V2X-BM is compared with.
+        argument: ``pairwise`` or None.
+        settings: scenario, and the agent's spec for error messages.
+
     """
     hybrid = shield_episodes(policy, argument, settings)
     if isinstance(policy, Believing):
@@ -69,7 +85,7 @@ def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: 
 def make_estimating_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
     """Make the agent ``e_v2x_bm:believed`` or ``e_v2x_bm:pairwise:believed``: E-V2X-BM in the estimated world.
 
-    ``argument`` is ``pairwise`` or None.
+    ``argument`` is ``pairwise`` or None; ``settings`` hold the scenario.
     """
     return Believing(make_e_v2x_bm(argument, settings), settings.needed_scenario())
 

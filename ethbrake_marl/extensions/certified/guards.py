@@ -71,8 +71,7 @@ class BelievedGuard(ShieldGuard):
         """Return the infos of a step that is certified in the estimated worlds.
 
         ``trusted`` is true if the mode is ``robust``, so that the bound also says something about the true world.
-        ``memory``
-        holds the shield after the step, ``ruling`` its decision (None at the reset).
+        ``memory`` holds the shield after the step, ``ruling`` its decision (None at the reset).
         """
         estimated: BelievedShield = memory.shield
         robust, shield = estimated.robust is not None, estimated.shield

@@ -96,8 +96,9 @@ class RobustOptions(ShieldOptions):
         return super().shield(scenario, vehicle, others)
 
     def check_in(self, scenario: Scenario, *, several: bool) -> None:
-        """Raise ``InvalidInput`` if a shield with these settings refuses the scenario. ``several``: whether it shields
-        all learners together.
+        """Raise ``InvalidInput`` if a shield with these settings refuses the scenario.
+
+        ``several`` is True for one shield of all learners together.
         """
         one = one_learner(scenario)
         if self.believed:  # the scenario's scripts apply only if it has exactly one learner
@@ -133,7 +134,8 @@ class RobustOptions(ShieldOptions):
 
 
 def checked_uncertainty(given: object) -> Uncertainty | None:
-    """Return an ``Uncertainty`` from an object or its written form such as ``"gaps_m=0.5"``; None stays None.
+    """Return ``given`` as an ``Uncertainty``: an object, its written form such as ``"gaps_m=0.5"``, or None, which
+    stays None.
 
     Raises ``InvalidInput`` for anything else.
     """
@@ -148,8 +150,7 @@ def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None
     """Return the checked uncertainty for a shield mode, or None if there is none.
 
     Raises ``InvalidInput`` if mode ``robust`` has none, or another mode has one; ``where`` begins the message.
-    ``given`` is
-    an ``Uncertainty``, its written form, or None.
+    ``given`` is an ``Uncertainty``, its written form, or None.
     """
     uncertainty = checked_uncertainty(given)
     if (mode == "robust") != (uncertainty is not None):

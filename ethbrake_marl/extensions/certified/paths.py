@@ -171,18 +171,17 @@ def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
 
 @compiled(apart=True)
 def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats, time: Floats, length: float) -> Floats:
-    """Return the closing speed [W] (m/s) of the other pair of three vehicles if it may meet in the same piece after
-    pair ``p``.
+    """Return the closing speed of the other pair of three vehicles if it may meet in the same piece after pair ``p``.
 
-    The result is 0 if it cannot meet.
+    The result is an affine form [W] in m/s; it is 0 if that pair cannot meet.
 
     Args:
         cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
         path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
         motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        speed: affine form [W] of the closing speed at the impact, m/s.
-        time: affine form [W] of the time of the impact of pair ``p``, s after the start of the piece.
+        speed: affine form [W] of the closing speed at the impact of pair ``p``, m/s.
+        time: affine form [W] of the time of that impact, s after the start of the piece.
         length: length of the piece, s.
 
     """
@@ -449,8 +448,7 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float
 
 @compiled(apart=True)
 def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
-    """Follow a path to its end. Return the maximum of ``worst``, its harm, and the harm of worlds whose harm is final
-    earlier.
+    """Follow a path to its end. Return the maximum of ``worst``, its harm, and the harm that branches off on the way.
 
     Args:
         cell: the box of worlds, with its commands and its pieces (time intervals of constant command).

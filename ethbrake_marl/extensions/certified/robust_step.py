@@ -114,7 +114,8 @@ class RobustShield(StepShield):
         return decision if boxes is None else certify_inside(boxes, now, memory.backup, budget, decision, asked)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Return a mask [n] of the worlds that may leave the range spanned by their members.
+        """Return a mask [n] of the worlds that may leave the range spanned by their members, now in the states
+        ``running``.
 
         Besides the worlds of ``StepShield``: worlds whose own latency is uncertain, because a decision then falls at a
         different time in each world of the box, and all worlds if one uncertain number moves several quantities

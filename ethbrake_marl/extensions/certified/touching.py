@@ -70,24 +70,28 @@ def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
 
 @compiled(apart=True)
 def apart(touch: Floats) -> float:
-    """Return the largest difference of speeds of a pair in contact, m/s, from its state ``touch`` (a row of
-    ``Path.touch``).
+    """Return the largest difference of speeds of a pair in contact, m/s. ``touch`` is its state, a row of
+    ``Path.touch``.
     """
     return float(max(touch[OPENING], touch[CLOSING], 0.0))
 
 
 @compiled(apart=True)
 def faster(cell: Cell, p: int) -> float:
-    """Return the largest factor, at least 1, by which impacts of pair ``p`` may make the front vehicle faster than the
-    rear one was.
+    """Return by which factor, at least 1, an impact may make the front vehicle of pair ``p`` faster than the rear one
+    was.
+
+    ``cell`` holds the coefficient of restitution and the shares of mass.
     """
     return float(max(1.0, (1.0 + cell.restitution) * high(cell.share[p, 0])))
 
 
 @compiled(apart=True)
 def backwards(cell: Cell, p: int) -> float:
-    """Return the largest backward speed of the rear vehicle of pair ``p`` after an impact, as a multiple (>= 0) of its
-    speed before.
+    """Return the largest backward speed of the rear vehicle of pair ``p`` after an impact, as a multiple of its speed
+    before.
+
+    It is at least 0. ``cell`` holds the coefficient of restitution and the shares of mass.
     """
     return float(max(0.0, (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0))
 
@@ -98,8 +102,7 @@ def stray(cell: Cell, touch: Floats, p: int) -> float:
 
     In a world that creeps (one of the two vehicles stands or moves backwards), the form's speed lies between 0 and
     ``CREEP``, the rear vehicle's between minus ``backwards`` and 1 times ``CREEP``, and the front vehicle's between 0
-    and
-    ``faster`` times ``CREEP``: no impact makes a rear vehicle faster.
+    and ``faster`` times ``CREEP``: no impact makes a rear vehicle faster.
 
     Args:
         cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
@@ -126,8 +129,8 @@ def blur(cell: Cell, path: Path, p: int, side: int) -> float:
 
 @compiled(apart=True)
 def begin_touch(touch: Floats) -> None:
-    """Reset ``touch``, the state of a pair in contact, in place, except the columns of the present piece (SPREAD,
-    REACH).
+    """Reset ``touch``, the state of a pair in contact, in place. The columns of the present piece (SPREAD, REACH)
+    stay.
     """
     spread, reach = touch[SPREAD], touch[REACH]  # columns of the present piece
     touch[:] = 0.0
@@ -181,27 +184,30 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
 
 @compiled(apart=True)
 def dip_of(cell: Cell, vague: float, length: float) -> float:
-    """Return by how much (m/s) a speed may fall below its values at both ends of a piece (time interval of constant
-    command).
+    """Return by how much (m/s) a speed may fall below its values at both ends of a piece.
 
     This can happen if the vehicle's force changes sign in it. ``vague`` is the largest deviation of the acceleration
-    from
-    its mean (m/s2), ``length`` the length of the piece (s).
+    from its mean (m/s2), ``length`` the length of the piece (s).
+
+    A piece is a time interval of constant command; ``cell`` is the box of worlds.
     """
     return 0.5 * vague * length if cell.moving else 0.0
 
 
 @compiled(apart=True)
 def own_pulls(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the least and the largest acceleration by the commands of either vehicle of pair ``p``, m/s2."""
+    """Return the least and the largest acceleration (m/s2) by the commands of either vehicle of pair ``p`` in a
+    piece.
+
+    ``motion`` is the motion of all vehicles in the piece (time interval of constant command).
+    """
     weakest = min(low(motion.pull[p]) - motion.vague[p], low(motion.pull[p + 1]) - motion.vague[p + 1])
     return weakest, max(high(motion.pull[p]) + motion.vague[p], high(motion.pull[p + 1]) + motion.vague[p + 1])
 
 
 @compiled(apart=True)
 def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, hardest: float, length: float) -> None:
-    """Update the state of a pair in contact for worlds that may creep, which means that one vehicle stands or moves
-    backwards.
+    """Update the state of a pair in contact for worlds that may creep: one of its vehicles stands or moves backwards.
 
     Args:
         cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
@@ -260,8 +266,7 @@ def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) 
 
 @compiled(apart=True)
 def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
-    """Separate pair ``p``, which was in contact and opens in the present piece: both vehicles move alone from now
-    on.
+    """Separate pair ``p``, which was in contact and opens in the present piece: both vehicles move alone from then on.
 
     Args:
         cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
@@ -337,8 +342,7 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
 
 @compiled(apart=True)
 def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: float, most: float) -> None:
-    """Start a new phase of a contact: the pair is now pressed together by an acceleration outside the range of the last
-    phase.
+    """Start a new phase of a contact: the pair is now pressed together harder or less hard than in the phase before.
 
     The new range covers both phases if the bound by flights allows it, else the new phase alone.
 

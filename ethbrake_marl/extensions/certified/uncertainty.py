@@ -116,11 +116,9 @@ class Uncertainty:
         """Return the members of worlds at the alert, [n * M]: each world followed by the corners of its box.
 
         The *box* of a world is the set of all values in its intervals. Corners come in the order of binary numbers; the
-        first
-        interval is the lowest bit. Intervals of width 0 add no
-        corners. Friction changes all capacities together and harm is not monotone in it, so it has eight values instead
-        of two ends. Raises ``InvalidInput`` for a vehicle that does not exist, a capacity or mass that may be 0, or
-        more than ``MOST_CORNERS`` corners.
+        first interval is the lowest bit. Intervals of width 0 add no corners. Friction changes all capacities together
+        and harm is not monotone in it, so it has eight values instead of two ends. Raises ``InvalidInput`` for a
+        vehicle that does not exist, a capacity or mass that may be 0, or more than ``MOST_CORNERS`` corners.
         """
         sides = self._sides(worlds)
         ends = [_OF_FRICTION if name == "friction" else (0.0, 1.0) for name, *_ in reversed(sides)]
@@ -158,8 +156,8 @@ class Uncertainty:
         return _placed(worlds, sides, lambda k: shares[k])
 
     def _sides(self, worlds: Worlds) -> list[_Side]:
-        """Return the uncertain numbers: for each, its quantity, its vehicle or pair, and its least and largest value
-        [n].
+        """Return the uncertain numbers of ``worlds``: quantity, index of vehicle or pair, least and largest value [n]
+        of each.
         """
         sides: list[_Side] = []
         for interval in self.intervals:
@@ -195,7 +193,7 @@ class Uncertainty:
 
 
 def parse_uncertainty(text: str) -> Uncertainty:
-    """Parse ``quantity=half-width`` entries separated by commas, for instance ``UNCERTAINTY_EXAMPLE``.
+    """Parse a text of ``quantity=half-width`` entries separated by commas, for instance ``UNCERTAINTY_EXAMPLE``.
 
     A half-width is a number in the quantity's unit, or a percentage of its value. ``.vehicle_2`` or ``.pair_1`` after
     the quantity limits the entry to one vehicle or pair. Blanks around entries and ``=`` are ignored. Raises

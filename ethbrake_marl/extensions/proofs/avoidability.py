@@ -63,9 +63,9 @@ def drive_before_braking(
     """Return how long a vehicle may drive with constant ``u >= 0`` so that full braking still keeps it behind the
     leader.
 
-    Returns its duration, the time at which the gap becomes 0, and whether both vehicles move at that time (then
-    ``a_f > a_l`` and the speeds are equal; else the follower stops at the standing leader). Infinite if the follower
-    never moves. Assumes ``spare_gap >= 0``.
+    Returns its duration, the time at which the gap becomes 0, and whether both vehicles move at that time (then ``a_f >
+    a_l`` and the speeds are equal; else the follower stops at the standing leader). Infinite if the follower never
+    moves. Assumes ``spare_gap >= 0``.
 
     Args:
         gap: gap to the leader (the vehicle in front, which brakes from now on), m.
@@ -100,11 +100,21 @@ def drive_before_braking(
 def largest_behind(
     gap: float, v_l: float, a_l: float, v_f: float, a_f: float, u: float, limit: float
 ) -> tuple[float, float, bool]:
-    """Return the values of ``drive_before_braking`` for a vehicle that stops driving at its speed limit ``limit``, m/s.
+    """Return how long a vehicle may drive, at most up to its speed limit, so that full braking still keeps it behind
+    the leader.
 
-    These are the duration of the longest drive (s), the time at which the gap becomes 0 (s), and whether both vehicles
-    move
-    then. The other arguments are those of ``drive_before_braking``.
+    The leader is the front vehicle, which brakes from now on. Also returns the time at which the gap becomes 0 (s), and
+    whether both vehicles move then.
+
+    Args:
+        gap: gap to the leader, m.
+        v_l: speed of the leader, m/s.
+        a_l: braking capacity of the leader, m/s2.
+        v_f: speed of the following vehicle, m/s.
+        a_f: its braking capacity, m/s2.
+        u: its driving acceleration, m/s2.
+        limit: its speed limit, m/s.
+
     """
     cap = time_to_limit(v_f, u, limit)
     if cap > 0.0:
@@ -171,8 +181,8 @@ def leader_at_onset(
 
 @compiled
 def decide_front(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: int, out: Floats) -> bool:
-    """Decide whether vehicle ``i`` stays behind the front vehicle by full braking. Return False if the pair certainly
-    meets.
+    """Decide whether vehicle ``i`` stays behind the front vehicle by full braking. Return False if it certainly does
+    not.
 
     Args:
         gap: [P] gaps, m.
@@ -201,7 +211,7 @@ def plan_behind(
     gap: Floats, speed: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, keep: float,
     plan: Floats, out: Floats,
 ) -> None:  # fmt: skip
-    """Write the trajectory that is farthest ahead at all times, but stays ``keep`` metres behind the front vehicle, to
+    """Write the trajectory that is farthest ahead at all times, but ``keep`` metres behind the front vehicle, to
     ``plan``.
 
     Args:
@@ -302,8 +312,7 @@ def decide_world(
 def decide_worlds(
     gaps: Floats, speeds: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, out: Floats
 ) -> None:
-    """Decide for each of ``n`` worlds whether vehicle ``i`` can avoid contact; write the verdicts to ``out`` [n,
-    RESULT_WIDTH].
+    """Decide for each of ``n`` worlds whether vehicle ``i`` can avoid contact; write the verdicts to ``out``.
 
     Args:
         gaps: [n, P] gaps, m.
@@ -326,20 +335,20 @@ REASONS = ("", "early", "front", "rear")  # name of each reason code; "" if cont
 
 @dataclass(frozen=True, slots=True)
 class Avoidability:
-    """Verdict on each world, [n].
+    """Verdict on each of ``n`` worlds: can the controlled vehicle avoid all contact?
 
-    ``reason``: 0 avoidable; 1 early: a pair meets before the controlled vehicle may act; 2 front: even full braking
-    meets the front vehicle; 3 rear: the rear vehicle meets the largest trajectory that avoids the front vehicle.
+    The *largest trajectory* is the one that is farthest ahead at all times without contact with the front vehicle.
+    ``margin_m`` is the smallest gap between it and the rear vehicle (for two vehicles with the rear one controlled: the
+    part of the gap that full braking does not need). If contact is unavoidable it is negative: for *front* the missing
+    gap, for *early* the overlap before the vehicle may act.
 
-    ``margin_m``: smallest gap between that trajectory and the rear vehicle (for two vehicles with the rear one
-    controlled: the part of the gap that full braking does not need). If contact is unavoidable it is negative: for
-    *front* the missing gap, for *early* the overlap before the vehicle may act.
-
-    ``switch_s``, ``command_mps2``: the witness, a command profile of the controlled vehicle that has no impact in the
-    physics. Each command applies from its absolute time to the next (infinite: never). NaN if contact is unavoidable.
+    ``switch_s`` and ``command_mps2`` are a witness: a command profile without an impact in the physics. Each command
+    applies from its absolute time to the next (infinite: never). They are NaN if contact is unavoidable.
     """
 
-    reason: Ints  # [n] 0 avoidable, 1 early, 2 front, 3 rear
+    # [n] 0: avoidable. 1, early: a pair meets before the controlled vehicle may act. 2, front: even full braking meets
+    # the front vehicle. 3, rear: the rear vehicle meets the largest trajectory
+    reason: Ints
     margin_m: Floats  # [n] smallest gap to the rear vehicle, m; negative if contact is unavoidable
     switch_s: Floats  # [n, 3] times from which on the commands of the witness apply, s
     command_mps2: Floats  # [n, 3] commands of the witness, m/s2

@@ -34,8 +34,7 @@ def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
     """Return the least closing speed of first contacts between the times ``early`` and ``late``, m/s.
 
     It falls with time, except if the leader (front vehicle) brakes harder than the controlled vehicle: it may then rise
-    by
-    the difference.
+    by the difference.
 
     Args:
         kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
@@ -58,8 +57,7 @@ def decision_around(at: Floats, early: float, late: float) -> tuple[float, float
     """Return start and end (s) of the decision step that holds both ``early`` and ``late``.
 
     Returns ``late`` twice if there are no decision steps, or if the times lie in more than one step. ``at`` is one
-    world
-    (columns of ``line.LINE``).
+    world (columns of ``line.LINE``).
     """
     step = at[LINE.TIME_STEP]
     if step <= 0.0:
@@ -75,8 +73,7 @@ def lacking(kind: int, at: Floats, early: float, late: float, softest: float, ha
     """Return how far the command in force at a first contact is from the best command after it, at least, in m/s2.
 
     Before a gentle contact the vehicle brakes (drives); to soften what follows it drives (brakes) after it. The command
-    is
-    the same in the whole decision step, so it cannot do both.
+    is the same in the whole decision step, so it cannot do both.
 
     Args:
         kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
@@ -287,11 +284,10 @@ def least_harm(
 
 @compiled
 def next_split(kind: int, at: Floats, time: float, last: float) -> float:
-    """Return the next time after ``time`` at which a decision is due or the front vehicle comes to rest, at most
-    ``last``, in s.
+    """Return the next time (s) at which a decision is due or the front vehicle comes to rest, at most ``last``.
 
-    With brake build-up it is at most ``_PART_S`` later. ``kind`` is the kind of contact, ``at`` one world (columns of
-    ``line.LINE``).
+    With brake build-up it is at most ``_PART_S`` later than ``time``. ``kind`` is the kind of contact (``FRONT_FIRST``,
+    ...), ``at`` one world (columns of ``line.LINE``).
     """
     until = last if kind < RAMPED_FRONT else min(last, time + _PART_S)
     if at[LINE.TIME_STEP] > 0.0:

@@ -40,8 +40,8 @@ def least_on_piece(constant: float, pressing: float, since: float, until: float)
 def least_before(at: Floats, met: float, squared: float) -> float:
     """Return the least closing speed (m/s) of a pair's first contact until ``met``, for a leader that follows a script.
 
-    At time t the closing speed is at least ``c(t) + g(t) / t``:
-    the closing speed of the extreme motions, and what must be added to it to use up their gap by then.
+    At time t the closing speed is at least ``c(t) + g(t) / t``: the closing speed of the extreme motions, and what must
+    be added to it to use up their gap by then.
 
     Args:
         at: [PAIR_WIDTH] one pair, columns ``PAIR_GAP`` to ``FOLLOWER_A``.

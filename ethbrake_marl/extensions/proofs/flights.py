@@ -14,8 +14,8 @@ from ethbrake_marl.physics.jit import compiled
 
 @compiled
 def flight_lead(share: float, press: float, reach: float, opening: float, flight: float) -> float:
-    """Return the speed that a flight gains for the controlled vehicle over the common speed of both, less its cost,
-    m/s.
+    """Return the speed (m/s) that a flight gains for the controlled vehicle over the common speed of both, less its
+    cost.
 
     A *flight* is a time in which the two vehicles are apart. For length L and opening speed o the lead over the common
     speed is ``share (press L - o) - G``. G is the least loss of command, at most ``reach`` per second, that keeps the
@@ -75,8 +75,7 @@ def lead(
     """Return the largest ``flight_lead`` (m/s) of flights from ``shortest`` to ``longest`` (s).
 
     A *flight* is a time in which the two vehicles are apart. The maximum is over all opening speeds up to ``opening``:
-    a
-    smaller one may lead further if flights are cut short.
+    a smaller one may lead further if flights are cut short.
 
     Args:
         share: partner's share of both masses, 0 to 1.
@@ -128,8 +127,8 @@ def largest_lead(
     share: float, press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float,
     since: float, until: float,
 ) -> float:  # fmt: skip
-    """Return by how much the controlled vehicle can be faster than both vehicles' common speed (without loss), at most,
-    in m/s.
+    """Return by how much (m/s), at most, the controlled vehicle is faster than the common speed of both vehicles
+    (without loss).
 
     The last time apart before the meeting with the rear vehicle began with the first impact, within the window from
     ``late`` to ``end``, or after it.

@@ -48,12 +48,10 @@ def least_closing(
     start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, share: float,
     press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float, until: float,
 ) -> float:  # fmt: skip
-    """Return the least closing speed (m/s) of a second meeting until ``until``: from the common speed, less the lead
-    over it.
+    """Return the least closing speed (m/s) of a second meeting until ``until``.
 
     The common speed is the speed of the centre of mass of the two vehicles that met first. The time is divided at one
-    of a
-    few moments, because a loss of speed in the window counts only after it.
+    of a few moments, because a loss of speed in the window counts only after it.
 
     Args:
         start: closing speed of the common speed at the first meeting, m/s.
@@ -94,9 +92,8 @@ def pushed_by_leader(
     """Return the least closing speed (m/s) at the rear pair after a first contact with the front vehicle (leader).
 
     The bound follows from the centre of mass of leader and controlled vehicle. Returns 0 if nothing is proven. A
-    standing
-    leader stays in place, so a later first contact with it differs only in time; the window with the loss is then not
-    used.
+    standing leader stays in place, so a later first contact with it differs only in time; the window with the loss is
+    then not used.
 
     Args:
         at: one world, as the columns of ``line.LINE``.

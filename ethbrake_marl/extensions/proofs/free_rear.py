@@ -59,8 +59,8 @@ def gained(near: float, time: float, since: float, power: float) -> float:
 
 @compiled
 def behind_full_braking(at: Floats, early: float, late: float) -> float:
-    """Return the least gap to the rear vehicle if the controlled vehicle brakes until ``early``, the rear one until
-    ``late``, m.
+    """Return the least gap (m) to the rear vehicle if the controlled vehicle brakes until ``early``, the rear one until
+    ``late``.
 
     ``at`` is one world (columns of ``line.LINE``); the times are in s.
     """
@@ -99,8 +99,7 @@ def after_behind(
     """Return the least squared closing speed (m2/s2) at the front pair after a first contact with the rear vehicle.
 
     The bound starts from a state at ``early`` that is at every later time no further and no faster than after any of
-    these
-    contacts.
+    these contacts.
 
     Args:
         at: one world, as the columns of ``line.LINE``.
@@ -142,8 +141,9 @@ def put_behind(
     at: Floats, early: float, late: float, near: float, far: float, soft: float, hard: float, search: Floats,
     count: int, moved: Floats, plan: Floats, other: Floats, heap: Floats,
 ) -> int:  # fmt: skip
-    """Add a range of first contacts with the rear vehicle to the heap if it may do less harm than the best; return its
-    new size.
+    """Add a range of first contacts with the rear vehicle to the heap if it may do less harm than the best one known.
+
+    Returns the new number of entries on the heap.
 
     Args:
         at: one world, as the columns of ``line.LINE``.

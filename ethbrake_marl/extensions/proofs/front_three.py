@@ -63,12 +63,11 @@ def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Float
 
 @compiled(apart=True)
 def late_meetings(at: Floats, first: float, stand: float, plan: Floats, other: Floats) -> int:
-    """Return a code: may the first contact with the rear vehicle come after the rear vehicle would stand by full
+    """Return a code: may the rear vehicle first touch the controlled one after the time at which it would stand by
     braking?
 
     0: it cannot. 1: it may, and the harm is then no less than if the front vehicle is met first. 2: it may, and nothing
-    is
-    proven.
+    is proven.
 
     Args:
         at: one world, as the columns of ``line.LINE``.

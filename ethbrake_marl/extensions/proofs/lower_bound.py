@@ -99,8 +99,8 @@ def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) ->
 
 @compiled(apart=True)
 def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, other: Floats) -> float:
-    """Return the latest time (s), at most ``last``, of a first contact with one neighbour before the other one has
-    arrived.
+    """Return the latest time (s) of a first contact with one neighbour at which the other neighbour has not arrived
+    yet.
 
     The later the contact, the shorter the drive (the braking) before it, and the less room behind (ahead).
 
@@ -109,7 +109,7 @@ def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, o
             brake build-up).
         at: one world, as the columns of ``line.LINE``.
         first: time of a first contact at which there is room, s.
-        last: latest time of a first contact with this neighbour, s.
+        last: latest time of a first contact with this neighbour, s; the result is at most this.
         plan: working memory for one plan.
         other: working memory for a second plan.
 
@@ -127,8 +127,8 @@ def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, o
 
 @compiled(apart=True)
 def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple[float, float, bool]:
-    """Return the latest contact with the front vehicle (s), and the latest one at which the front vehicle is met first
-    (s).
+    """Return the latest contact (s) with the front vehicle, and the latest one before any contact with the rear
+    vehicle.
 
     The third result says whether the front vehicle may be met first arbitrarily late and softly.
 
@@ -299,8 +299,8 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def last_rest(at: Floats) -> tuple[float, float]:
-    """Return the time (s) at which all harm is over if all brake, and the time (s) at which the rear vehicle stands by
-    braking.
+    """Return the time (s) by which all harm has happened if all brake, and the time (s) at which the rear vehicle
+    stands.
 
     ``at`` is one world (columns of ``line.LINE``).
     """

@@ -26,8 +26,8 @@ _GUARD = 2.0**-46  # relative allowance for rounding of positions, so that no me
 
 @compiled(apart=True)
 def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
-    """Return the least closing speed (m/s) of a first contact with the front vehicle at ``time``, and how long to drive
-    first (s).
+    """Return the least closing speed (m/s) of a contact with the front vehicle at ``time``, and how long to drive first
+    (s).
 
     The slowest way to be there at that time is to drive, then to brake. ``at`` is one world (columns of ``line.LINE``).
     """
@@ -50,7 +50,7 @@ def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
 
 @compiled
 def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, float]:
-    """Return distance (m) and speed (m/s) at ``time`` of the controlled vehicle if it brakes for ``brake`` s, then
+    """Return distance (m) and speed (m/s) of the controlled vehicle at ``time`` if it brakes for ``brake`` s, then
     drives.
 
     It brakes at most to rest. ``at`` is one world (columns of ``line.LINE``).
@@ -90,8 +90,8 @@ def braking_to_rear(at: Floats, time: float, further: float) -> float:
 
 @compiled(apart=True)
 def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
-    """Return the least closing speed (m/s) of a first contact with the rear vehicle at ``time``, and how long to brake
-    first (s).
+    """Return the least closing speed (m/s) of a contact with the rear vehicle at ``time``, and how long to brake first
+    (s).
 
     The fastest way to be there at that time is to brake, then to drive. The braking is infinite if the vehicle is then
     at its speed limit. ``at`` is one world (columns of ``line.LINE``).

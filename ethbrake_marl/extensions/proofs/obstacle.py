@@ -41,8 +41,7 @@ def all_three(at: Floats) -> tuple[float, float, float, float]:
     (m/s2).
 
     Masses are in units of the controlled vehicle's mass. The fourth result is the part of that deceleration that comes
-    from
-    the rear vehicle (m/s2). ``at`` is one world (columns of ``line.LINE``).
+    from the rear vehicle (m/s2). ``at`` is one world (columns of ``line.LINE``).
     """
     front, rear = at[LINE.FRONT_SHARE] / (1.0 - at[LINE.FRONT_SHARE]), at[LINE.REAR_SHARE] / (1.0 - at[LINE.REAR_SHARE])
     whole = front + 1.0 + rear
@@ -102,10 +101,10 @@ def least_beyond(
 
 @compiled(apart=True)
 def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float, float, float]:
-    """Return the least position (m) and speed (m/s) at ``late`` of a braking vehicle after its first contact, and its
-    brakes (m/s2).
+    """Return the least position (m) and speed (m/s) at ``late`` of a vehicle that brakes after its first contact.
 
-    The brakes are the hardest of all three vehicles, so that no vehicle falls further behind.
+    The third result is its deceleration (m/s2): the hardest of all three vehicles, so that no vehicle falls further
+    behind.
 
     Args:
         at: one world, as the columns of ``line.LINE``.
@@ -153,8 +152,7 @@ def stopped_there(
     time.
 
     These are its largest distance from the obstacle (m; infinite if it is not known), its largest backward speed (m/s)
-    and
-    the largest time it spends there (s).
+    and the largest time it spends there (s).
 
     Args:
         at: one world, as the columns of ``line.LINE``.
@@ -199,8 +197,7 @@ def behind_leader(
     """Return the least squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
 
     Nobody passes the front vehicle, which hits the obstacle with at most ``sqrt(beyond)``. Returns LARGE if such a
-    course
-    is impossible.
+    course is impossible.
 
     Args:
         at: one world, as the columns of ``line.LINE``.
@@ -324,8 +321,7 @@ def after_at_obstacle(
 def beyond_rear(
     at: Floats, early: float, late: float, closing: float, least: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least squared speed (m2/s2) with which the front vehicle hits the obstacle after the rear vehicle was
-    met first.
+    """Return the least squared speed (m2/s2) of the front vehicle at the obstacle after the rear vehicle was met first.
 
     Args:
         at: one world, as the columns of ``line.LINE``.

@@ -106,8 +106,8 @@ def fill_brake_then_drive(plan: Floats, v: float, u: float, limit: float, brake:
 
 @compiled
 def piece_at(plan: Floats, now: float, v: float) -> tuple[float, float, bool]:
-    """Return the acceleration in force at time ``now`` (m/s2), until when it lasts (s), and whether it ends because the
-    vehicle stops.
+    """Return the acceleration in force at ``now`` (m/s2), the time at which it ends (s), and whether the vehicle then
+    stops.
 
     ``plan`` [2, PIECES] is the vehicle's acceleration profile, ``v`` its speed at ``now`` (m/s).
     """
@@ -128,13 +128,12 @@ def piece_at(plan: Floats, now: float, v: float) -> tuple[float, float, bool]:
 def walk(
     gap: float, v_front: float, front: Floats, v_rear: float, rear: Floats, until: float
 ) -> tuple[float, float, float]:
-    """Follow two vehicles until ``until``. Return their smallest gap, and time and squared closing speed of their first
+    """Follow two vehicles until ``until``. Return their smallest gap, and time and squared closing speed of their
     contact.
 
     Units are m, s and m2/s2. The time is infinite and the speed 0 if they do not meet. The two pass through each other,
-    so
-    a negative smallest gap is the depth of the overlap. If the gap reaches 0 and opens again, that is no contact; if it
-    would become an overlap, it is a contact with closing speed 0. Needs speeds >= 0.
+    so a negative smallest gap is the depth of the overlap. If the gap reaches 0 and opens again, that is no contact; if
+    it would become an overlap, it is a contact with closing speed 0. Needs speeds >= 0.
 
     Args:
         gap: gap now, m.

@@ -45,12 +45,11 @@ def fill_follower(at: Floats, plan: Floats) -> None:
 
 @compiled
 def range_of(sign: float, at: Floats) -> tuple[float, float, float, float]:
-    """Return the range of the controlled vehicle's force times ``sign``: largest, its rate, size of the least, its
+    """Return the range of the controlled vehicle's force times ``sign``: largest force, its rate, least force, its
     rate.
 
-    A *force* is an acceleration in m/s2; rates are in m/s3. With ``sign`` 1 the largest force is full drive, with -1 it
-    is
-    full braking. ``at`` is one world (columns of ``line.LINE``).
+    A *force* is an acceleration in m/s2; the least one is returned as a positive size. Rates are in m/s3. With ``sign``
+    1 the largest force is full drive, with -1 it is full braking. ``at`` is one world (columns of ``line.LINE``).
     """
     if sign > 0.0:
         return at[LINE.U_F], at[LINE.RISE_F], at[LINE.A_F], at[LINE.FALL_F]
@@ -81,12 +80,10 @@ def fill_controlled(at: Floats, sign: float, switch: float, time: float, final: 
 def switch_for(
     at: Floats, sign: float, time: float, place: float, final: float, halvings: int, plan: Floats
 ) -> tuple[float, float, float]:
-    """Return two times (s) that enclose the switch which leads the controlled vehicle to ``place`` at ``time``, and its
-    speed there.
+    """Return two times (s) just before and after the switch that leads the controlled vehicle to ``place`` at ``time``.
 
-    The *switch* is the time at which its force (acceleration times ``sign``) turns from rising to falling. The speed
-    (m/s)
-    belongs to the earlier switch.
+    The *switch* is the time at which its force (acceleration times ``sign``) turns from rising to falling. The third
+    result is the speed (m/s) at ``time`` after the earlier switch.
 
     Args:
         at: one world, as the columns of ``line.LINE``.
@@ -198,8 +195,7 @@ def gentlest_ramped_between(kind: int, at: Floats, early: float, late: float) ->
 
 @compiled(apart=True)
 def force_of_meeting(kind: int, at: Floats, early: float, late: float, hard: float) -> float:
-    """Return the largest acceleration at ``early`` (m/s2) of the controlled vehicle with which a contact can be as soft
-    as ``hard``.
+    """Return the largest acceleration (m/s2) of the controlled vehicle at which a contact can be as soft as ``hard``.
 
     The result is times the sign: 1 for contacts with the front vehicle, -1 for the rear one.
 
@@ -375,8 +371,7 @@ class LowerBound:
 def at_onset_of(
     where: str, worlds: Worlds, vehicles: Ints, harm_count: HarmCount, horizon_s: float
 ) -> tuple[Worlds, Floats, Floats, Bools]:
-    """Return the worlds at the moment when the first of ``vehicles`` may act, that time, the harm until then, and a
-    mask of pairs.
+    """Return the worlds when the first of ``vehicles`` may act, that time, the harm until then, and a mask of pairs.
 
     The time is [n] s, the harm [n] m2/s2. The mask [n, P] is True for pairs whose next impact counts and whose vehicles
     move forward.
@@ -402,7 +397,12 @@ def at_onset_of(
 def check_asked(where: str, harm_count: str, horizon_s: object, time_step_s: object) -> None:
     """Raise ``InvalidInput`` for an unknown harm count, a horizon that is not a number, or an invalid time step.
 
-    ``where`` is the name of the caller, which begins the error message.
+    Args:
+        where: name of the caller, which begins the error message.
+        harm_count: must be ``first`` or ``total``.
+        horizon_s: must be a number.
+        time_step_s: must be None or a number of at least ``LEAST_TIME_STEP_S``.
+
     """
     check_harm_count(harm_count)
     if not _is_number(horizon_s):
@@ -418,18 +418,17 @@ def _is_number(value: object) -> bool:
 
 
 def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -> Floats:
-    """Return the largest difference between a bound and the simulated harm that floating-point arithmetic can cause;
-    [n] m2/s2.
+    """Return how far apart floating-point arithmetic can bring a bound and the simulated harm, at most; [n] m2/s2.
 
     A squared closing speed is ``D = w^2 + 2 b g``. Let ``V`` be the largest speed in the line, ``G`` the sum of its
     gaps (plus ``way_m`` [n]), ``A`` the largest closing acceleration and ``a`` the weakest brakes. Then ``w^2`` is at
     most ``V^2``, and no gap grows beyond ``G + V^2 / 2a`` (plus ``V a / r`` if brakes build up at rate r), so all terms
-    of D stay below ``S = V^2 (1 + A / a) + 2 A G``.
-    A segment of motion rounds each speed twice and each gap five times; a round of impacts rounds each speed by up to
-    8 eps of the largest speed. Either changes D by at most 8 eps S. These errors add up and do not multiply, because
-    the proofs compare a motion with itself. ``BOUND_EPS`` covers 500 of them: an episode of 8 s has 80 steps, and the
-    bound's own arithmetic is a few hundred roundings. For several vehicles (a team) the largest speed is a speed limit
-    if any of them may drive, and the largest closing acceleration uses the strongest drive.
+    of D stay below ``S = V^2 (1 + A / a) + 2 A G``. A segment of motion rounds each speed twice and each gap five
+    times; a round of impacts rounds each speed by up to 8 eps of the largest speed. Either changes D by at most 8 eps
+    S. These errors add up and do not multiply, because the proofs compare a motion with itself. ``BOUND_EPS`` covers
+    500 of them: an episode of 8 s has 80 steps, and the bound's own arithmetic is a few hundred roundings. For several
+    vehicles (a team) the largest speed is a speed limit if any of them may drive, and the largest closing acceleration
+    uses the strongest drive.
 
     Args:
         worlds: the worlds, [n].

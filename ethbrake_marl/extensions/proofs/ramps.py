@@ -96,8 +96,8 @@ def fill_switch(
 
 @compiled
 def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, float, float, float]:
-    """Return acceleration (m/s2) and jerk (m/s3) in force at ``now``, the time at which they end (s), and the speed
-    reached then.
+    """Return acceleration (m/s2) and jerk (m/s3) in force at ``now``, when they end (s), and the speed reached then
+    (m/s).
 
     That speed is NaN if the interval ends otherwise than at rest or at the speed limit.
 
@@ -163,8 +163,8 @@ def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, f
 
 @compiled
 def force_of(plan: Floats, now: float) -> float:
-    """Return the force (acceleration, m/s2) that a plan [3, LEGS] commands at time ``now`` (s), also if the vehicle is
-    at rest.
+    """Return the force (acceleration, m/s2) that a plan [3, LEGS] commands at ``now`` (s), even for a vehicle at
+    rest.
     """
     return leg_at(plan, now, 1.0, math.inf)[0]
 
@@ -200,8 +200,7 @@ def meeting(
     gap: float, slack: float, v_front: float, front: Floats, front_limit: float, v_rear: float, rear: Floats,
     rear_limit: float, since: float, until: float,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Return the time at which two vehicles first meet after ``since``, their closing speed w, and the least forced
-    closing speed.
+    """Return the time at which two vehicles first meet, their closing speed w then, and the least forced closing speed.
 
     Returns inf, 0, 0 if they never meet. The last value is the least of ``w + (gap - slack) / t`` until then, t counted
     from ``since``. It bounds every motion of the pair that is never behind these two, is ``slack`` nearer at ``since``,

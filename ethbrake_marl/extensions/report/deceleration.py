@@ -62,9 +62,9 @@ class DecelerationCurve:
 def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> DecelerationCurve:
     """Compute predicted, first-impact and total harm of one world at many constant decelerations of one vehicle.
 
-    The decelerations are ``points`` evenly spaced ones and the breakpoints of the pairwise closed form.
-    The prediction assumes that all others brake fully; in the simulation they follow the scenario's scripts. Raises
-    ``InvalidInput`` unless there is exactly one world, ``points`` is at least 2 and every script is fixed at the alert.
+    The decelerations are ``points`` evenly spaced ones and the breakpoints of the pairwise closed form. The prediction
+    assumes that all others brake fully; in the simulation they follow the scenario's scripts. Raises ``InvalidInput``
+    unless there is exactly one world, ``points`` is at least 2 and every script is fixed at the alert.
 
     Args:
         world: the world at the alert, n = 1.
@@ -154,10 +154,8 @@ def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
     """Draw predicted and simulated harm of one world against the constant deceleration of one vehicle.
 
     Top: the three curves, the decelerations that E-V2X-BM chooses (by the closed form, and by simulation for both
-    counts),
-    and level lines at the best known harm of any profile, if known. Bottom: how each pair alone first meets. ``title``
-    is
-    written above; if empty, the name of the scenario.
+    counts), and level lines at the best known harm of any profile, if known. Bottom: how each pair alone first meets.
+    ``curve`` is the result of ``deceleration_curve``; ``title`` is written above, if empty the name of the scenario.
     """
     scenario, vehicle = curve.task.scenario, curve.task.vehicle
     figure = new_figure(8.0, 5.4)

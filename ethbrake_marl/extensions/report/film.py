@@ -75,8 +75,8 @@ def film(world: Worlds, agents: Mapping[str, Driver], ending: str, *, scenario: 
 
 
 def film_bytes(films: Films, ending: str, *, fps: int = FILM_FPS) -> bytes:
-    """Return films of one world, one below the other, in real time, as the bytes of a file: an endless GIF or SVG, or
-    an MP4.
+    """Return films of one world, one below the other, in real time, as the bytes of a GIF, SVG (both endless) or MP4
+    file.
 
     A film that ends before the others keeps showing its end. Raises ``InvalidInput`` without films, for more than
     ``MOST_FILMS`` films or ``MOST_PICTURES`` pictures, for an ``ending`` other than ``.gif``, ``.mp4`` and ``.svg``,

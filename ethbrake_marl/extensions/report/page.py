@@ -55,7 +55,7 @@ class Part:
 
     @classmethod
     def facts(cls, found: Mapping[str, object]) -> Part:
-        """Return names and their values as a list, one below the other."""
+        """Return names and their values as a list, one below the other; ``found`` maps names to values."""
         lines = [Markup("<dt>{}</dt><dd>{}</dd>").format(shown(name), _text(value)) for name, value in found.items()]
         return cls(Markup("<dl>\n{}\n</dl>\n").format(Markup("\n").join(lines)))
 
@@ -280,7 +280,7 @@ class Page:
 
     @staticmethod
     def anchors(titles: Sequence[str]) -> list[str]:
-        """Return a unique link name for each title, of letters, digits and hyphens."""
+        """Return a unique link name for each title, of letters, digits and hyphens, for instance "worst-ten-worlds"."""
         found: list[str] = []
         for k, title in enumerate(titles):
             name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:40]

@@ -64,8 +64,7 @@ _SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the varian
 
 
 def is_papers_test(task: Task, seed: int | None) -> bool:
-    """Return whether results can stand beside the paper's rows: Vehicle 2 in a list of the paper's random test, as
-    shipped.
+    """Return whether the paper's rows apply: Vehicle 2 is controlled in a list of the paper's random test, as shipped.
 
     ``task`` is the evaluated task, ``seed`` the seed of the list of worlds; None: unknown.
     """

@@ -75,8 +75,7 @@ def _impacts(motion: EpisodeMotion) -> list[list[float]]:
     """Return each impact as a list: time, pair, closing speed, 1 if first, number, first-impact and total harm so far.
 
     Of several impacts of a pair within ``_BIN_S`` only the last is kept. The harm after the last impact equals the
-    ledger
-    exactly.
+    ledger exactly.
     """
     rows = motion.impacts
     order = np.argsort(rows.time_s, kind="stable")

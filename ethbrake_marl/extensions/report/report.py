@@ -159,8 +159,7 @@ class Report:
         """Return the report with episodes to watch and with the section on shields.
 
         For the episodes every agent drives once more. Shields are measured in the first ``SHIELD_WORLDS`` worlds, in
-        every mode
-        and without a shield.
+        every mode and without a shield.
 
         Args:
             agents: the evaluated agents by name; they are not changed.
@@ -238,8 +237,7 @@ class Report:
         fails.
 
         It fails in another test where it does no less harm than full braking. If it fails in none, the share of worlds
-        in which
-        it does more harm is named.
+        in which it does more harm is named.
         """
         rows, harm = {row.agent: row for row in self.rows}, NAMES[self.harm_count]
         if self.about not in rows:
@@ -380,14 +378,17 @@ def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
 
 
 def _empty(rows: SummaryTable) -> list[str]:
-    """Return the headings of the columns in which no row has a value."""
+    """Return the headings of the columns of a summary in which no row has a value."""
     sheet = rows.sheet()
     filled = sheet.filled()
     return [name for k, name in enumerate(sheet.headings) if k not in filled]
 
 
 def _table(sheet: Sheet, caption: str, names: set[str]) -> Part:
-    """Return a table of the first column (the agent) and the columns in ``names``; empty columns are left out."""
+    """Return part of ``sheet`` as a table: its first column (the agent) and the columns in ``names`` that have a value.
+
+    ``caption`` is the title of the table.
+    """
     filled = set(sheet.filled())
     some = sheet.only(k for k, name in enumerate(sheet.names) if k == 0 or (name in names and k in filled))
     rows = [

@@ -56,8 +56,7 @@ def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
     """Draw the distribution of each quantity that varies, the most important ones in pairs, and three worlds to scale.
 
     Pairs show quantities of the first learner, and of the pair ahead of it, before quantities of other vehicles.
-    Colours
-    separate the scenarios of a mixture, or the types of the first learner.
+    Colours separate the scenarios of a mixture, or the types of the first learner.
 
     Args:
         scenario: the scenario of the worlds.

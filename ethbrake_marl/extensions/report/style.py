@@ -49,8 +49,8 @@ class ShownFigure(Figure):
     """A figure that a notebook displays, with or without pyplot."""
 
     def draw(self, renderer: RendererBase) -> None:
-        """Draw the figure. The first of the two drawings of a saved file only computes the layout, because it is thrown
-        away.
+        """Draw the figure. Saving a file draws twice; the first time only computes the layout, because nothing else is
+        kept.
         """
         engine = self.get_layout_engine()
         if self.axes and isinstance(engine, ConstrainedLayoutEngine) and self.canvas.is_saving():
@@ -72,9 +72,7 @@ def series_style(number: int) -> dict[str, Any]:
 
 
 def label_text(text: str, most: int = 40) -> str:
-    """Return text that is safe in a figure: no formula, no character that the font lacks, at most ``most``
-    characters.
-    """
+    """Return text that is safe in a figure: no formula, only characters that the font has, at most ``most`` of them."""
     signs = font_signs()
     told = "".join(c if ord(c) in signs else c.encode("unicode_escape").decode() for c in plain_text(text))
     return (told if len(told) <= most else f"{told[: most - 16]}…{told[-15:]}").replace("$", r"\$")
@@ -92,8 +90,9 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def style_axes(axes: Axes, labelsize: float = 9) -> None:
-    """Set a thin grid behind the data, and remove the top and right frame lines. ``labelsize`` is the font size of
-    ticks.
+    """Set a thin grid behind the data, and remove the top and right frame lines.
+
+    ``labelsize`` is the font size of the numbers at the ticks.
     """
     axes.grid(visible=True, color="#dddddd", linewidth=0.6)
     axes.set_axisbelow(True)
@@ -114,7 +113,7 @@ def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **
 
 
 def name_axes(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
-    """Set the title of a panel and the labels of its x and y axis; empty texts are left out."""
+    """Set the title of a panel and the labels ``x`` and ``y`` of its axes; empty texts are left out."""
     in_style = ((title, partial(axes.set_title, loc="left"), 10), (x, axes.set_xlabel, 9), (y, axes.set_ylabel, 9))
     for text, write, size in in_style:
         if text:
@@ -197,7 +196,8 @@ TITLES = {"first": "First-impact harm (m²/s²)", "total": "Total harm (m²/s²)
 
 
 def plain(value: float, _: int) -> str:
-    """Format the number at a tick of an axis without powers of ten. The second argument, the tick's index, is not
-    used.
+    """Format the number at a tick of an axis without powers of ten.
+
+    The second argument, the index of the tick, is not used.
     """
     return f"{value:g}"

@@ -22,9 +22,7 @@ TESTS = {
 
 
 def is_as_shipped(scenario: Scenario) -> bool:
-    """Return whether the scenario equals the shipped scenario of the same name, apart from title, description and
-    source.
-    """
+    """Return whether the scenario equals the shipped one of the same name, apart from title, description and source."""
     one, other = (
         each.model_dump(exclude={"title", "description", "source"}) for each in (scenario, load_scenario(scenario.name))
     )

@@ -60,8 +60,9 @@ def road_figure(records: Mapping[str, EpisodeRecord], *, caption: str) -> Figure
     """Draw trajectories as the paper does: vehicle against position on the road, with an arrow every ten time steps.
 
     Dashed lines join the positions of all vehicles at the same time. ``records`` are episodes by the title of their
-    panel;
-    there are two panels in a row.
+    panel; there are two panels in a row.
+
+    ``caption`` is the text below the figure.
     """
     figure, panels = _in_pairs(len(records), 1.9, "Position along the road (m)", "Vehicle")
     for axes, (title, record) in zip(panels, records.items(), strict=False):
@@ -113,6 +114,8 @@ def changes_figure(changes: Mapping[str, Mapping[str, Estimate]], *, x_label: st
     """Draw by how much each change moves a number: one row per change, one mark per label, with its 95 % interval.
 
     ``changes`` maps the name of a change to the differences, by label.
+
+    ``x_label`` is the label of the x axis, ``caption`` the text below the figure.
     """
     rows = list(changes)
     labels = list(dict.fromkeys(label for each in changes.values() for label in each))

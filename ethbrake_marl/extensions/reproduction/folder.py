@@ -129,9 +129,7 @@ class Parameter:
 
 
 def stated(name: str, value: str, where: str) -> Parameter:
-    """Return a parameter that the paper states at the place ``where``; if ``where`` is empty, the value is our
-    default.
-    """
+    """Return a parameter with the place where the paper states it; if ``where`` is empty, the value is our default."""
     return Parameter(name, value, f"stated in the paper ({where})") if where else Parameter(name, value)
 
 
@@ -211,7 +209,7 @@ class Item:
 
 
 def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return a CSV file as text, with ``head`` as its first line.
+    """Return a CSV file as text: the line ``head``, then ``rows``.
 
     An ``Estimate`` in a row fills three columns: value, low, high; ``head`` needs a name for each of them.
     """
@@ -243,8 +241,7 @@ def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
     """Return the quantities of a scenario as parameters, each with its origin.
 
     ``places`` maps keys of the scenario to the place where the paper states them, if that is not the usual one; an
-    empty
-    text marks our default.
+    empty text marks our default.
     """
     content = scenario.model_dump(mode="json", exclude_none=True)
     found = [
@@ -257,7 +254,7 @@ def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
 
 
 def list_parameter(episodes: int, where: str = "") -> Parameter:
-    """Return the number of worlds and the seed of their list as a parameter.
+    """Return the number of worlds, ``episodes``, and the seed of their list as a parameter.
 
     The paper states the number at ``where`` (empty: our default). The seed is ours: the paper only says "a fixed random
     seed".

@@ -66,10 +66,9 @@ def by_distance(evaluation: Evaluation) -> tuple[list[float], Groups]:
 
 
 def less_in_each(groups: Groups, smaller: str, *larger: str) -> list[Less]:
-    """Return comparisons, paired by world: in every group of worlds, does strategy ``smaller`` do less harm than each
-    ``larger``?
+    """Return comparisons: does strategy ``smaller`` do less harm than each of ``larger``, in every group of worlds?
 
-    ``groups`` maps the name of a group to the harm [n] of each strategy.
+    They are paired by world. ``groups`` maps the name of a group to the harm [n] of each strategy.
     """
     return [
         Less.of_harms(group if len(larger) == 1 else f"{group}, {other}", harm, smaller, other)
@@ -177,9 +176,7 @@ _ONE, _LIST = "d = 7, 7 m; v = 20, 18, 20 m/s", "d = 5-10 m; v = 18-22 m/s"
 
 
 def reproduce_delays(settings: Reproduction) -> Made:
-    """Reproduce the harm of the four strategies at three delays, in the world of the paper's figure and in a list of
-    worlds.
-    """
+    """Reproduce the harm of the four strategies at three delays, in the world of the paper's figure and in a list."""
     episodes = min(_DELAY_WORLDS, settings.episodes)
     found: dict[tuple[str, str], Groups] = {}  # by worlds and reading
     for reading in READINGS:

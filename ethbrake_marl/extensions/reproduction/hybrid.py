@@ -48,8 +48,13 @@ _ALONE, _REALISED, _AS_PRINTED = "policy alone", "hybrid, realised H*", "hybrid,
 def _drive_hybrid(name: str, settings: Reproduction, reading: Reading) -> Evaluation:
     """Evaluate E-V2X-BM, a policy that has not converged, and the paper's hybrid of both on a list of worlds.
 
-    The *hybrid* is the paper's Algorithm 1: it chooses one of the two at the alert. ``name`` is a shipped scenario,
-    ``reading`` the assumption on when Vehicle 2 may act.
+    The *hybrid* is the paper's Algorithm 1: it chooses one of the two at the alert.
+
+    Args:
+        name: name of a shipped scenario.
+        settings: settings of the reproduction, with the number of worlds.
+        reading: assumption on when Vehicle 2 may act.
+
     """
     return _driven_hybrid(name, settings, reading, unconverged_policy(settings)[1])
 
@@ -72,12 +77,10 @@ def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: s
 
 
 def reproduce_illustration(settings: Reproduction) -> Made:
-    """Reproduce the harm of E-V2X-BM, a policy that has not converged, and the hybrid of both against the sum of both
-    gaps.
+    """Reproduce the harm of E-V2X-BM, a policy that has not converged, and the hybrid of both, against the sum of gaps.
 
     The *hybrid* is the paper's Algorithm 1: it chooses one of the two at the alert. The paper's claim that it
-    "consistently
-    selects the strategy that results in lower harm" is judged in each world and in each group.
+    "consistently selects the strategy that results in lower harm" is judged in each world and in each group.
     """
     found, verdicts = {}, []
     for reading in READINGS:

@@ -29,8 +29,8 @@ from ethbrake_marl.files.store import write_file, write_output
 
 
 def choose_items(names: Sequence[str]) -> list[Item]:
-    """Return the items (figures and tables of the paper) with these names, in the order of the paper; without names,
-    all.
+    """Return the items (figures and tables of the paper) with these names, in the order of the paper; all without
+    names.
 
     Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for a repeated name.
     """
@@ -46,7 +46,8 @@ def choose_items(names: Sequence[str]) -> list[Item]:
 def open_folder(asked: Reproduction, *, force: bool = False) -> StudyFolder:
     """Return the folder of a reproduction as a ``StudyFolder``, which continues an earlier one with the same settings.
 
-    With ``force`` the results in it are deleted; its trainings stay. Raises ``InvalidInput`` if the folder is a link.
+    ``asked`` are the settings. With ``force`` the results in the folder are deleted; its trainings stay. Raises
+    ``InvalidInput`` if the folder is a link.
     """
     path, question = asked.folder, {"episodes": asked.episodes, "version": __version__}
     if path.is_symlink():

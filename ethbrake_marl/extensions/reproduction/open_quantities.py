@@ -137,9 +137,7 @@ class Headline:
 
 
 def reproduce_gaps(settings: Reproduction) -> Made:
-    """Make the table of sensitivities: every open quantity, our default, alternatives, and how far the main results
-    move.
-    """
+    """Make the table of sensitivities: every open quantity, our default, alternatives, and how far the results move."""
     episodes, scenario = min(2_000, settings.episodes), load_scenario(RANDOM)
     base = _measure(scenario, Alternative("default"), episodes)
     measured = [gap for gap in GAPS if gap.alternatives]

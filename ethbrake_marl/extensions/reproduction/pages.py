@@ -33,8 +33,7 @@ def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
     """Return four texts on the results and the run that made them.
 
     These are the lead sentence; the command that makes the results; date, machines and processor time; and a list with
-    a
-    remark if lists are shorter than the paper's, else empty.
+    a remark if lists are shorter than the paper's, else empty.
     """
     every = len(results) == len(ITEMS)
     most = max((result.episodes for result in results), default=MOST_EPISODES)
@@ -121,7 +120,7 @@ FIGURES, PREFIX = "figures", "reproduction-"  # folder and file prefix of the fi
 
 
 def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
-    """Write the Markdown page to ``file``, the results as ``.json`` beside it, and the figures into the folder
+    """Write the Markdown page to ``file``, the results as ``.json`` beside it, and the figures into a folder
     ``figures``.
 
     Existing files are replaced. ``folder`` holds the figures of the results.
@@ -138,9 +137,7 @@ def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
 
 
 def docs_page(results: Sequence[Result]) -> str:
-    """Return the Markdown page of these results, with the verdict on each item. The ``.json`` file beside it holds the
-    rest.
-    """
+    """Return the Markdown page of these results, with the verdict on each item. The ``.json`` file has all the rest."""
     lead, command, made, few = _account(results)
     blocks = [
         f"# {_TITLE}",

@@ -100,10 +100,9 @@ _STAND_IN = "ppo-paper-random-obstacle"  # shipped policy that replaces an uncon
 
 
 def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:
-    """Return a policy for the paper's "PPO model obtained from training before convergence occurred", and its
-    description.
+    """Return a policy in place of the paper's "PPO model obtained from training before convergence occurred".
 
-    This is the policy that ``--full`` stopped early, or else a shipped policy in its place.
+    It is the policy that ``--full`` stopped early, or else a shipped policy. Also returns its description.
     """
     for (path,) in settings.trained([STOPPED]).values():
         about = f"PPO stopped early: the last policy of {EARLY.decisions:,} decisions on paper-random"
@@ -113,7 +112,7 @@ def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:
 
 
 def hybrid(policy: Policy, scenario: Scenario, bound: Literal["coupled", "pairwise"]) -> Agent:
-    """Return the paper's hybrid (Algorithm 1): at the alert it chooses the policy or E-V2X-BM, whichever expects less
+    """Return the paper's hybrid (Algorithm 1): at the alert it chooses ``policy`` or E-V2X-BM, whichever expects less
     harm.
 
     ``bound`` is the harm expected of E-V2X-BM: ``coupled`` simulates it, ``pairwise`` predicts it by a closed form.

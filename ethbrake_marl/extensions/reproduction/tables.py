@@ -108,10 +108,10 @@ def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list
 
 
 def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdict:
-    """Return a verdict on whether a choice between two strategies, world by world, can avoid as many collisions as
-    printed.
+    """Return a verdict: can a choice between two strategies, world by world, avoid as many collisions as printed?
 
-    It avoids a collision only where one of the two strategies does, so at most as many as both together.
+    It avoids a collision only where one of the two strategies does, so at most as many as both together. ``one`` and
+    ``other`` are the paper's rows of the two strategies, ``chosen`` is its row of the choice.
     """
     avoided = [row.episodes - row.collisions for row in (one, other, chosen)]
     together = avoided[0] + avoided[1]
@@ -138,7 +138,7 @@ def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
 
 
 def rows_table(beside: Beside) -> Sheet:
-    """Return the table of our results under one assumption, with the proven minimum."""
+    """Return the table of our results under one assumption (``beside``), with the proven minimum."""
     columns: dict[str, Column | str] = {
         _RATE: PERCENT, _MEAN_HARM: "First-impact harm", _TOTAL: "Total harm", _PREDICTED_HARM: "Predicted harm",
         _DECREASE: replace(PERCENT, heading="Harm decrease"),

@@ -203,8 +203,7 @@ def _judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Re
     """Return a verdict on each claim about one world, without intervals.
 
     ``claims`` maps a claim to a text with the numbers, the number that should be smaller, and the larger one. ``show``
-    is
-    the format of their difference.
+    is the format of their difference.
     """
     return [
         judge_statement(f"{claim} ({reading.name})", [Less(told, Estimate(smaller - larger, None))], show=show)
@@ -213,7 +212,7 @@ def _judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Re
 
 
 def _asked_of_vehicle_2(record: EpisodeRecord) -> tuple[float, float, float]:
-    """Return Vehicle 2's first command (m/s2), the sum of the sizes of its changes of command (m/s2), and its share of
+    """Return Vehicle 2's first command, the sum of the sizes of its changes of command (both m/s2), and its share of
     braking.
 
     The share of braking is over the time until its standstill, from 0 to 1.

@@ -104,8 +104,8 @@ def _off(printed: float, ours: Estimate) -> str:
 
 
 def _chance(estimate: Estimate) -> float:
-    """Return how far apart two such estimates from two lists of worlds may lie: sqrt 2 times the half-width of the
-    interval.
+    """Return how far apart two such estimates from two lists of worlds may lie: sqrt 2 times the interval's
+    half-width.
     """
     low, high = estimate.ends
     return math.sqrt(2.0) * 0.5 * (high - low)
@@ -134,8 +134,7 @@ class Less:
         """Compare the harm of two strategies in the same worlds, with the proven lower bound.
 
         ``harm`` maps strategies to their harm [n]; ``smaller`` and ``larger`` are names of strategies; ``where``
-        describes the
-        comparison.
+        describes the comparison.
         """
         low, high = harm[smaller], harm[larger]
         least = paired_difference(harm[PROVEN], high) if PROVEN in harm else None
@@ -143,8 +142,7 @@ class Less:
 
 
 def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False, show: Column = HARM) -> Verdict:
-    """Return a verdict on a statement of the paper: it agrees if every comparison comes out below 0 with its whole
-    interval.
+    """Return a verdict on a statement of the paper: it agrees if the interval of every comparison lies below 0.
 
     Args:
         what: the statement.

@@ -26,12 +26,12 @@ class Searched(AgentAround):
 
     It knows the model of the line and the other vehicles' scripts, and does not react to anything unexpected.
     ``predicted_harm`` [n] (m2/s2) is never above the policy's own harm, and equals the simulated harm exactly if the
-    others follow their scripts. The commands of a world do not depend on its batch. Raises ``InvalidInput`` for an
-    object that is not an agent, a number of candidates outside 1 to 1,000,000 and, when an episode begins, another
-    vehicle's script whose command is not fixed at the alert.
+    others follow their scripts. Raises ``InvalidInput`` for an object that is not an agent, a number of candidates
+    outside 1 to 1,000,000 and, when an episode begins, another vehicle's script whose command is not fixed at the
+    alert.
 
     Args:
-        policy: any agent.
+        policy: the agent around whose episode it searches.
         scenario: the scenario in which it searches.
         candidates: number of candidates in each world.
         harm_count: harm to minimise, ``first`` or ``total``.
@@ -79,13 +79,20 @@ class Searched(AgentAround):
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
         """Return the command of the present step, [n] m/s2, and the unchanged memory.
 
-        ``memory`` is the result of ``begin``; ``vehicle`` is not used.
+        Args:
+            worlds: the worlds now, [n]; only their time is read.
+            memory: result of ``begin``.
+            vehicle: not used.
+
         """
         return self._outlook.command(worlds, memory), memory
 
 
 def search_around(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """Return the agent ``+search``, which searches around the episode of ``policy``. ``argument`` must be None."""
+    """Return the agent ``+search``, which searches around the episode of ``policy``.
+
+    ``argument`` must be None; ``settings`` hold the scenario and the harm to minimise.
+    """
     return Searched(policy, settings.needed_scenario(), harm_count=settings.harm_count)
 
 

@@ -56,11 +56,9 @@ def best_harm(
     """Search every world for the command profiles of least harm, once per harm count; return them as a table.
 
     With both counts, each may take the other's result. The result is never worse than the best constant deceleration of
-    a
-    controlled vehicle (with the other controlled ones braking fully), than the same search with one of them alone, or
+    a controlled vehicle (with the other controlled ones braking fully), than the same search with one of them alone, or
     than ``known``. It does not depend on ``threads`` or on the other worlds. Raises ``InvalidInput`` for no vehicle, a
-    script
-    whose command is not fixed at the alert, no count, or a budget below 1.
+    script whose command is not fixed at the alert, no count, or a budget below 1.
 
     Args:
         scenario: the scenario of the worlds.
@@ -124,8 +122,7 @@ def search_list(
 
     A world that the physics cannot advance (a defect) is left out: no table holds it, and the header lists it under
     ``LEFT_OUT``. Raises ``InvalidInput`` as ``best_harm`` does, and if ``known`` holds no world of the list;
-    ``PhysicsError``
-    if no world is left.
+    ``PhysicsError`` if no world is left.
 
     Args:
         scenario: the scenario of the list.
@@ -325,9 +322,7 @@ def _startable(profiles: Profiles) -> Profiles:
 
 
 def _joined(parts: list[Profiles], n: int) -> Profiles:
-    """Join several sets of profiles, [n * Q_j] each, into one set [n * Q] with all profiles of world 0 first, and so
-    on.
-    """
+    """Join several sets of profiles, [n * Q_j] each, into one set [n * Q]: all profiles of world 0 first, and so on."""
     parts = Profiles.padded(parts, MOST_PHASES)
     ends = np.concatenate([part.ends.reshape(n, -1, MOST_PHASES) for part in parts], axis=1)
     shape = (n, -1, MOST_PHASES, parts[0].commands_mps2.shape[2])

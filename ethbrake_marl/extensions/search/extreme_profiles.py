@@ -44,8 +44,7 @@ def extreme_profiles(problem: ProfileProblem, states: Floats, has_front: Bools, 
     on.
 
     An *extreme* profile changes between full drive and full braking. ``states`` only serves to find when two vehicles
-    would
-    meet, so a neighbour that does not brake fully makes the profiles less good, not wrong.
+    would meet, so a neighbour that does not brake fully makes the profiles less good, not wrong.
 
     Args:
         problem: the worlds, with the commands of the other vehicles and the harm to minimise.

@@ -122,10 +122,8 @@ class LimitMeasures(MeasureSet):
         """Return further values of one agent's row, by name.
 
         ``known_best_share`` is the share of worlds with a best known harm, ``below_best_known`` the number of worlds
-        where the
-        agent is below it, ``best_known_warning`` a warning or None, and ``impact_unproven`` the summary of worlds with
-        proven
-        contact but no proven impact (``Between``).
+        where the agent is below it, ``best_known_warning`` a warning or None, and ``impact_unproven`` the summary of
+        worlds with proven contact but no proven impact (``Between``).
 
         Args:
             tally: counts and means of the agent.
@@ -144,12 +142,17 @@ class LimitMeasures(MeasureSet):
     def warnings(self, rows: Sequence[SummaryRow]) -> Sequence[str]:
         """Return the warning that a table of best known harm covers only some of the worlds, as a list; empty if there
         is none.
+
+        ``rows`` are the summaries of the agents.
         """
         warning = rows[0].more[NAME]["best_known_warning"]
         return [warning] if warning else []
 
     def notes(self, rows: Sequence[SummaryRow]) -> Sequence[str]:
-        """Return a note on unavoidable harm and the best known harm, as a list; empty if nothing is proven."""
+        """Return a note on unavoidable harm and the best known harm, as a list; empty if nothing is proven.
+
+        ``rows`` are the summaries of the agents.
+        """
         row, first, total = rows[0], rows[0]["best_known_first_impact_harm"], rows[0]["best_known_total_harm"]
         if first is None or total is None:
             return []

@@ -119,8 +119,9 @@ def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
 
 
 def unproven_because(worlds: Worlds, task: Task) -> str | None:
-    """Return the reason why nothing is proven for the task in these worlds, as a clause; None if something is
-    proven.
+    """Return the reason why nothing is proven for the task in these worlds, as a clause; None if something is proven.
+
+    ``task`` names the scenario and the controlled vehicles.
     """
     if worlds.vehicles.in_pieces.any() or (_is_team(task) and worlds.vehicles.build_up.any()):
         return _uneven_because(worlds)
@@ -130,7 +131,10 @@ def unproven_because(worlds: Worlds, task: Task) -> str | None:
 
 
 def undecided_because(worlds: Worlds, task: Task) -> str | None:
-    """Return the reason why it is not decided whether contact can be avoided, as a clause; None if it is decided."""
+    """Return the reason why it is not decided whether contact can be avoided, as a clause; None if it is decided.
+
+    ``task`` names the scenario and the controlled vehicles.
+    """
     return _uneven_because(worlds) if worlds.vehicles.build_up.any() else _uncovered_because(worlds, task)
 
 
@@ -172,7 +176,8 @@ def _is_team(task: Task) -> bool:
 
 
 def _script_because(task: Task, proven: str) -> str | None:
-    """Return a clause that names a vehicle which follows another script than full_brake; None if there is none.
+    """Return a clause that names a vehicle of the task which follows another script than full_brake; None if there is
+    none.
 
     ``proven`` is the subject of the clause, for instance "avoidability is proven".
     """

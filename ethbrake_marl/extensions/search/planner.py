@@ -59,9 +59,12 @@ class Outlook(NamedTuple):
     def command(self, worlds: Worlds, memory: Memory) -> Floats:
         """Return the present command in each world, [n] m/s2.
 
-        ``memory`` holds ``commands_mps2`` [n, decisions], one command for each decision, and ``start_s`` [n], the time
-        of the
-        first one.
+        Args:
+            worlds: the worlds now, [n]; only their time is read.
+            memory: holds ``commands_mps2`` [n, decisions], one command for each decision, and ``start_s`` [n], the time
+                of the
+                first one.
+
         """
         step = Decisions(memory["start_s"], self.time_step_s).latest(worlds.time_s)
         now: Floats = memory["commands_mps2"][np.arange(worlds.n), np.clip(step, 0, self.decisions - 1)]
@@ -140,8 +143,14 @@ class Planner:
         return {"plan": plan, "planned_s": start_s, "others_mps2": others, "predicted_harm": harm}
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Make new plans where a decision is due; return the first command of each world's plan, [n] m/s2, and the new
-        memory.
+        """Return the first command of each world's plan, [n] m/s2, and the new memory. Plans are renewed where a
+        decision is due.
+
+        Args:
+            worlds: the worlds now, [n].
+            memory: memory from ``begin`` or the previous ``act``.
+            vehicle: index of the controlled vehicle.
+
         """
         rows = self._outlook.due(worlds, memory["planned_s"])
         if rows.size:
@@ -152,8 +161,13 @@ class Planner:
         return Profiles(*memory["plan"]).commands_mps2[:, 0, 0], memory
 
     def _rest(self, held: Memory, time_s: Floats, problem: ProfileProblem) -> Profiles:
-        """Return the part of each stored plan that is still ahead at ``time_s`` [n], as profiles for the new
-        problem.
+        """Return the part of each stored plan that is still ahead, as profiles [m] for the new problem.
+
+        Args:
+            held: memory of the worlds that plan again.
+            time_s: [m] present time, s.
+            problem: the search problem from that time on.
+
         """
         plan = Profiles(*held["plan"])
         passed = np.rint((time_s - held["planned_s"]) / self._outlook.time_step_s).astype(np.int64)[:, np.newaxis]
@@ -162,8 +176,8 @@ class Planner:
         return Profiles(ends, plan.commands_mps2)
 
     def _search(self, problem: ProfileProblem, plan: Profiles) -> tuple[Profiles, Floats]:
-        """Return the best plan of each world from a search that starts with ``plan`` and constants, and its harm [n]
-        m2/s2.
+        """Return the best plan of each world, and its harm [n] (m2/s2), from a search that starts with ``plan`` and
+        constants.
         """
         constants = problem.constant(problem.even_grid(15))
         n, K = plan.ends.shape  # [n * Q]: for each world its plan, then constants

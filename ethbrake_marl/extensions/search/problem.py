@@ -32,8 +32,7 @@ def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, se
 
     A profile has at most ``MOST_PHASES`` phases of constant command. The result is never worse than any profile of
     ``given``. Raises ``InvalidInput`` for a budget below 1, and ``PhysicsError`` with the worlds in which no profile
-    could
-    be followed.
+    could be followed.
 
     Args:
         problem: n worlds, with the commands of the other vehicles and the harm to minimise.

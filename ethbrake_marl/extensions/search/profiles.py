@@ -78,10 +78,8 @@ def apply_change(change: Floats, bounds: Floats, ends: Ints, commands: Floats) -
     """Apply one change to a profile, in place. Return False if it had no effect.
 
     Kinds of change: COMMAND_CHANGE adds to one command. TRADE also changes the next command, so that the speed after
-    both
-    phases stays and only the position changes. SET_COMMAND replaces a command. MOVE_END moves the border between two
-    phases
-    by whole steps.
+    both phases stays and only the position changes. SET_COMMAND replaces a command. MOVE_END moves the border between
+    two phases by whole steps.
 
     Args:
         change: [CHANGE_WIDTH] columns KIND, VEHICLE, PHASE and AMOUNT (m/s2, or steps).
@@ -223,7 +221,7 @@ def search_world(
 
 @compiled
 def copy_profile(ends: Ints, commands: Floats, to_ends: Ints, to_commands: Floats) -> None:
-    """Copy the phases of one profile (``ends``, ``commands``) over the first phases of another."""
+    """Copy one profile (``ends``, ``commands``) over the first phases of another one (``to_ends``, ``to_commands``)."""
     for k in range(ends.shape[0]):
         to_ends[k] = ends[k]
     copy_rows(commands, to_commands, commands.shape[0])
@@ -363,7 +361,7 @@ def is_among(value: float, values: Floats) -> bool:
 
 @compiled
 def largest(values: Floats) -> int:
-    """Return the index of the first largest value."""
+    """Return the index of the largest of ``values``; of several equal ones, the first."""
     place = 0
     for k in range(values.shape[0]):
         if values[k] > values[place]:

@@ -35,14 +35,10 @@ class BestHarm:
     """Agent that plays the command profile of least known harm.
 
     A world without a stored profile is searched at the alert. If the ``scenario`` has no other learner, a second search
-    with
-    as many candidates starts from the better of that result and the episode of ``universal``, so the harm is never
-    above
-    that policy's. ``predicted_harm`` [n] equals the engine's harm (m2/s2) bit for bit if the engine has the same time
-    step.
-    Raises ``InvalidInput`` for a budget below 1 or an unknown count and, when an episode begins, for another vehicle's
-    script
-    whose command is not fixed at the alert.
+    with as many candidates starts from the better of that result and the episode of ``universal``, so the harm is never
+    above that policy's. ``predicted_harm`` [n] (m2/s2) equals the engine's harm exactly if the engine has the same time
+    step. Raises ``InvalidInput`` for a budget below 1 or an unknown count and, when an episode begins, for another
+    vehicle's script whose command is not fixed at the alert.
 
     Args:
         recall: returns the stored profile of each world of a problem, and a mask of the worlds that have one.
@@ -77,9 +73,11 @@ class BestHarm:
     def make(cls, argument: str | None, settings: AgentSettings, recall: Recall) -> BestHarm:
         """Make the agent ``best_harm`` or ``best_harm:CANDIDATES``.
 
-        ``argument`` is the number of candidates, or None; ``InvalidInput`` if it is not such a number. ``recall``
-        returns the
-        stored profiles of a problem.
+        Args:
+            argument: number of candidates, or None for the default; ``InvalidInput`` if it is not such a number.
+            settings: scenario, harm to minimise and other settings of agents.
+            recall: returns the stored profile of each world of a problem, and a mask of the worlds that have one.
+
         """
         budget = PROFILE_BUDGET if argument is None else budget_of(argument)
         if budget is None:
@@ -119,7 +117,14 @@ class BestHarm:
         }
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the command of the present step, [n] m/s2, and the unchanged memory."""
+        """Return the command of the present step, [n] m/s2, and the unchanged memory.
+
+        Args:
+            worlds: the worlds now, [n]; only their time is read.
+            memory: result of ``begin``.
+            vehicle: not used.
+
+        """
         return self._outlook.command(worlds, memory), memory
 
     def _search(self, worlds: Worlds, vehicle: int, others: Floats) -> tuple[Floats, Floats]:

@@ -65,10 +65,8 @@ def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed:
     [n].
 
     The result is never worse than the given commands. Harm (m2/s2) is counted as the engine counts it. Worlds are
-    independent
-    of each other. Raises ``InvalidInput`` for several vehicles, commands of another shape or beyond a capacity, or a
-    budget
-    below 1, and ``PhysicsError`` with the worlds in which the given commands cannot be played.
+    independent of each other. Raises ``InvalidInput`` for several vehicles, commands of another shape or beyond a
+    capacity, or a budget below 1, and ``PhysicsError`` with the worlds in which the given commands cannot be played.
 
     Args:
         problem: n worlds, with the commands of the other vehicles and the harm to minimise.
@@ -129,7 +127,13 @@ def _refine_worlds(
 def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budget: int) -> bool:
     """Improve the commands ``mine`` of one world in place. Return False if they cannot be played.
 
-    ``other`` and ``room`` are working memory; ``budget`` is the number of candidates.
+    Args:
+        world: the world, with its commands, bounds and random stream.
+        mine: commands to improve.
+        other: working memory.
+        room: working memory.
+        budget: number of candidates.
+
     """
     templates, theirs = int(TEMPLATE_SHARE * budget), int(THEIR_CLIMB_SHARE * budget)
     value, reached = follow_steps(world.episode, mine, 0, math.inf)
@@ -148,11 +152,17 @@ def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budge
 
 @compiled(apart=True)
 def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[float, int]:
-    """Play the commands of ``plan`` from step ``begin`` on, and write its states. Return its harm, and the number of
-    steps played.
+    """Play the commands of ``plan`` from a step on, and write its states. Return the harm (m2/s2) and the number of
+    steps.
 
-    Stops as soon as the harm (m2/s2) is not below ``bound``, because harm never falls. The number of steps is -1 if the
-    physics failed.
+    The number of steps is -1 if the physics failed.
+
+    Args:
+        world: the world, with the commands of the other vehicles.
+        plan: commands to play, with the state at step ``begin``; the later states are written.
+        begin: first step to play.
+        bound: harm at which to stop, m2/s2, because harm never falls.
+
     """
     table, clock = world.table, world.clock
     grid, restitution, total, last = (
@@ -233,8 +243,7 @@ def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, num
     """Simulate random templates and write the best one to ``best``; return its harm (m2/s2) and its number of steps.
 
     A *template* is one command, another one for a short while, then full braking. The number of steps is 0 if no
-    template
-    is below ``bound``.
+    template is below ``bound``.
 
     Args:
         world: the world, with its commands, bounds and random stream.
@@ -263,7 +272,9 @@ def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, num
 
 @compiled
 def steps_in(world: Episode, duration_s: float) -> int:
-    """Return the number of decision steps in ``duration_s``, rounded, at least 1."""
+    """Return the number of decision steps in ``duration_s``, rounded, at least 1. ``world`` holds the length of a
+    step.
+    """
     return max(int(duration_s / world.clock[CLOCK.TIME_STEP] + 0.5), 1)
 
 

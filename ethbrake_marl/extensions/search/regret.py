@@ -35,11 +35,14 @@ class Regrets:
     source: NDArray[np.str_]
 
     def best(self, harm_count: HarmCount) -> Floats:
-        """Return the best known harm under one count, [n] m2/s2."""
+        """Return the best known harm under ``harm_count`` (``first`` or ``total``), [n] m2/s2."""
         return self.first_impact_harm if harm_count == "first" else self.total_harm
 
     def regret(self, outcome: Outcome, harm_count: HarmCount) -> Floats:
-        """Return the outcome's harm minus the best known harm, [n] m2/s2, never negative."""
+        """Return an agent's harm minus the best known harm, [n] m2/s2, never negative.
+
+        ``outcome`` is the agent's outcome in these worlds; ``harm_count`` is ``first`` or ``total``.
+        """
         return outcome.ledger.world_harm(harm_count) - self.best(harm_count)
 
     def below(self, outcome: Outcome) -> Bools:
@@ -122,8 +125,7 @@ def limits_of(evaluation: Evaluation) -> Limits | Unproven:
     """Return proofs and best known harm of each world before any agent drives; ``Unproven`` if nothing is proven.
 
     They are computed once per evaluation. Warns with ``IncompleteTable`` if a table of best known harm covers only some
-    of
-    the worlds.
+    of the worlds.
     """
     return evaluation.once(_limits)
 

@@ -31,10 +31,8 @@ def best_known(worlds: Worlds, task: Task) -> dict[HarmCount, Floats]:
     """Return the best known harm of each world (at t = 0) from the shipped tables, by harm count, [n] m2/s2.
 
     NaN if no shipped table has it. Worlds are recognised by everything that affects their harm: state, parameters,
-    scripts
-    of the others, time step, horizon and the controlled vehicles (in ``task``). Raises ``InvalidInput`` for a script
-    whose
-    command is not fixed at the alert, because no search covers it.
+    scripts of the others, time step, horizon and the controlled vehicles (in ``task``). Raises ``InvalidInput`` for a
+    script whose command is not fixed at the alert, because no search covers it.
     """
     identity = task_problem(worlds, task).identity
     known = {harm_count: np.full(worlds.n, np.nan) for harm_count in HARM_COUNTS}
@@ -44,8 +42,7 @@ def best_known(worlds: Worlds, task: Task) -> dict[HarmCount, Floats]:
 
 
 def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Profiles, Bools]:
-    """Return the stored profiles of a problem with one controlled vehicle, [n], and a mask [n] of the worlds that have
-    one.
+    """Return the stored profiles of a problem with one controlled vehicle, [n], and a mask [n] of worlds that have one.
 
     ``harm_count`` is the harm that the profiles minimise, ``first`` or ``total``.
     """

@@ -61,9 +61,9 @@ class BestHarmTable:
     def load(cls, path: Path) -> BestHarmTable:
         """Return the table that is stored in the file ``path``.
 
-        Raises ``InvalidInput`` if there is no file, and ``CorruptBundle`` if it is not a table.
-        Names, types, shapes and sizes are checked from the headers before anything is unpacked. The harm of a world is
-        not verified; ``check_fits`` checks that the profiles fit a problem.
+        Raises ``InvalidInput`` if there is no file, and ``CorruptBundle`` if it is not a table. Names, types, shapes
+        and sizes are checked from the headers before anything is unpacked. The harm of a world is not verified;
+        ``check_fits`` checks that the profiles fit a problem.
         """
         if not os.path.exists(path):
             raise InvalidInput(f"{path}: there is no such table of best known harm")
@@ -153,8 +153,7 @@ class BestHarmTable:
         """Return the table with smaller values replaced, and a mask [m] of the worlds that were replaced.
 
         A value is replaced if ``harm`` is smaller by more than ``TOLERANCE``. Worlds that are not in the table are
-        ignored.
-        Raises ``InvalidInput`` for a count that the table does not hold, or for shapes that do not match.
+        ignored. Raises ``InvalidInput`` for a count that the table does not hold, or for shapes that do not match.
 
         Args:
             identity: [m] hash of each world.
@@ -207,8 +206,9 @@ def table_bytes(table: BestHarmTable) -> bytes:
 
 
 def _rows(harm_count: HarmCount) -> list[ArrayRow]:
-    """Return name, type and shape of the arrays in a table file for one count: n worlds, m phases in all, C controlled
-    vehicles.
+    """Return name, type and shape of each array that a table file holds for one harm count.
+
+    n worlds, m phases in all, C controlled vehicles.
     """
     return [
         ArrayRow("header", "|u1", ("bytes",)),
@@ -270,7 +270,7 @@ def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> Bes
 
 
 def _used(ends: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return how many phases each profile uses, [n], from the ``ends`` [n, K] of its phases; 0 if there is no
-    profile.
+    """Return the number of phases that each profile uses, [n]; 0 if there is no profile. ``ends`` [n, K] are their
+    ends.
     """
     return np.where(ends[:, -1] > 0, np.argmax(ends == ends[:, -1:], axis=1) + 1, 0)

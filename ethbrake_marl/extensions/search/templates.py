@@ -20,9 +20,8 @@ def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed:
     """Return the best of some random templates in each world: its commands [n, T] (m/s2), and its number of steps [n].
 
     A *template* is a whole episode: brake fully, give way, brake again. The number of steps is 0 if no template is
-    below
-    the bound. Each world draws its own templates and is independent of the others. Raises ``InvalidInput`` for several
-    controlled vehicles, or no template.
+    below the bound. Each world draws its own templates and is independent of the others. Raises ``InvalidInput`` for
+    several controlled vehicles, or no template.
 
     Args:
         problem: n worlds, with the commands of the other vehicles and the harm to minimise.
@@ -47,8 +46,7 @@ def _best_templates(
     """Write the best random template of each world to ``commands`` [n, T] and its number of steps to ``steps`` [n].
 
     ``random`` [n] is the initial state of each world's random stream, ``bound`` [n] the harm to be below, ``number``
-    the
-    number of templates per world.
+    the number of templates per world.
     """
     start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
     best, room = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))
