@@ -56,7 +56,8 @@ def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
     piece.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         of_gap: True for the gap, False for the relative speed.
@@ -91,7 +92,8 @@ def may_meet(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> b
     """Return whether pair ``p`` may come into contact in this piece while it closes.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
         motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
@@ -126,7 +128,8 @@ def approach(
     stopping distance is added to g.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
         motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
@@ -187,7 +190,7 @@ def _stopping_way(moving: bool, speed: Floats, pull: Floats, vague: float, lengt
 
     Args:
         moving: True if the command of any vehicle builds up.
-        speed: affine form [W] of the speed at the start of the piece, m/s.
+        speed: affine form [W] (centre, slopes, remainder) of the speed at the start of the piece, m/s.
         pull: affine form [W] of the mean acceleration, m/s2.
         vague: largest deviation of the acceleration from ``pull``, m/s2.
         length: length of the piece, s.

@@ -29,12 +29,13 @@ def spring_apart(
     """Set speed and distance of both vehicles of a pair that separates after an impact, up to the end of the piece.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
         motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         how: closing speed and time of the contact (from ``approach``).
-        jump: affine form [W] of the change of the pair's relative speed by the impact, m/s.
+        jump: affine form [W] (centre, slopes, remainder) of the change of the pair's relative speed by the impact, m/s.
         left: affine form [W] of the time from the impact to the end of the piece, s.
         after: receives the speeds at the end of the piece.
         way: [N, W] receives the distances travelled in the piece, m.
@@ -65,7 +66,7 @@ def stand_still(cell: Cell, pull: Floats, vague: float, left: float, speed: Floa
 
     Args:
         cell: the box of worlds.
-        pull: affine form [W] of the mean acceleration after the impact, m/s2.
+        pull: affine form [W] (centre, slopes, remainder) of the mean acceleration after the impact, m/s2.
         vague: largest deviation of the acceleration from ``pull``, m/s2.
         left: longest time from the impact to the end of the piece (time interval of constant command), s.
         speed: affine form [W] of the speed at the end of the piece, m/s; corrected in place.
@@ -94,12 +95,13 @@ def stay(
     Both vehicles get the speed of the pair's centre of mass.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
         motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         how: closing speed and time of the contact (from ``approach``).
-        speed: affine form [W] of the closing speed at the impact, m/s.
+        speed: affine form [W] (centre, slopes, remainder) of the closing speed at the impact, m/s.
         left: affine form [W] of the time from the impact to the end of the piece, s.
         after: receives the speeds at the end of the piece and the state of the pair in contact.
         way: [N, W] receives the distances travelled in the piece, m.

@@ -155,7 +155,7 @@ def build_up(cell: Cell, i: int, late: Floats, rates: Floats) -> None:
     Args:
         cell: the box of worlds; only its ``forces`` change.
         i: index of the vehicle.
-        late: affine form [W] of the time from the alert to the first piece, s.
+        late: affine form [W] (centre, slopes, remainder) of the time from the alert to the first piece, s.
         rates: [2, W] rates at which the brakes build up (0) and release (1), m/s3.
 
     """
@@ -208,7 +208,8 @@ def ramp(
     + e) / 2 - m^2 (d + 2 e) / 6``. Returns whether the force has reached ``wanted`` at the end in every world.
 
     Args:
-        force: affine form [W] of the acceleration at the start, m/s2; becomes the acceleration at the end.
+        force: affine form [W] (centre, slopes, remainder) of the acceleration at the start, m/s2; becomes the
+            acceleration at the end.
         wanted: affine form [W] of the acceleration that the command asks for, m/s2.
         duration: affine form [W] of the time for which the command acts, s.
         longest: upper limit of ``duration``, s.
@@ -286,9 +287,9 @@ def wait(cell: Cell, late: Floats) -> bool:
 def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
     """Return the acceleration of vehicle ``i`` from the alert until ``late``, and whether it is certain.
 
-    The acceleration is an affine form [W] in m/s2; it is 0 for the shielded vehicle. It is not certain if the vehicle's
-    command may take effect within that time. ``cell`` is the box of worlds; ``late`` [W] is the time from the alert to
-    the first piece (time interval of constant command), s.
+    The acceleration is an affine form [W] (centre, slopes, remainder) in m/s2; it is 0 for the shielded vehicle. It is
+    not certain if the vehicle's command may take effect within that time. ``cell`` is the box of worlds; ``late`` [W]
+    is the time from the alert to the first piece (time interval of constant command), s.
     """
     pull = np.zeros_like(late)
     if i == cell.vehicle:
@@ -581,8 +582,7 @@ class Boxes(NamedTuple):
             enough: [m] bound that needs no refinement, m2/s2.
             cells: most parts of a box to examine.
             only_enough: True: a result above ``enough`` is no bound; it only says that no bound of at most ``enough``
-                was
-                established.
+                was established.
 
         """
         bounds = np.empty(len(rows))

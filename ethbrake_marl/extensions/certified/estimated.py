@@ -178,8 +178,7 @@ class Ranges:
 
         Args:
             share: maps (quantity, vehicle index) to a position in the range: 0 is the least value, 1 the largest. None:
-                all
-                medians.
+                all medians.
             key: the quantity, a key of ``middle``.
 
         """
@@ -210,8 +209,7 @@ class Ranges:
             share: maps (quantity, vehicle index) to a position in its range, 0 to 1; None: the median of every
                 quantity.
             foretold: the worlds as they were predicted for now (impacts included), and a mask [n, N] of the vehicles
-                for which
-                this prediction is better than their last message. None: no prediction.
+                for which this prediction is better than their last message. None: no prediction.
 
         """
         worlds.refuse_build_up(":believed")

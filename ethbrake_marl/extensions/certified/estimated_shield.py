@@ -75,10 +75,8 @@ class BelievedShield:
         vehicle: index of the shielded vehicle.
         harm_count: ``first`` or ``total`` impacts.
         robust: worlds to certify. None: the median of everything unknown. ``corners``: also all corners of the ranges;
-            more
-            than ``MOST_CORNERS`` raise ``InvalidInput``. ``interior``: all worlds of the box around the corners, once,
-            at
-            the first decision.
+            more than ``MOST_CORNERS`` raise ``InvalidInput``. ``interior``: all worlds of the box around the corners,
+            once, at the first decision.
         others: scripts of the other vehicles by index; None: the scenario's scripts.
 
     """
@@ -172,8 +170,7 @@ class BelievedShield:
             worlds: the true worlds; only what the vehicle received is read.
             proposed: [n] proposed actions.
             proposer: the policy and its memory. Where nothing else certifies a proposal, its rollout in the estimated
-                worlds
-                is tried. None: no rollout.
+                worlds is tried. None: no rollout.
             only: [n] True for worlds that decide now; None: all.
 
         """

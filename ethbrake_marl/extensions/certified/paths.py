@@ -100,7 +100,8 @@ def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
     """Record the rough bound on the harm of a path that is not followed any further; return the new ``worst``.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
         worst: largest harm recorded so far, m2/s2.
         out: [W] receives the affine form of the harm if it is a new largest one.
@@ -119,7 +120,8 @@ def branch(
     rough bound is recorded instead.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
         stack: paths that wait to be followed; new paths are put on top.
         motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
@@ -173,10 +175,11 @@ def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
 def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats, time: Floats, length: float) -> Floats:
     """Return the closing speed of the other pair of three vehicles if it may meet in the same piece after pair ``p``.
 
-    The result is an affine form [W] in m/s; it is 0 if that pair cannot meet.
+    The result is an affine form [W] (centre, slopes, remainder) in m/s; it is 0 if that pair cannot meet.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
         motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
@@ -212,13 +215,14 @@ def strike(
     Returns False if this path cannot be followed.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
         stack: paths that wait to be followed; new paths are put on top.
         motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         how: closing speed and time of the contact (from ``approach``).
-        speed: affine form [W] of the closing speed at the impact, m/s.
+        speed: affine form [W] (centre, slopes, remainder) of the closing speed at the impact, m/s.
         harm: affine form [W] of the harm including this impact, m2/s2.
 
     """
@@ -292,7 +296,8 @@ def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int, how: Approach
     This needs a change in how the pair is pressed: a command changes, or a force builds up.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
         motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
@@ -323,7 +328,8 @@ def may_turn(cell: Cell, motion: Motion, p: int, piece: int) -> bool:
     That is so if the front vehicle's acceleration may fall or the rear vehicle's may rise.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         piece: index of the piece, 0 to J - 1.
@@ -337,7 +343,8 @@ def may_move(cell: Cell, motion: Motion, i: int, piece: int, which: int) -> bool
     """Return whether brake build-up may lower (``which`` 0) or raise (``which`` 1) an acceleration within a piece.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
         i: index of the vehicle.
         piece: index of the piece, 0 to J - 1.
@@ -357,7 +364,8 @@ def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, len
     these worlds. Returns False if the stack is full.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
         stack: paths that wait to be followed; new paths are put on top.
         motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
@@ -390,12 +398,13 @@ def thrown_back(cell: Cell, path: Path, motion: Motion, p: int, how: Approach, s
     False for the last vehicle of the line if it never drives: nobody is behind it, so it may as well stand.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
         motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         how: closing speed and time of the contact (from ``approach``).
-        speed: affine form [W] of the closing speed at the impact, m/s.
+        speed: affine form [W] (centre, slopes, remainder) of the closing speed at the impact, m/s.
 
     """
     P, share = cell.gap.shape[0], (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0
@@ -417,7 +426,8 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float
     A result above ``most`` is no bound: the search then stopped early.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         stack: memory for paths (sets of worlds with the same impacts).
         motion: memory for the motion of each vehicle.
         out: [W] receives the affine form of the harm that reaches the bound.
@@ -451,7 +461,8 @@ def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, o
     """Follow a path to its end. Return the maximum of ``worst``, its harm, and the harm that branches off on the way.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; changed in place.
         stack: paths that wait to be followed; new paths are put on top.
         motion: memory for the motion of each vehicle.
@@ -488,7 +499,8 @@ def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
     For this the pair must open first.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
         motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
 
@@ -507,7 +519,8 @@ def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out
     """Handle all pairs that are, or may come, into contact in the present piece. Return the new ``worst``.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; changed in place.
         stack: paths that wait to be followed; new paths are put on top.
         motion: motion of each vehicle in the present piece; changed in place.
@@ -562,7 +575,8 @@ def go_on(cell: Cell, path: Path, motion: Motion) -> bool:
     """Advance the path to the end of the present piece without an impact. Return False if no world can do so.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; changed in place.
         motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
 

@@ -45,7 +45,8 @@ def rough_harm(cell: Cell, path: Path, hit: int) -> float:
     motion.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
         hit: index of a pair that counts as hit already; -1: only the pairs marked in the path.
 

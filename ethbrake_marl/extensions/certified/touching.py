@@ -105,7 +105,8 @@ def stray(cell: Cell, touch: Floats, p: int) -> float:
     and ``faster`` times ``CREEP``: no impact makes a rear vehicle faster.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``.
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
 
@@ -118,7 +119,8 @@ def blur(cell: Cell, path: Path, p: int, side: int) -> float:
     """Return the largest deviation of a vehicle's speed from the affine form of its pair in contact, m/s.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         side: 0 for the front vehicle of the pair, 1 for the rear one.
@@ -145,7 +147,8 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
     separate.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; changed in place.
         motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
@@ -210,7 +213,8 @@ def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, har
     """Update the state of a pair in contact for worlds that may creep: one of its vehicles stands or moves backwards.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``; changed in place.
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         slowest: least speed of the centre of mass in the piece, m/s.
@@ -245,7 +249,8 @@ def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) 
     A world creeps if one vehicle of the pair stands or moves backwards.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; changed in place.
         motion: motion of each vehicle in the present piece; changed in place.
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
@@ -269,7 +274,8 @@ def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
     """Separate pair ``p``, which was in contact and opens in the present piece: both vehicles move alone from then on.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; changed in place.
         motion: motion of each vehicle in the present piece; changed in place.
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
@@ -307,7 +313,8 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
     creeps, its holding brakes make a flight lower and slower.)
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``; changed in place.
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         least: least closing acceleration, m/s2.

@@ -365,16 +365,22 @@ class Avoidability:
 
 
 def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str] | None = None) -> Avoidability:
-    """Decide in every world whether ``vehicle`` (index from 0) can avoid all contact from now on.
+    """Decide in every world whether one vehicle can avoid all contact from now on.
 
-    Where it cannot, every profile leads to contact, but not always to an impact: see ``LowerBound.impact_proven``.
-    Covers three vehicles with the middle one controlled, or two with either. The others brake with their whole capacity
-    from their latencies on; ``scripts`` (index -> name, as in ``Scenario.roles``) is only checked to say the same. An
-    overlap of the deciding trajectories of up to 1e-12 m counts as gap 0, so as avoided.
+    Where it cannot, every command profile leads to contact, but not always to an impact: see
+    ``LowerBound.impact_proven``. Covers three vehicles with the middle one controlled, or two with either. The others
+    brake with their whole capacity from their latencies on. An overlap of the deciding trajectories of up to 1e-12 m
+    counts as gap 0, so as avoided.
+
+    Args:
+        worlds: the worlds now, [n].
+        vehicle: index of the controlled vehicle, from 0.
+        scripts: name of each other vehicle's script by index, as in ``Scenario.roles``; only checked to be full_brake.
 
     Raises ``InvalidInput`` for another line, a script other than full_brake, a front vehicle that may brake only after
     the controlled one acts, a vehicle that moves backward, or an obstacle (``obstacle_gap_m``) that vehicle_1 could
     reach before any contact.
+
     """
     worlds.refuse_build_up("avoidability")
     check_covered(worlds, vehicle, scripts)

@@ -119,8 +119,8 @@ def harm_of(
         soft: least closing speed of the contact, m/s.
         hard: largest closing speed of the contact, m/s.
         floor: known lower bound on the harm at the other pair, m2/s2.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     begin, end = decision_around(at, early, late)
@@ -209,8 +209,8 @@ def divide(
         at: one world, as the columns of ``line.LINE``.
         floor: known lower bound on the harm at the other pair, m2/s2.
         count: number of cells on the heap.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
         heap: working memory of the search, [CELLS, NEAR].
 
     """
@@ -253,8 +253,8 @@ def least_harm(
         floor: known lower bound on the harm at the other pair, m2/s2.
         best: harm that is possible in any case, m2/s2.
         enough: if some contact does no more harm than this (m2/s2), 0 is returned, because this is proven elsewhere.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
         heap: working memory of the search, [CELLS, NEAR].
 
     """

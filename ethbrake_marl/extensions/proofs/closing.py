@@ -82,7 +82,7 @@ def least_closing_of_pair(at: Floats, until: float, plan: Floats, other: Floats)
         at: [PAIR_WIDTH] one pair, columns ``PAIR_GAP`` to ``FOLLOWER_A``.
         until: horizon, s.
         plan: working memory for one plan (``empty_plan``).
-        other: working memory for a second plan.
+        other: further working memory of the same kind.
 
     """
     onset = at[LEADER_ONSET]

@@ -102,8 +102,8 @@ def pushed_by_leader(
         closing: largest closing speed of the contact, m/s.
         end: time until which the command of the earlier decision stays in force, s.
         lack: least amount by which that command falls short of the best one, m/s2.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     share, rest, press = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.U_F] + at[LINE.A_L]
@@ -146,8 +146,8 @@ def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: 
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         closing: largest closing speed of the contact, m/s.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     share, rest, bounce = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.RESTITUTION]
@@ -200,8 +200,8 @@ def after_front(
         closing: largest closing speed of the contact, m/s.
         end: time until which the command of the earlier decision stays in force, s.
         lack: least amount by which that command falls short of the best one, m/s2.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     share, rest = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE]
@@ -265,8 +265,8 @@ def braking_after(
         a_l: its braking capacity, m/s2.
         v_f: speed of the braking vehicle, m/s.
         a_f: its braking capacity, m/s2.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     fill_braking(plan, 0.0, a_l)
@@ -295,8 +295,8 @@ def pushed_by_rear(
         end: time until which the command of the earlier decision stays in force, s.
         lack: least amount by which that command falls short of the best one, m/s2.
         gap: gap to the front vehicle at ``early``, m.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
@@ -331,8 +331,8 @@ def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: F
         early: earliest time of the first contact, s after the controlled vehicle may act.
         closing: largest closing speed of the contact, m/s.
         gap: gap to the front vehicle at ``early``, m.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     share, v_l = at[LINE.REAR_SHARE], leader(at, early)[0]

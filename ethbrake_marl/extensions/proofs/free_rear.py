@@ -110,8 +110,8 @@ def after_behind(
         hard: largest closing speed of the contact, m/s.
         faster: least speed by which the rear vehicle is faster than by full braking, m/s.
         moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     further = near - faster * (late - early)
@@ -156,8 +156,8 @@ def put_behind(
         search: [SEARCH] columns ``SINCE``, ``POWER``, ``FLOOR`` and ``BEST`` (least harm so far).
         count: number of entries on the heap.
         moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
         heap: [SEARCHED + 4, HEAP_WIDTH] entries, the least bound first; changed in place.
 
     """
@@ -193,8 +193,8 @@ def try_behind(
         far: largest such distance, m.
         search: [SEARCH] columns ``SINCE``, ``POWER``, ``FLOOR`` and ``BEST``; the last one changes.
         moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     near = max(near, behind_full_braking(at, time, time))
@@ -219,8 +219,8 @@ def divide_behind(
         search: [SEARCH] columns ``SINCE``, ``POWER``, ``FLOOR`` and ``BEST``; the last one may fall.
         count: number of entries on the heap.
         moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
         heap: [SEARCHED + 4, HEAP_WIDTH] entries, the least bound first; changed in place.
 
     """
@@ -260,8 +260,8 @@ def meetings_behind(
         last: latest time of the contact, s after the controlled vehicle may act.
         search: [SEARCH] columns ``SINCE``, ``POWER``, ``FLOOR`` and ``BEST``; the last one may fall.
         moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
         heap: working memory of the search, [SEARCHED + 4, HEAP_WIDTH].
 
     """

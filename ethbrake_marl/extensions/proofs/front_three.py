@@ -44,8 +44,8 @@ def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Float
         first: earliest first contact with the front vehicle, s.
         last: latest first contact with the front vehicle, s.
         pair: working memory for a pair, [PAIR_WIDTH].
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     pair[PAIR_GAP], pair[LEADER_ONSET], pair[LEADER_FREE] = at[LINE.GAP_L] + at[LINE.GAP_R], 0.0, 0.0
@@ -73,8 +73,8 @@ def late_meetings(at: Floats, first: float, stand: float, plan: Floats, other: F
         at: one world, as the columns of ``line.LINE``.
         first: earliest first contact with the front vehicle, s; infinite: none.
         stand: time at which the rear vehicle stands by full braking, s.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     if first == math.inf or not stays_ahead(at, first, first, plan, other):
@@ -110,8 +110,8 @@ def combined_bound_of_team(
         power: largest acceleration by which it holds them back, m/s2.
         pair: working memory for a pair, [PAIR_WIDTH].
         moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
         heap: working memory for contacts with the front vehicle, [CELLS, NEAR].
         heap_behind: working memory for contacts with the rear vehicle, [SEARCHED + 4, HEAP_WIDTH].
 

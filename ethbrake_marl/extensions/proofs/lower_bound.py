@@ -67,8 +67,8 @@ def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
 
     Args:
         at: one world, as the columns of ``line.LINE``.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], math.inf, at[LINE.A_F])
@@ -88,8 +88,8 @@ def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) ->
             brake build-up).
         at: one world, as the columns of ``line.LINE``.
         time: time of the contact, s after the controlled vehicle may act.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     if kind == FRONT_FIRST:
@@ -110,8 +110,8 @@ def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, o
         at: one world, as the columns of ``line.LINE``.
         first: time of a first contact at which there is room, s.
         last: latest time of a first contact with this neighbour, s; the result is at most this.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     if is_first(kind, at, last, plan, other):
@@ -135,8 +135,8 @@ def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple
     Args:
         at: one world, as the columns of ``line.LINE``.
         first: earliest contact with the front vehicle, s.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     touches = spare_gap(at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F]) >= 0.0
@@ -163,8 +163,8 @@ def front_first(
         floor: known lower bound on the harm at the other pair, m2/s2.
         best: least harm of a first contact that is known so far, m2/s2.
         enough: if some contact does no more harm than this (m2/s2), 0 is returned at once.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
         heap: working memory of the search, [CELLS, NEAR].
 
     """
@@ -211,8 +211,8 @@ def soft_harm(
         late: latest time of the first contact, s.
         floor: known lower bound on the harm at the other pair, m2/s2.
         best: least harm of a first contact that is known so far, m2/s2.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     soft = 0.0
@@ -237,8 +237,8 @@ def rear_first(
         floor: known lower bound on the harm at the other pair, m2/s2.
         best: least harm of a first contact that is known so far, m2/s2.
         enough: if some contact does no more harm than this (m2/s2), 0 is returned at once.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
         heap: working memory of the search, [CELLS, NEAR].
 
     """
@@ -279,8 +279,8 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
     Args:
         at: one world, as the columns of ``line.LINE``.
         rest: time at which the controlled and the rear vehicle stand by full braking, s.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     fill_braking(plan, 0.0, at[LINE.A_L])
@@ -324,8 +324,8 @@ def combined_bound(
         until: horizon, s; harm after it does not count.
         front: bound on the harm of the front pair alone, m2/s2.
         rear: bound on the harm of the rear pair alone, m2/s2.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
         heap: working memory of the search, [CELLS, NEAR].
 
     """
@@ -390,20 +390,27 @@ def lower_bound(
     scripts: Mapping[int, str] | None = None,
     time_step_s: float | None = None,
 ) -> LowerBound:
-    """Return a proven lower bound on the harm from now to ``horizon_s`` (absolute), over all commands of ``vehicle``.
+    """Return a proven lower bound on the harm of every world, over all commands of one vehicle.
 
     ``harm = early + max(front_pair + rear_pair, combined)``, each part rounded outward (``rounding``). The combined
-    bound is 0 where contact can be avoided. Harm that may come only after the horizon counts as 0. With ``harm_count``
-    "first", the next impact of a pair that was hit before counts as 0 too.
-
-    With ``time_step_s`` the bound is proven only for commands that change at decisions: the first one when the vehicle
-    may act, then one every ``time_step_s``, as for every agent. That is sharper, and takes ten times as long.
+    bound is 0 where contact can be avoided. Harm that may come only after the horizon counts as 0.
 
     With brake build-up the bound holds for any command at any time and is looser. It has no verdict on contact:
     ``contact`` is None if brakes build up in any of the worlds.
 
+    Args:
+        worlds: the worlds now, [n].
+        vehicle: index of the controlled vehicle, from 0.
+        harm_count: ``first`` or ``total``. With ``first``, the next impact of a pair that was hit before counts as 0.
+        horizon_s: time until which harm counts, s (absolute).
+        scripts: name of each other vehicle's script by index; only checked to be full_brake. None: full_brake.
+        time_step_s: time between two decisions, s. The bound is then proven only for commands that change at decisions:
+            the first one when the vehicle may act, then one every ``time_step_s``, as for every agent. That is sharper,
+            and takes ten times as long. None: commands may change at any time.
+
     Covers the same lines as ``avoidability``. Raises ``InvalidInput`` for other lines, for an unknown ``harm_count``, a
     time step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before the vehicle may act.
+
     """
     check_asked("lower_bound", harm_count, horizon_s, time_step_s)
     slow = worlds.vehicles.build_up

@@ -129,8 +129,8 @@ def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
     Args:
         at: one world, as the columns of ``line.LINE``.
         drive: duration of the drive, s; infinite: drive all the time.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
@@ -148,8 +148,8 @@ def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
     Args:
         at: one world, as the columns of ``line.LINE``.
         brake: duration of the braking, s.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])
@@ -168,8 +168,8 @@ def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Flo
         at: one world, as the columns of ``line.LINE``.
         drive: duration of the drive, s.
         until: end of the comparison, s.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
@@ -186,8 +186,8 @@ def stays_behind(at: Floats, brake: float, until: float, plan: Floats, other: Fl
         at: one world, as the columns of ``line.LINE``.
         brake: duration of the braking, s.
         until: end of the comparison, s.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])

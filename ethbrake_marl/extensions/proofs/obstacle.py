@@ -81,8 +81,8 @@ def least_beyond(
         place: least position of the centre of mass of all three at ``late``, m.
         speed: its speed at ``late``, m/s.
         least: bound that is known before, m2/s2; the result is at least this.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     if not speed > 0.0:
@@ -208,8 +208,8 @@ def behind_leader(
         beyond: largest squared speed with which the front vehicle hits the obstacle, m2/s2.
         place: least position of the centre of mass of all three at ``late``, m.
         speed: its speed at ``late``, m/s.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     wall, drive, onset = at[LINE.GAP_L] + at[LINE.WALL], at[LINE.U_F], at[LINE.ONSET_R]
@@ -288,8 +288,8 @@ def after_at_obstacle(
         soft: least closing speed of the contact, m/s.
         hard: largest closing speed of the contact, m/s.
         follows: known lower bound on the harm at the rear pair, m2/s2.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     share = at[LINE.FRONT_SHARE]
@@ -329,8 +329,8 @@ def beyond_rear(
         late: latest time of the first contact, s.
         closing: largest closing speed of the contact, m/s.
         least: bound that is known before, m2/s2; the result is at least this.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     v_l, way_l = leader(at, late)
@@ -356,8 +356,8 @@ def after_rear(
         closing: largest closing speed of the contact, m/s.
         end: time until which the command of the earlier decision stays in force, s.
         lack: least amount by which that command falls short of the best one, m/s2.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
@@ -399,8 +399,8 @@ def after(
         closing: largest closing speed of the contact, m/s.
         end: time until which the command of the earlier decision stays in force, s.
         lack: least amount by which that command falls short of the best one, m/s2.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
 
     """
     if kind >= RAMPED_FRONT:

@@ -46,8 +46,8 @@ def combined_ramped(
         front: bound on the harm of the front pair alone, m2/s2.
         rear: bound on the harm of the rear pair alone, m2/s2.
         contact_s: time by which some contact is certain, s; infinite: unknown.
-        plan: working memory for one plan.
-        other: working memory for a second plan.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
         heap: working memory of the search, [CELLS, NEAR].
 
     """

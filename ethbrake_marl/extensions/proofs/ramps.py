@@ -70,8 +70,7 @@ def fill_switch(
         low: size of the least force.
         fall: rate at which the force falls, m/s3.
         switch: time at which it begins to fall, s. A value from -1 to 0, for an infinite ``rise``, means to start at
-            once
-            from a part of the way up.
+            once from a part of the way up.
         time: time at which ``final`` holds, s.
         final: force at ``time``; -inf: no such condition.
 

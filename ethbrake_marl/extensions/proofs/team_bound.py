@@ -126,21 +126,28 @@ def team_bound(
     scripts: Mapping[int, str] | None = None,
     time_step_s: float | None = None,
 ) -> TeamBound:
-    """Return a proven lower bound on the harm from now to ``horizon_s`` (absolute), over all commands of ``vehicles``.
+    """Return a proven lower bound on the harm of every world, over all joint commands of several vehicles.
 
     ``harm = early + obstacle + max(pairs[:, 0] + pairs[:, 1], combined) + pairs[:, 2:]``, each part rounded outward. If
     Vehicle 1 is controlled, ``combined`` covers the obstacle and Vehicles 1 and 2: ``early + max(obstacle + pairs[:,
-    0], combined) + pairs[:, 1:]``.
-    All other vehicles brake with their whole capacity from their latencies on; ``scripts`` (index -> name) is only
-    checked to say the same. Harm that may come only after the horizon counts as 0. With ``harm_count`` "first", the
-    next impact of a pair that was hit before counts as 0 too. A single controlled vehicle is allowed; ``lower_bound``
-    is sharper where it covers the line.
+    0], combined) + pairs[:, 1:]``. Harm that may come only after the horizon counts as 0.
 
-    With ``time_step_s`` the bound is proven only for commands that change at decisions: the first one when the first of
-    the vehicles may act, then one every ``time_step_s``. That is sharper if Vehicle 2 is the first one.
+    All other vehicles brake with their whole capacity from their latencies on. A single controlled vehicle is allowed;
+    ``lower_bound`` is sharper where it covers the line.
+
+    Args:
+        worlds: the worlds now, [n].
+        vehicles: indices of the controlled vehicles, from 0.
+        harm_count: ``first`` or ``total``. With ``first``, the next impact of a pair that was hit before counts as 0.
+        horizon_s: time until which harm counts, s (absolute).
+        scripts: name of each other vehicle's script by index; only checked to be full_brake. None: full_brake.
+        time_step_s: time between two decisions, s. The bound is then proven only for commands that change at decisions:
+            the first one when the first of the vehicles may act, then one every ``time_step_s``. That is sharper if
+            Vehicle 2 is the first one. None: commands may change at any time.
 
     Raises ``InvalidInput`` for vehicles that are empty, unknown or repeated, another script, an unknown count, a time
     step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before any of them may act.
+
     """
     check_asked("team_bound", harm_count, horizon_s, time_step_s)
     # sort the controlled vehicles, and refuse what the bound does not cover

@@ -30,8 +30,7 @@ def estimates_figure(
         y_label: label of the y axis.
         caption: text below the figure.
         x_label: label of the x axis if x is a number: lines with bands are drawn. Empty: x is a text, and groups of
-            bars
-            are drawn.
+            bars are drawn.
 
     """
     figure, every = new_panels((4.6 * len(panels), 4.2), columns=len(panels), sharey=True)

@@ -134,8 +134,7 @@ def search_list(
         threads: number of threads; None: one for each core.
         known: a table whose profiles the search starts with; None: no table.
         chunks: folder in which each finished chunk is stored as a file. A later call with the same arguments reads it;
-            a
-            file of other arguments is computed again and replaced. None: nothing is stored.
+            a file of other arguments is computed again and replaced. None: nothing is stored.
         on_progress: called with the number of worlds done and their total.
 
     """

@@ -62,8 +62,7 @@ class Outlook(NamedTuple):
         Args:
             worlds: the worlds now, [n]; only their time is read.
             memory: holds ``commands_mps2`` [n, decisions], one command for each decision, and ``start_s`` [n], the time
-                of the
-                first one.
+                of the first one.
 
         """
         step = Decisions(memory["start_s"], self.time_step_s).latest(worlds.time_s)
