@@ -19,7 +19,7 @@ from ethbrake_marl.shield.guard import StepGuard
 
 
 class RobustMode(IntEnum):
-    """Code of mode ``robust`` in the info ``shield_mode``; ``eb.ShieldMode`` has the other codes."""
+    """Number that stands for mode ``robust`` in the info ``shield_mode``; ``eb.ShieldMode`` has the other modes."""
 
     ROBUST = 2
 
@@ -39,10 +39,11 @@ class RobustGuard(StepGuard):
 
 
 class BelievedGuard(ShieldGuard):
-    """Guard of modes ``step`` and ``robust`` in the estimated world, around a ``BelievedShield``.
+    """Guard of modes ``step`` and ``robust`` in the estimated world: connects a ``BelievedShield`` with a running
+    engine.
 
-    Its bound exists from the first decision on and holds in the estimated world. The motion is not compared with the
-    prediction, because an estimate may be wrong without a fault of the system.
+    Its bound on harm exists from the first decision on and holds in the estimated world. The motion is not compared
+    with the prediction, because an estimate may be wrong without a fault of the system.
     """
 
     def _started(self, shield: BelievedShield, alert: Worlds, rows: Ints) -> BelievedShield:

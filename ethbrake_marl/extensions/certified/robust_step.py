@@ -64,7 +64,7 @@ class RobustShield(StepShield):
 
     @property
     def possible_are(self) -> str:  # type: ignore[override]  # a constant there
-        """Description of a world's members (possible worlds) for error messages."""
+        """Words for a world's members (possible worlds) in error messages, for instance "uncertainty: gaps_m=0.5"."""
         return f"uncertainty: {self.uncertainty}"
 
     def members_of(self, worlds: Worlds) -> Worlds:

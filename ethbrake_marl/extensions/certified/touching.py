@@ -70,8 +70,9 @@ def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
 
 @compiled(apart=True)
 def apart(touch: Floats) -> float:
-    """Return the largest difference of speeds of a pair in contact, m/s. ``touch`` is its state, a row of
-    ``Path.touch``.
+    """Return the largest difference of speeds of a pair in contact, m/s.
+
+    ``touch`` [TOUCH_WIDTH] is its state, a row of ``Path.touch``.
     """
     return float(max(touch[OPENING], touch[CLOSING], 0.0))
 
@@ -98,15 +99,14 @@ def backwards(cell: Cell, p: int) -> float:
 
 @compiled(apart=True)
 def stray(cell: Cell, touch: Floats, p: int) -> float:
-    """Return the largest difference between the speed of a pair's centre of mass and its affine form, m/s.
+    """Return the largest difference between the speed of a pair's centre of mass and the speed in its affine form, m/s.
 
-    In a world that creeps (one of the two vehicles stands or moves backwards), the form's speed lies between 0 and
+    It is above 0 only if one of the two vehicles may stand or move backwards. The form's speed then lies between 0 and
     ``CREEP``, the rear vehicle's between minus ``backwards`` and 1 times ``CREEP``, and the front vehicle's between 0
     and ``faster`` times ``CREEP``: no impact makes a rear vehicle faster.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
+        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
         touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``.
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
 
@@ -131,8 +131,9 @@ def blur(cell: Cell, path: Path, p: int, side: int) -> float:
 
 @compiled(apart=True)
 def begin_touch(touch: Floats) -> None:
-    """Reset ``touch``, the state of a pair in contact, in place. The columns of the present piece (SPREAD, REACH)
-    stay.
+    """Reset the state of a pair in contact, in place; the columns of the present piece (SPREAD, REACH) stay.
+
+    ``touch`` [TOUCH_WIDTH] is the state, a row of ``Path.touch``.
     """
     spread, reach = touch[SPREAD], touch[REACH]  # columns of the present piece
     touch[:] = 0.0
@@ -304,17 +305,16 @@ def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
 
 @compiled(apart=True)
 def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length: float, vague: float) -> None:
-    """Update the relative speed and the gap of pair ``p`` in contact over the present piece.
+    """Update the relative speed and the gap of pair ``p``, which is in contact, over the present piece.
 
-    The closing acceleration is between ``least`` and ``most``. An impact never increases the relative speed, so it
-    grows at most by what the commands add. While the pair is pressed together by b between b- and b+, it does not grow:
-    from gap g and relative speed w, a flight never exceeds the gap h = g + w^2 / (2 b-) and closes with at most sqrt(2
-    b+ h); the impact leaves the share e of that. This is less than before if e sqrt(b+ / b-) < 1. (Where a vehicle
-    creeps, its holding brakes make a flight lower and slower.)
+    An impact never increases the relative speed, so it grows at most by what the commands add. While the pair is
+    pressed together by b between b- (``least``) and b+ (``most``), it does not grow: from gap g and relative speed w, a
+    *flight* (the time between two impacts) never exceeds the gap h = g + w^2 / (2 b-) and closes with at most sqrt(2 b+
+    h); the impact leaves the share e (restitution) of that. This is less than before if e sqrt(b+ / b-) < 1. (Where one
+    vehicle stands or moves backwards, its holding brakes make a flight lower and slower.)
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
+        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
         touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``; changed in place.
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         least: least closing acceleration, m/s2.
@@ -351,7 +351,8 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
 def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: float, most: float) -> None:
     """Start a new phase of a contact: the pair is now pressed together harder or less hard than in the phase before.
 
-    The new range covers both phases if the bound by flights allows it, else the new phase alone.
+    The new phase covers the accelerations of both if the relative speed then still decays from impact to impact, else
+    its own accelerations alone.
 
     Args:
         touch: state of the pair in contact, a row of ``Path.touch``; changed in place.
@@ -378,8 +379,9 @@ def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: fl
 def settle(touch: Floats, e: float, length: float) -> None:
     """Reset the state of a contact if the pair certainly moves as one by the end of the present piece.
 
-    A flight that begins with separating speed s takes at most 2 s / b- and closes with at most s sqrt(b+ / b-). So
-    after 2 s / (b- (1 - e sqrt(b+ / b-))) the two move as one, unless one of them creeps.
+    The closing acceleration lies between b- and b+. A *flight* (the time between two impacts) that begins with
+    separating speed s takes at most 2 s / b- and closes with at most s sqrt(b+ / b-). So after 2 s / (b- (1 - e sqrt(b+
+    / b-))) the two move as one, unless one of them stands or moves backwards.
 
     Args:
         touch: state of the pair in contact, a row of ``Path.touch``; changed in place.

@@ -218,7 +218,8 @@ def parse_uncertainty(text: str) -> Uncertainty:
 
 
 def _values(worlds: Worlds, quantity: str) -> Floats:
-    """Return the reported values of a quantity: [n, N], [n, P], or [n, 1] for friction.
+    """Return the reported values of ``quantity`` (one of ``QUANTITIES``): [n, N], [n, P] for gaps, or [n, 1] for
+    friction.
 
     Capacities are those on a dry road.
     """

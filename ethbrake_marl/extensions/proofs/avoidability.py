@@ -161,8 +161,7 @@ def met(gap: float, closing: float) -> bool:
 def leader_at_onset(
     gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, start: float
 ) -> tuple[float, float]:
-    """Return the gap to the leader (m) and its speed (m/s) at ``start``, when the follower may act; it coasts until
-    then.
+    """Return gap to the leader (m) and speed of the leader (m/s) at ``start``, until when the follower coasts.
 
     The leader brakes by then. The gap is concave until then: if it is not negative at the end, it never was.
 
@@ -181,7 +180,7 @@ def leader_at_onset(
 
 @compiled
 def decide_front(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: int, out: Floats) -> bool:
-    """Decide whether vehicle ``i`` stays behind the front vehicle by full braking. Return False if it certainly does
+    """Decide whether vehicle ``i`` stays behind the front vehicle by full braking; return False if it certainly does
     not.
 
     Args:
@@ -190,7 +189,7 @@ def decide_front(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: 
         onset: [N] times from which on the vehicles may brake, s.
         braking: [N] braking capacities, m/s2.
         i: index of the controlled vehicle, at least 1.
-        out: [RESULT_WIDTH] receives columns REASON, MARGIN and SPARE.
+        out: [RESULT_WIDTH] receives columns REASON (a code), MARGIN and SPARE (both m) of the verdict.
 
     """
     a_l, v_f, a_f = braking[i - 1], speed[i], braking[i]
@@ -267,7 +266,9 @@ def decide_world(
 ) -> None:  # fmt: skip
     """Decide whether vehicle ``i`` can avoid contact in one world, and write the verdict to ``out``.
 
-    DRIVE and TOUCH in the verdict count from the time at which vehicle ``i`` may act.
+    Columns of the verdict: REASON (AVOIDABLE, EARLY, FRONT or REAR), MARGIN (m) as in ``Avoidability``, SPARE (m; part
+    of the gap that full braking does not need), DRIVE and TOUCH (s after vehicle ``i`` may act; end of the drive, and
+    of the full braking after it), FOLLOW (m/s2; the command after that).
 
     Args:
         gap: [P] gaps, m.
@@ -279,7 +280,7 @@ def decide_world(
         i: index of the controlled vehicle.
         plan: [2, PIECES] working memory.
         rear: [2, PIECES] working memory.
-        out: [RESULT_WIDTH] receives the verdict (columns REASON to FOLLOW).
+        out: [RESULT_WIDTH] receives the verdict.
 
     """
     out[REASON], out[MARGIN], out[SPARE] = AVOIDABLE, math.inf, math.inf
@@ -360,7 +361,7 @@ class Avoidability:
 
     @property
     def reason_name(self) -> NDArray[np.str_]:
-        """Name of the reason, [n]: one of ``REASONS``."""
+        """Name of the reason in each world, [n]: "" if contact is avoidable, else "early", "front" or "rear"."""
         return np.array(REASONS)[self.reason]
 
 

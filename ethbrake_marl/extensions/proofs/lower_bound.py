@@ -127,15 +127,15 @@ def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, o
 
 @compiled(apart=True)
 def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple[float, float, bool]:
-    """Return the latest contact (s) with the front vehicle, and the latest one before any contact with the rear
-    vehicle.
+    """Return the latest contact (s) with the front vehicle, and the latest one (s) that comes before the rear vehicle
+    arrives.
 
     The third result says whether the front vehicle may be met first arbitrarily late and softly.
 
     Args:
         at: one world, as the columns of ``line.LINE``.
         first: earliest contact with the front vehicle, s.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        plan: working memory, from ``empty_plan``.
         other: further working memory of the same kind.
 
     """

@@ -122,8 +122,7 @@ def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float
 
 @compiled
 def last_drive(room: float, speed: float, brakes: float, drive: float, time: float) -> float:
-    """Return for how long (s) a vehicle must drive at the end to be ``room`` further after ``time``, if it brakes
-    before.
+    """Return for how long (s) a vehicle must drive at the end of ``time``, after braking, to be ``room`` further then.
 
     Infinite if it cannot.
 

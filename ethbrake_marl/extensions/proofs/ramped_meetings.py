@@ -310,11 +310,11 @@ def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Flo
 
 @compiled(apart=True)
 def meet_ramped(kind: int, at: Floats, sign: float, plan: Floats, other: Floats) -> tuple[float, float, float]:
-    """Return contact time, closing speed and least forced closing speed with a neighbour under full drive or full
-    braking.
+    """Return time and closing speed of the contact with a neighbour under full drive or full braking, with brake
+    build-up.
 
-    The contact time (s) is infinite and the speeds (m/s) are 0 if they never meet. ``meeting`` explains the third
-    result.
+    The time (s) is infinite and the speed (m/s) 0 if they never meet. The third result is the least closing speed (m/s)
+    of any motion of the pair that is at no time farther apart than these two.
 
     Args:
         kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
@@ -349,7 +349,7 @@ LEAST_PART = 100  # least number of worlds per thread; fewer are not worth a thr
 
 @dataclass(frozen=True, slots=True)
 class LowerBound:
-    """Proven bounds on each world, [n] m2/s2."""
+    """Proven bounds on the harm of each world, [n] m2/s2 each."""
 
     harm: Floats  # lower bound on the total harm: no command profile does less
     early: Floats  # harm before the controlled vehicle may act

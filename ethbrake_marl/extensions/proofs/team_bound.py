@@ -101,7 +101,7 @@ def _combined_bound_of_line(
 
 @dataclass(frozen=True, slots=True)
 class TeamBound:
-    """Proven bounds on each world, [n] m2/s2."""
+    """Proven bounds on the harm of each world, [n] m2/s2 each."""
 
     harm: Floats  # lower bound on the total harm: no joint command does less
     early: Floats  # harm before any controlled vehicle may act

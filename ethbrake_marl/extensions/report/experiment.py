@@ -51,7 +51,7 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
     others, done = other_tests(evaluation.scenario), count()
 
     def begin(stage: str) -> None:
-        """Report the progress: a stage begins, or (empty) all stages have ended."""
+        """Report the progress: ``stage`` begins, or all stages have ended if it is empty."""
         tell(Progress(f"report{stage and ': '}{stage}", next(done), 2 + len(others)))
 
     is_papers = is_papers_test(evaluation.task, evaluation.seed)

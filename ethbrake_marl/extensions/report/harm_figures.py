@@ -103,9 +103,10 @@ def regret_distribution(evaluation: Evaluation) -> Figure:
 
 
 def harm_in_parts(evaluation: Evaluation) -> Figure:
-    """Draw each agent's mean harm as the best known harm plus its regret where contact is unavoidable and avoidable.
+    """Draw each agent's mean harm in three parts: best known harm, and regret where contact is unavoidable and
+    avoidable.
 
-    Raises ``InvalidInput`` if nothing is proven about the worlds.
+    *Regret* is harm minus best known harm. Raises ``InvalidInput`` if nothing is proven about the worlds.
     """
     regrets = regrets_of(evaluation)
     if regrets is None:

@@ -77,7 +77,7 @@ class Part:
 
     @classmethod
     def opened(cls, title: str, parts: Sequence[Part]) -> Part:
-        """Return parts that are hidden until the reader clicks on their title."""
+        """Return ``parts`` under a title; they are hidden until the reader clicks on the title."""
         return cls._around("<details><summary>{}</summary>\n{}</details>\n", parts, shown(title))
 
     @classmethod
@@ -250,10 +250,10 @@ class Page:
 
     """
 
-    title: str
-    sections: Sequence[Section]
-    lead: str = ""
-    opening: Sequence[Part] = ()
+    title: str  # title of the page
+    sections: Sequence[Section]  # sections in order
+    lead: str = ""  # text below the title
+    opening: Sequence[Part] = ()  # parts between the lead and the table of contents
 
     @cached_property
     def _parts(self) -> list[Part]:

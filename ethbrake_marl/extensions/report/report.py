@@ -66,7 +66,9 @@ def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) ->
 
 
 def avoidable_section(evaluation: Evaluation) -> Section:
-    """Return the section that splits collisions, harm and regret into avoidable and unavoidable contact."""
+    """Return the section that shows collisions, harm and regret separately for avoidable and for unavoidable
+    contact.
+    """
     regrets, limits = regrets_of(evaluation), limits_of(evaluation)
     body: list[str | Part] = []
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
@@ -295,7 +297,9 @@ class Report:
         return Section("Results", [*told, Part.box("Three words", WORDS), *_measured(rows, because)])
 
     def _episodes(self) -> Section:
-        """Return the section with episodes to watch, with notes on agents that drove differently the second time."""
+        """Return the section with episodes to watch. Notes name agents whose second drive differs from the
+        evaluation.
+        """
         evaluation, played = self.evaluation, self.played
         if not played:
             return Section("Episodes", ())

@@ -46,7 +46,7 @@ _NO_DATES: dict[str, dict[str, None]] = {  # metadata to leave out, because they
 
 
 class ShownFigure(Figure):
-    """A figure that a notebook displays, with or without pyplot."""
+    """A figure that a notebook displays by itself, with or without pyplot."""
 
     def draw(self, renderer: RendererBase) -> None:
         """Draw the figure. Saving a file draws twice; the first time only computes the layout, because nothing else is
@@ -185,7 +185,7 @@ def picture_bytes(figure: Figure, path: str | Path) -> bytes:
 
 
 def write_picture(path: str | Path, figure: Figure, *, force: bool = False) -> None:
-    """Write a figure as PNG, SVG or PDF, by the ending of ``path``. The file is written whole or not at all.
+    """Write ``figure`` to a PNG, SVG or PDF file, by the ending of ``path``. The file is written whole or not at all.
 
     Raises ``InvalidInput`` for another ending or a file that cannot be written, and ``AlreadyExists`` unless ``force``.
     """

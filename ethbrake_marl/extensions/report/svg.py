@@ -121,7 +121,7 @@ def _size_pt(root: ElementTree.Element) -> tuple[float, float]:
 
 
 def _is_ours(svg: bytes) -> bool:
-    """Return whether an SVG contains only elements and attributes that our figures have."""
+    """Return whether the bytes of an SVG contain only elements and attributes that our figures have."""
     try:
         level = [ElementTree.fromstring(svg)]
     except (ElementTree.ParseError, LookupError, ValueError):  # not XML, or an unknown encoding

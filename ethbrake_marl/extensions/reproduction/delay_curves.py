@@ -145,7 +145,8 @@ Courses = Mapping[str, Course]  # trainings by recipe
 def reproduce_curves(delay: str, settings: Reproduction) -> Made:
     """Reproduce the learning curves at one delay (``high`` or ``low``) from the trainings of ``--full``.
 
-    Without these trainings, the results of shipped policies at this delay take their place.
+    Returns verdicts, tables, figures and data. Without these trainings, the results of shipped policies at this delay
+    take their place.
     """
     courses = {
         each: {

@@ -135,11 +135,11 @@ def stated(name: str, value: str, where: str) -> Parameter:
 
 @model(frozen=True, config=WRITTEN)
 class Table:
-    """A table as text: each cell has a value and, if there is one, an interval."""
+    """A table as text, as it is stored in a result."""
 
     title: str  # title above the table
     head: Sequence[str]  # headings of the columns
-    rows: Sequence[Sequence[Shown]]  # cells of each row
+    rows: Sequence[Sequence[Shown]]  # cells of each row: a value and, if there is one, an interval
     note: str = ""  # text below the table
 
 
@@ -202,10 +202,10 @@ class Item:
     labels: tuple[str, ...]  # labels in the paper's source
     title: str  # title of the item
     what: str  # description of the paper's figure or table, one sentence
-    make: Callable[[Reproduction], Made]  # function that reproduces it
+    make: Callable[[Reproduction], Made]  # function that reproduces it with these settings
     most_s: float  # upper estimate of processor seconds with the paper's numbers of worlds
     trained: tuple[str, ...] = ()  # groups of trainings that it shows with ``--full``
-    play: Callable[[], Part] | None = None  # makes the player of episodes for its page
+    play: Callable[[], Part] | None = None  # function that returns the player of episodes for its page; None: no player
 
 
 def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

@@ -141,7 +141,10 @@ def over_distance(
 
 
 def reproduce_distance(settings: Reproduction) -> Made:
-    """Reproduce the harm of the four strategies over the total distance, and judge the paper's statements about it."""
+    """Reproduce the harm of the four strategies against the sum of both gaps; return figure, tables and verdicts.
+
+    The verdicts judge the paper's statements about it.
+    """
     episodes, braking = min(_DISTANCE_WORLDS, settings.episodes), NAMES[FULL_BRAKE]
     found, verdicts = {}, []
     for reading in READINGS:
@@ -176,7 +179,10 @@ _ONE, _LIST = "d = 7, 7 m; v = 20, 18, 20 m/s", "d = 5-10 m; v = 18-22 m/s"
 
 
 def reproduce_delays(settings: Reproduction) -> Made:
-    """Reproduce the harm of the four strategies at three delays, in the world of the paper's figure and in a list."""
+    """Reproduce the harm of the four strategies at three delays; return figures, tables and verdicts.
+
+    There is one figure for the world of the paper's figure, and one for a list of worlds.
+    """
     episodes = min(_DELAY_WORLDS, settings.episodes)
     found: dict[tuple[str, str], Groups] = {}  # by worlds and reading
     for reading in READINGS:

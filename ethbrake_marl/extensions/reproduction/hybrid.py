@@ -77,10 +77,12 @@ def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: s
 
 
 def reproduce_illustration(settings: Reproduction) -> Made:
-    """Reproduce the harm of E-V2X-BM, a policy that has not converged, and the hybrid of both, against the sum of gaps.
+    """Reproduce harm against the sum of both gaps, for E-V2X-BM, a policy that has not converged, and the hybrid of
+    both.
 
-    The *hybrid* is the paper's Algorithm 1: it chooses one of the two at the alert. The paper's claim that it
-    "consistently selects the strategy that results in lower harm" is judged in each world and in each group.
+    Returns figure, tables and verdicts. The *hybrid* is the paper's Algorithm 1: it chooses one of the two at the
+    alert. The paper's claim that it "consistently selects the strategy that results in lower harm" is judged in each
+    world and in each group.
     """
     found, verdicts = {}, []
     for reading in READINGS:
@@ -106,7 +108,10 @@ def reproduce_illustration(settings: Reproduction) -> Made:
 
 
 def reproduce_hybrid_table(settings: Reproduction) -> Made:
-    """Reproduce the paper's table of 5,000 episodes (``Table:hybrid``), with both possible sets of initial speeds."""
+    """Reproduce the paper's table of 5,000 episodes (``Table:hybrid``); return tables and verdicts.
+
+    The paper allows two sets of initial speeds; both are used.
+    """
     ours = {
         "E-V2X-BM": (NAMES[PAIRWISE], NAMES[COUPLED]),
         "Standalone DRL": (_ALONE,),
@@ -137,7 +142,9 @@ def reproduce_hybrid_table(settings: Reproduction) -> Made:
 
 
 def reproduce_random_table(settings: Reproduction) -> Made:
-    """Reproduce collisions, harm and its decrease of the four strategies in the random test (``Table:Random``)."""
+    """Reproduce collisions, harm and decrease of harm in the random test (``Table:Random``); return tables and
+    verdicts.
+    """
     episodes, besides = min(_RANDOM_WORLDS, settings.episodes), []
     ours: dict[str, tuple[str, ...]] = {
         "Non-E": (NAMES[FULL_BRAKE],),

@@ -47,10 +47,10 @@ AXES: dict[Against, tuple[str, str, type]] = {  # column, label of the axis, typ
 
 
 class LearningCurves(NamedTuple):
-    """Trainings of several recipes on one scenario, in ``folder/RECIPE-seedK`` for the seeds 0, 1, ... of each."""
+    """Trainings of several recipes with several seeds each on one scenario, stored in ``folder/RECIPE-seedK``."""
 
     scenario: Scenario  # scenario of all trainings
-    plan: Sequence[tuple[TrainingRecipe, int]]  # recipes, each with its number of seeds
+    plan: Sequence[tuple[TrainingRecipe, int]]  # recipes, each with its number of seeds: 0, 1, ...
     folder: Path  # folder of the trainings, the figure and the tables
     against: Against = "steps"  # quantity on the x axis: ``steps`` or ``cpu``
 
@@ -101,7 +101,7 @@ class LearningCurves(NamedTuple):
             return train_all(trainings, jobs, tell)
 
     def write(self) -> dict[str, Any]:
-        """Draw the finished trainings, write figure, table and summary, and return the summary.
+        """Draw the finished trainings, write figure, table and summary to the folder, and return the summary.
 
         For each recipe the summary has: the harm of the policy that each training kept, and of its last policy, as
         interquartile mean over seeds with a stratified bootstrap interval; hashes of the recipe's fixed list and of the

@@ -119,11 +119,11 @@ _SHOWN = tuple(NAMES[spec] for spec in _SPECS)
 
 @dataclass(frozen=True, slots=True)
 class Headline:
-    """Harm and collisions of each strategy in each world of a list."""
+    """Main results on a list of n worlds: harm and collisions of each strategy."""
 
-    gaps_m: Floats  # [n, P] gaps, to recognise lists of the same worlds
-    harm: Mapping[str, Floats]  # by strategy, [n] m2/s2
-    collided: Mapping[str, Bools]  # by strategy, [n]
+    gaps_m: Floats  # [n, P] gaps at the alert, m, to recognise lists of the same worlds
+    harm: Mapping[str, Floats]  # strategy -> harm, [n] m2/s2
+    collided: Mapping[str, Bools]  # strategy -> True for worlds with a collision, [n]
 
     def change(self, base: Headline, strategy: str) -> Estimate:
         """Return the change of a strategy's mean harm against ``base``, m2/s2.
@@ -137,7 +137,10 @@ class Headline:
 
 
 def reproduce_gaps(settings: Reproduction) -> Made:
-    """Make the table of sensitivities: every open quantity, our default, alternatives, and how far the results move."""
+    """Measure how far the results on the random test move when one quantity that the paper leaves open changes.
+
+    Returns a register of the open quantities, tables, a figure and verdicts.
+    """
     episodes, scenario = min(2_000, settings.episodes), load_scenario(RANDOM)
     base = _measure(scenario, Alternative("default"), episodes)
     measured = [gap for gap in GAPS if gap.alternatives]

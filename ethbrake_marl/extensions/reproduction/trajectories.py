@@ -51,7 +51,10 @@ Records = dict[tuple[Reading, int, str], EpisodeRecord]  # by reading, scenario 
 
 
 def reproduce_trajectories(settings: Reproduction) -> Made:
-    """Reproduce the positions of the three vehicles in the paper's Scenarios 1 and 2, on the road and over time."""
+    """Reproduce the vehicles' positions in the paper's Scenarios 1 and 2, on the road and over time.
+
+    Returns figures, a table and verdicts.
+    """
     records, figures, verdicts = _record_all(settings), {}, []
     for reading, stem in zip(READINGS, ("stated", "early"), strict=True):
         own = {f"{name}, Scenario {k}": records[reading, k, name] for name in _POLICIES for k in _SCENARIOS}
@@ -88,7 +91,7 @@ def reproduce_trajectories(settings: Reproduction) -> Made:
 
 
 def reproduce_accelerations(settings: Reproduction) -> Made:
-    """Reproduce the commands of Vehicle 2 in the paper's Scenarios 1 and 2."""
+    """Reproduce the commands of Vehicle 2 in the paper's Scenarios 1 and 2; return figure, table and verdicts."""
     records, verdicts = _record_all(settings), []
     driven = {key: _asked_of_vehicle_2(record) for key, record in records.items()}
     panels = {
@@ -202,8 +205,11 @@ def _apart(records: Records, reading: Reading, what: str) -> list[float]:
 def _judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Reading, show: Column) -> list[Verdict]:
     """Return a verdict on each claim about one world, without intervals.
 
-    ``claims`` maps a claim to a text with the numbers, the number that should be smaller, and the larger one. ``show``
-    is the format of their difference.
+    Args:
+        claims: claim -> text with the numbers, number that should be smaller, number that should be larger.
+        reading: assumption on when Vehicle 2 may act, for the text of the verdict.
+        show: format of the difference.
+
     """
     return [
         judge_statement(f"{claim} ({reading.name})", [Less(told, Estimate(smaller - larger, None))], show=show)

@@ -310,7 +310,9 @@ def _searched(
 
 
 def _startable(profiles: Profiles) -> Profiles:
-    """Replace profiles with too many phases for a search by their first command, held to the end."""
+    """Return profiles that a search can start with: a profile with too many phases becomes its first command, held to
+    the end.
+    """
     ends, commands = Profiles.padded([profiles], MOST_PHASES)[0]
     last = ends[:, -1:]
     short = ends[:, MOST_PHASES - 1 : MOST_PHASES] == last

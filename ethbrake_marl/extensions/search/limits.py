@@ -22,7 +22,7 @@ _DECIDED = ({1}, {1, 2})  # controlled vehicles, of three, for which avoidabilit
 
 
 class IncompleteTable(UserWarning):
-    """Warning that a table of best known harm covers only some of the worlds."""
+    """Warning that a table of best known harm covers only some of the worlds of an evaluation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,10 +176,10 @@ def _is_team(task: Task) -> bool:
 
 
 def _script_because(task: Task, proven: str) -> str | None:
-    """Return a clause that names a vehicle of the task which follows another script than full_brake; None if there is
-    none.
+    """Return a clause that names a vehicle which follows another script than full_brake; None if there is none.
 
-    ``proven`` is the subject of the clause, for instance "avoidability is proven".
+    ``task`` names the scenario and the controlled vehicles; ``proven`` is the subject of the clause, for instance
+    "avoidability is proven".
     """
     scenario = task.scenario
     for i in range(scenario.vehicles):

@@ -114,10 +114,14 @@ def apply_change(change: Floats, bounds: Floats, ends: Ints, commands: Floats) -
 
 @compiled
 def compact(ends: Ints, commands: Floats, phases: int) -> int:
-    """Remove empty phases and join equal neighbours among the first ``phases`` of a profile, in place; return how many
-    are left.
+    """Remove empty phases of a profile and join neighbouring ones with equal commands, in place; return how many are
+    left.
 
-    ``ends`` [K] are the steps at which phases end, ``commands`` [K, C] their commands.
+    Args:
+        ends: [K] steps at which the phases end.
+        commands: [K, C] commands of the phases, m/s2.
+        phases: number of phases in use before.
+
     """
     last, kept = ends[ends.shape[0] - 1], 0
     for k in range(phases):
