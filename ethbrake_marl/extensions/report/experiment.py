@@ -149,7 +149,8 @@ def write_figures(
 
 
 def telling_world(evaluation: Evaluation, harm_count: HarmCount = "first") -> int:
-    """Return the row of the world to draw: the median of the policy's reductions of harm, where full braking does harm.
+    """Return the row of the world to draw: the median by the policy's reduction of harm, of worlds where full braking
+    does harm.
 
     Returns 0 if full braking does no harm in any world. ``harm_count`` is ``first`` or ``total``.
     """

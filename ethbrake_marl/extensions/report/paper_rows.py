@@ -73,7 +73,11 @@ def is_papers_test(task: Task, seed: int | None) -> bool:
 
 
 def check_papers_test(task: Task, seed: int | None) -> None:
-    """Raise ``InvalidInput`` unless results can stand beside the paper's rows (``is_papers_test``)."""
+    """Raise ``InvalidInput`` unless the paper's rows apply: ``task`` controls Vehicle 2 in a list of the paper's random
+    test.
+
+    ``seed`` is the seed of the list; None: unknown, which raises.
+    """
     if not is_papers_test(task, seed):
         raise InvalidInput(
             f"paper: the paper's rows are about Vehicle 2 in a list of {' or '.join(_SHOWN_WITH)} as shipped, and these"

@@ -88,7 +88,7 @@ def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
 
 
 def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
-    """Return the quantities to draw in pairs: label -> values [n].
+    """Return the quantities of ``worlds`` to draw in pairs: label -> values [n].
 
     One vehicle (or pair) of each quantity that varies comes first, the nearest to vehicle ``focus``; then further ones.
     """

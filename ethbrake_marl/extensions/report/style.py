@@ -49,8 +49,9 @@ class ShownFigure(Figure):
     """A figure that a notebook displays by itself, with or without pyplot."""
 
     def draw(self, renderer: RendererBase) -> None:
-        """Draw the figure. Saving a file draws twice; the first time only computes the layout, because nothing else is
-        kept.
+        """Draw the figure with matplotlib's ``renderer``.
+
+        Saving a file draws twice; the first pass only computes the layout, because its picture is not used.
         """
         engine = self.get_layout_engine()
         if self.axes and isinstance(engine, ConstrainedLayoutEngine) and self.canvas.is_saving():

@@ -96,7 +96,7 @@ def _in_pairs(panels: int, height_in: float, x: str, y: str) -> tuple[Figure, li
 def profiles_figure(panels: Mapping[str, Mapping[str, EpisodeRecord]], *, caption: str) -> Figure:
     """Draw the command of the controlled vehicle over time: one panel per title, one line per label.
 
-    ``panels`` maps the title of a panel to the recorded episodes, by the label of their line.
+    ``panels`` maps the title of a panel to recorded episodes by the label of their line; ``caption`` is the text below.
     """
     figure, every = _in_pairs(len(panels), 2.3, "Time since Vehicle 1 began to brake (s)", "Command (m/s²)")
     for axes, (title, records) in zip(every, panels.items(), strict=False):

@@ -133,7 +133,7 @@ def unproven_because(worlds: Worlds, task: Task) -> str | None:
 def undecided_because(worlds: Worlds, task: Task) -> str | None:
     """Return the reason why it is not decided whether contact can be avoided, as a clause; None if it is decided.
 
-    ``task`` names the scenario and the controlled vehicles.
+    ``worlds`` are at the alert; ``task`` names the scenario and the controlled vehicles.
     """
     return _uneven_because(worlds) if worlds.vehicles.build_up.any() else _uncovered_because(worlds, task)
 

@@ -375,7 +375,15 @@ def largest(values: Floats) -> int:
 
 @compiled(apart=True)
 def divide(world: SearchWorld, field: Population) -> None:
-    """Divide phases of the best profile of the field, in place, until it has the largest number of phases."""
+    """Divide phases of the best profile of the field, in place, until it has the largest number of phases.
+
+    The longest phase is halved first; only the first ``ATTENTION_STEPS`` steps count.
+
+    Args:
+        world: the world, with its commands, bounds and random stream.
+        field: the profiles that are improved together.
+
+    """
     used = field.phases[0]
     if used > 0 and field.values[0] > 0.0:
         K = field.ends.shape[1]
