@@ -52,8 +52,8 @@ class Approach(NamedTuple):
 
 @compiled(apart=True)
 def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
-    """Return by how much neighbouring pairs in contact may change a pair's relative speed (m/s) or gap (m) in this
-    piece.
+    """Return by how much neighbouring pairs in contact may change the relative speed (m/s) or the gap (m) of pair
+    ``p``.
 
     Args:
         cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of

@@ -41,8 +41,7 @@ SURPRISE = 1e-6  # tolerance (m, m/s) between a measurement and its prediction
 
 
 def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
-    """Restore the harm so far after a restart of the shield in ``rows``; keep the rest of the old plan if it harms no
-    more.
+    """After a restart of the shield in ``rows``, restore the harm so far, and keep the old plan where it is no worse.
 
     ``shield`` was just restarted and is changed; ``before`` is its copy from before the restart.
     """

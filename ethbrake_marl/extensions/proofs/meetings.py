@@ -121,8 +121,8 @@ def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
 
 @compiled(apart=True)
 def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
-    """Return the time (s) at which the controlled vehicle meets the front one if it drives for ``drive`` s, then
-    brakes.
+    """Return the time (s) at which the controlled vehicle, which drives for ``drive`` s and then brakes, meets the
+    front one.
 
     Infinite if they never meet.
 
@@ -140,7 +140,7 @@ def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
-    """Return the time (s) at which the rear vehicle meets the controlled one if that brakes for ``brake`` s, then
+    """Return the time (s) at which the rear vehicle meets the controlled one, which brakes for ``brake`` s, then
     drives.
 
     Infinite if they never meet.

@@ -46,7 +46,7 @@ def combined_ramped(
         front: bound on the harm of the front pair alone, m2/s2.
         rear: bound on the harm of the rear pair alone, m2/s2.
         contact_s: time by which some contact is certain, s; infinite: unknown.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        plan: working memory, from ``empty_legs``.
         other: further working memory of the same kind.
         heap: working memory of the search, [CELLS, NEAR].
 

@@ -29,8 +29,8 @@ from ethbrake_marl.files.store import write_file, write_output
 
 
 def choose_items(names: Sequence[str]) -> list[Item]:
-    """Return the items (figures and tables of the paper) with these names, in the order of the paper; all without
-    names.
+    """Return the items (figures and tables of the paper) with these names, in the order of the paper; if none is named,
+    all.
 
     Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for a repeated name.
     """

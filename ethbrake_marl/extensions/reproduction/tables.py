@@ -42,9 +42,7 @@ class Beside:
 
     @cached_property
     def numbers(self) -> dict[str, dict[str, Estimate]]:
-        """Our results: strategy -> quantity (such as "collision rate") -> estimate. ``NOBODY`` has the proven
-        minimum.
-        """
+        """Our results, by strategy and by quantity (such as "collision rate"). ``NOBODY`` has the proven minimum."""
         found, braking = {}, self.evaluation.outcomes.get(NAMES[FULL_BRAKE])
         for name, outcome in self.evaluation.outcomes.items():
             harm, predicted = outcome.first_impact_harm, outcome.predicted_harm
