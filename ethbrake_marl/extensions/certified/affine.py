@@ -166,9 +166,9 @@ def positive_part(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def cut(x: Floats, least: float, most: float) -> Floats:
-    """Return an affine form of the same number as ``x``, which is known to lie between ``least`` and ``most``.
+    """Return an affine form [W] of the same number as ``x``, which is known to lie between ``least`` and ``most``.
 
-    The result is the interval where it is tighter than the form, else the form itself.
+    The result is the form of that interval if the interval is tighter than ``x``, else ``x`` itself.
     """
     inside_low, inside_high = max(low(x), least), min(high(x), most)
     if inside_high - inside_low < radius(x):

@@ -218,8 +218,7 @@ def parse_uncertainty(text: str) -> Uncertainty:
 
 
 def _values(worlds: Worlds, quantity: str) -> Floats:
-    """Return the reported values of ``quantity`` (one of ``QUANTITIES``): [n, N], [n, P] for gaps, or [n, 1] for
-    friction.
+    """Return the reported values of one of ``QUANTITIES``: [n, N], for gaps [n, P], for friction [n, 1].
 
     Capacities are those on a dry road.
     """

@@ -33,13 +33,19 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
 @compiled
 def fill_leader(at: Floats, plan: Floats) -> None:
-    """Write the motion plan of the front vehicle, if nobody touches it, to ``plan`` [3, LEGS]. ``at`` is one world."""
+    """Write the plan of the front vehicle, if nobody touches it, to ``plan`` [3, LEGS].
+
+    A *plan* is a profile of piecewise linear acceleration. ``at`` is one world (columns of ``line.LINE``).
+    """
     fill_build_up(plan, 0.0, at[LINE.FORCE_L], -at[LINE.A_L], at[LINE.FALL_L])
 
 
 @compiled
 def fill_follower(at: Floats, plan: Floats) -> None:
-    """Write the motion plan of the rear vehicle, if nobody touches it, to ``plan`` [3, LEGS]. ``at`` is one world."""
+    """Write the plan of the rear vehicle, if nobody touches it, to ``plan`` [3, LEGS].
+
+    A *plan* is a profile of piecewise linear acceleration. ``at`` is one world (columns of ``line.LINE``).
+    """
     fill_build_up(plan, at[LINE.ONSET_R], at[LINE.FORCE_R], -at[LINE.A_R], at[LINE.FALL_R])
 
 

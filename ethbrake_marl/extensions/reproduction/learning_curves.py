@@ -80,10 +80,10 @@ class LearningCurves(NamedTuple):
 
         Args:
             steps: training steps of each training; None: the recipe's.
-            settings: ``KEY=VALUE`` changes that were made to the recipes, to be recorded.
+            settings: ``KEY=VALUE`` changes of scenario and recipe, only to be written to each training's
+                ``config.json``.
             jobs: number of trainings at a time.
             tell: called with the progress.
-
         """
         trainings = [
             TrainingJob(
