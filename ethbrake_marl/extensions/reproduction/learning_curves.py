@@ -84,6 +84,7 @@ class LearningCurves(NamedTuple):
                 ``config.json``.
             jobs: number of trainings at a time.
             tell: called with the progress.
+
         """
         trainings = [
             TrainingJob(
