@@ -270,7 +270,8 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
     """Compute the motion of every vehicle through one piece under its command, as if it were alone on the road.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
         piece: index of the piece, 0 to J - 1.
         motion: receives the result.
@@ -357,7 +358,8 @@ def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
     ``motion.rest`` and ``motion.vague`` of the vehicle are set too.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         i: index of the vehicle.
         piece: index of the piece, 0 to J - 1.
         motion: receives the result.
@@ -388,7 +390,8 @@ def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
     Changes ``onward``, ``reach``, ``pull`` and ``vague`` of the vehicle in ``motion``, in place.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         i: index of the vehicle.
         piece: index of the piece, 0 to J - 1.
         motion: motion of each vehicle in the present piece; changed in place.

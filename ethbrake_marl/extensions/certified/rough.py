@@ -41,8 +41,9 @@ def driven(cell: Cell, i: int, speed: float, since: float) -> float:
 
 @compiled(apart=True)
 def rough_harm(cell: Cell, path: Path, hit: int) -> float:
-    """Return an upper bound on the harm of all worlds of a path, from the present piece on, m2/s2. It follows no
-    motion.
+    """Return an upper bound on the harm of all worlds of a path, from the present piece on, m2/s2.
+
+    It uses only the largest speeds that the vehicles can still reach.
 
     Args:
         cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of

@@ -106,7 +106,8 @@ def stray(cell: Cell, touch: Floats, p: int) -> float:
     and ``faster`` times ``CREEP``: no impact makes a rear vehicle faster.
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``.
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
 
@@ -314,7 +315,8 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
     vehicle stands or moves backwards, its holding brakes make a flight lower and slower.)
 
     Args:
-        cell: the box of worlds, with its commands and its pieces (time intervals of constant command).
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
         touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``; changed in place.
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         least: least closing acceleration, m/s2.

@@ -161,7 +161,7 @@ def met(gap: float, closing: float) -> bool:
 def leader_at_onset(
     gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, start: float
 ) -> tuple[float, float]:
-    """Return gap to the leader (m) and speed of the leader (m/s) at ``start``, until when the follower coasts.
+    """Return gap to the leader (m) and speed of the leader (m/s) at ``start``, if the follower coasts until then.
 
     The leader brakes by then. The gap is concave until then: if it is not negative at the end, it never was.
 

@@ -48,23 +48,26 @@ def least_closing(
     start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, share: float,
     press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float, until: float,
 ) -> float:  # fmt: skip
-    """Return the least closing speed (m/s) of a second meeting until ``until``.
+    """Return the least closing speed (m/s) between the controlled vehicle and its other neighbour, after one it met
+    first.
 
-    The common speed is the speed of the centre of mass of the two vehicles that met first. The time is divided at one
-    of a few moments, because a loss of speed in the window counts only after it.
+    The *common speed* is the speed of the centre of mass of the two vehicles that met first. From the closing speed at
+    the common speed, the largest possible lead of the controlled vehicle over it is subtracted. Time is divided at one
+    of a few moments, because a loss of speed in the window counts only after it. Times count from the first contact, in
+    s.
 
     Args:
-        start: closing speed of the common speed at the first meeting, m/s.
+        start: closing speed at the common speed, at the first contact, m/s.
         slope: its rate of change, m/s2.
         turn: first time at which the rate changes, s.
         bend: change of the rate at ``turn``, m/s2.
         other_turn: second time at which the rate changes, s.
         other_bend: change of the rate at ``other_turn``, m/s2.
-        share: share of the first partner in both masses, 0 to 1.
-        press: acceleration with which the two close under the best command, m/s2.
+        share: share of the partner of the first contact in both masses, 0 to 1.
+        press: acceleration with which these two close under the best command, m/s2.
         reach: part of ``press`` that a command can hold back, m/s2.
         bounce: coefficient of restitution.
-        opening: speed with which the two separate after the first meeting, m/s.
+        opening: speed with which the two separate after the first contact, m/s.
         lost: speed that is lost in the window, m/s.
         late: start of the window, s.
         end: end of the window, s.

@@ -88,10 +88,10 @@ class Planner:
     argument or count and, when an episode begins, for another vehicle's script whose command is not fixed at the alert.
 
     Args:
-        argument: candidates per world and decision.
+        argument: number of candidates per world and decision, as text; None: ``CANDIDATES``.
         harm_count: harm to minimise, ``first`` or ``total``.
         horizon_s: time up to which it looks ahead, s.
-        most_candidates: upper limit of the number of candidates, whatever ``argument`` says.
+        most_candidates: upper limit of the number of candidates, whatever ``argument`` says; None: no limit.
         time_step_s: time between two decisions, s.
 
     >>> import ethbrake_marl as eb
