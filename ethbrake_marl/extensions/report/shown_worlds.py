@@ -34,9 +34,9 @@ WORDS = {
 
 
 def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS) -> dict[int, Played]:
-    """Choose up to ``most`` worlds to show, by row.
+    """Choose up to ``most`` worlds to show. Return an entry for the episode player for each, by row of the evaluation.
 
-    They are worlds where ``focus`` did worst, best against full braking, and typically, and worlds at random.
+    They are worlds where the agent ``focus`` did worst, best against full braking, and typically, and worlds at random.
     """
     outcome = evaluation.outcome(focus)
     found: dict[int, Played] = {}
@@ -64,7 +64,11 @@ def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS)
 
 
 def worst_rows(evaluation: Evaluation, focus: str) -> Ints:
-    """Return the ten worlds with the largest regret in total harm, or the largest total harm if no best is known."""
+    """Return the rows of the ten worlds in which the agent ``focus`` did worst, at most.
+
+    These have the largest regret in total harm, or the largest total harm if no best is known. Worlds with 0 are left
+    out.
+    """
     outcome, regrets = evaluation.outcome(focus), regrets_of(evaluation)
     value = outcome.total_harm if regrets is None else regrets.regret(outcome, "total")
     return _largest(value, value > 0.0)[:WORST]
