@@ -77,7 +77,10 @@ class SquashedShape(Shape):
     activation: Activation = "relu"
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """Return the network of a policy bundle: the actor only, whose action is the tanh of its mean."""
+        """Return the description of the network in a policy bundle: the actor only, whose action is tanh of its mean.
+
+        ``observation_size`` is the number of features of an observation; ``more`` are other fields of ``NetworkSpec``.
+        """
         return super().spec(observation_size, output="tanh", **more)
 
 
@@ -117,17 +120,17 @@ class SacRecipe(TrainingRecipe):
 
     @property
     def rounds(self) -> int:
-        """Decisions of each learner between two updates."""
+        """Decisions of each learner in each world between two updates: ``steps_per_update``."""
         return self.steps_per_update
 
     @property
     def updates_per_row(self) -> int:
-        """Updates between two rows of the progress table."""
+        """Number of updates between two rows of ``progress.csv``: ``log_every_updates``."""
         return self.log_every_updates
 
     @property
     def update_ratio(self) -> float:
-        """Gradient steps per decision of one learner in each world."""
+        """Number of gradient steps per decision: ``gradient_steps / (n_envs * steps_per_update)``."""
         return self.gradient_steps / (self.n_envs * self.steps_per_update)
 
     def derived(self) -> dict[str, float]:
