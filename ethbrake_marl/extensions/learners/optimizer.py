@@ -19,12 +19,12 @@ for _name in ("step", "add_param_group", "zero_grad", "state_dict", "load_state_
 
 
 def adam(rate: float, *networks: nn.Module | None) -> Adam:
-    """Return an optimiser for all weights of these networks."""
+    """Return an Adam optimiser with the learning rate ``rate`` for all weights of these networks; None is skipped."""
     return Adam([weight for each in networks if each is not None for weight in each.parameters()], lr=rate, eps=1e-5)
 
 
 def descend(optimizer: Optimizer, *losses: Tensor) -> None:
-    """Take one gradient step down the sum of these losses."""
+    """Change the optimiser's weights by one gradient step that lowers the sum of these losses."""
     optimizer.zero_grad()
     for loss in losses:
         loss.backward()  # type: ignore[no-untyped-call]
@@ -33,6 +33,9 @@ def descend(optimizer: Optimizer, *losses: Tensor) -> None:
 
 @torch.no_grad()
 def follow(average: Iterable[Tensor], learning: nn.Module, keep: float) -> None:
-    """Move the averaged weights towards the learning weights. The average keeps the share ``keep`` of itself."""
+    """Move averaged weights towards the weights of ``learning``: ``average = keep average + (1 - keep) learning``.
+
+    ``average`` holds the averaged weights in the order of ``learning.parameters()``; they are changed.
+    """
     for mean, learns in zip(average, learning.parameters(), strict=True):
         mean.lerp_(learns, 1.0 - keep)

@@ -29,7 +29,10 @@ class ChoosingShape(Shape):
     choices: int = Field(ge=2, le=4096, description="how many actions, evenly from -1 to 1, the network scores")
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """Return the spec of the actor, which takes the action with the highest score."""
+        """Return the description of the network in a policy bundle: an actor that takes the action of highest score.
+
+        ``observation_size`` is the number of features of an observation; ``more`` are other fields of ``NetworkSpec``.
+        """
         return super().spec(observation_size, output="choice", choices=self.choices, **more)
 
 
@@ -120,14 +123,19 @@ class OptionsRecipe(TrainingRecipe):
         return 2 * len(self.near) + len(self.fixed) + self.drawn
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the spec of the actor, with the policies that it may choose."""
+        """Return the description of the network in a policy bundle, including the policies that it may choose.
+
+        ``observation_size`` is the number of features of an observation.
+        """
         several = {"observation_size": observation_size, "value_hidden": ()}
         among = tuple(each.manifest.network.model_copy(update=several) for each in self.policies)
         return self.network.spec(observation_size, among=among)
 
     @cached_property
     def policies(self) -> tuple[Policy, ...]:
-        """Policies of ``among``, read once. A policy that itself chooses among policies is replaced by those.
+        """The policies that the key ``among`` names, loaded once.
+
+        A policy that itself chooses among policies is replaced by those.
 
         Raises ``InvalidInput`` with the name of a policy that cannot be used.
         """

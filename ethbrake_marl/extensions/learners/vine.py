@@ -26,7 +26,7 @@ class Counterfactual(Algorithm):
     """Vine with one actor for all learners, or with a mixture of experts for one learner."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> CounterfactualModel:
-        """Return the model, with the weights of the policy to start from, or random weights."""
+        """Return a new model, with the weights of the policy that the recipe's ``start`` names, or random weights."""
         recipe = training.recipe
         assert isinstance(recipe, CounterfactualRecipe)
         environment.engine.branch(environment.engine.moment())  # raises at once if the engine cannot branch
@@ -40,12 +40,12 @@ class Counterfactual(Algorithm):
         return model
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of the averaged weights."""
+        """Return copies of the averaged weights of ``actor``, by their names in a policy bundle with this network."""
         found: dict[str, Float32s] = actor.tensors(network)
         return found
 
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
-        """Return the optimiser of the actor, or the optimisers of each expert and of the gating network."""
+        """Return the optimiser as ``policy``, or in a mixture those of ``network_1``, ``network_2``, ..., ``gate``."""
         if not isinstance(model, ModesModel):
             return {"policy": model.policy.optimizer}
         members = {f"network_{k + 1}": actor.optimizer for k, actor in enumerate(model.policy.actors)}

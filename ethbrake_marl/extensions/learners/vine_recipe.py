@@ -96,13 +96,19 @@ class CounterfactualRecipe(TrainingRecipe):
         return self
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the spec of the actor, or of several actors and a gate."""
+        """Return the description of the network in a policy bundle: an actor, or several actors and a gate.
+
+        ``observation_size`` is the number of features of an observation.
+        """
         modes = self.modes
         several = {} if modes is None else {"networks": modes.networks, "gate_hidden": modes.gate}
         return self.network.spec(observation_size, **several)
 
     def policy_to_start_from(self, scenario: Scenario) -> str | None:
-        """Return the policy to start from, for instance ``ppo@shipped/ppo``; None: random weights."""
+        """Return the spec of the policy whose weights a training on ``scenario`` begins with.
+
+        For instance ``ppo@shipped/ppo``; None: random weights.
+        """
         kind, _, path = (self.start or "").partition("@")
         if path != SHIPPED:
             return self.start
@@ -111,7 +117,7 @@ class CounterfactualRecipe(TrainingRecipe):
         return None
 
     def begins(self, scenario: Scenario) -> str:
-        """Return a phrase on the initial weights: the policy to start from, or random weights and the reason."""
+        """Return a phrase about the initial weights: the spec of a policy, or ``random weights`` with the reason."""
         why = "" if self.start is None else f", as {self.start} has none for scenario {scenario.name!r}"
         return self.policy_to_start_from(scenario) or f"random weights{why}"
 

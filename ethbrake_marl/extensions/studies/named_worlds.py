@@ -53,12 +53,15 @@ class NamedWorlds(FileModel):
 
     @classmethod
     def of(cls, scenario: Scenario, /, **told: Any) -> NamedWorlds:
-        """Return the file of worlds of this scenario."""
+        """Return the content of a file of worlds that were drawn from ``scenario``.
+
+        ``told`` are the other fields of this class, except format, version and hash.
+        """
         return cls(format="ethbrake-worlds", version=1, scenario_sha256=scenario_sha256(scenario), **told)
 
     @classmethod
     def read(cls, path: str | Path) -> NamedWorlds:
-        """Read a file of named worlds. Raises ``InvalidInput`` with file, line and key."""
+        """Read and check a file of named worlds; raise ``InvalidInput`` with file, line and key of an error."""
         document = read_yaml(path, SIZE_LIMIT)
         found = read_model(document, cls, Wording(cls, "search again (ethbrake study falsify)"), "of named worlds")
         names = [world.name for world in found.worlds]
@@ -68,7 +71,7 @@ class NamedWorlds(FileModel):
 
     @property
     def text(self) -> str:
-        """The text of the file. Reading it back gives the same worlds, bit for bit."""
+        """The YAML text of the file. Reading it back gives the same worlds, bit for bit."""
         head = self.model_dump(exclude={"worlds"}, exclude_none=True)
         lines = [f"{key}: {flow_text(value)}" for key, value in head.items() if value != []]
         lines.append("worlds:")
@@ -78,7 +81,15 @@ class NamedWorlds(FileModel):
         return "\n".join(lines) + "\n"
 
     def worlds_of(self, scenario: Scenario, where: str) -> Worlds:
-        """Return the worlds at the alert. Raises ``InvalidInput`` if ``scenario`` is not their scenario."""
+        """Return the worlds of the file at the alert.
+
+        Args:
+            scenario: the scenario that the file names, loaded.
+            where: name of the file, for messages.
+
+        Raises ``InvalidInput`` if the content of ``scenario`` is not that of the worlds' scenario.
+
+        """
         if scenario_sha256(scenario) != self.scenario_sha256:
             raise InvalidInput(
                 f"{where}: its worlds were found in scenario {self.scenario!r}"
