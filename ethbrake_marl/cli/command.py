@@ -117,7 +117,10 @@ class Out:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Leave the progress bars as they are, and print what remains after Ctrl-C."""
+        """Stop redirecting stdout, and after Ctrl-C print what remains and end the command with status 130.
+
+        The arguments describe the exception that ended the block, if there is one, as for every context manager.
+        """
         self._turned.__exit__(kind, error, trace)
         self.end_progress()
         if isinstance(error, KeyboardInterrupt):
@@ -138,7 +141,7 @@ class Out:
             self.show(*shown, end=end)
 
     def print_json(self, content: Any) -> None:
-        """Print plain data as JSON on stdout, whether or not ``--json`` was passed."""
+        """Print ``content`` (plain data) as JSON on stdout, whether or not ``--json`` was passed."""
         self.end_progress()
         typer.echo(json.dumps(content, indent=2, allow_nan=False), self._stdout)
 
@@ -177,7 +180,10 @@ class Out:
         check_target(path, force=self.force)
 
     def write(self, path: Path, content: bytes | str, what: str | None = None) -> None:
-        """Write a file, completely or not at all, and print ``WHAT: PATH`` on stderr unless ``what`` is None."""
+        """Write ``content`` to a file, completely or not at all, and print ``WHAT: PATH`` on stderr.
+
+        ``what`` None: print nothing.
+        """
         from ethbrake_marl.files.store import write_output
 
         write_output(path, content.encode() if isinstance(content, str) else content, force=self.force)
@@ -239,12 +245,18 @@ class Out:
 
 
 class _PlainConsole(Console):
-    """Console that prints text literally: no markup in names of agents and paths, and no control characters."""
+    """Console of rich that prints text literally: no markup in names of agents and paths, and no control characters.
+
+    ``width`` is the number of columns; None: the terminal's.
+    """
 
     def __init__(self, file: TextIO, *, width: int | None = None) -> None:
         super().__init__(file=file, width=width, markup=False, emoji=False, highlight=False)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
-        """Yield the styled segments of a text or table as rich does, with control characters of texts replaced."""
+        """Yield the styled segments of ``renderable`` (a text or table) as rich does, without control characters.
+
+        ``options`` are rich's options of this output.
+        """
         for piece in super().render(renderable, options):
             yield piece if piece.control else Segment(plain_text(piece.text, keep=_KEPT), piece.style)

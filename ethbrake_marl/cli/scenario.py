@@ -110,7 +110,7 @@ def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
 
 
 def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tuple[list[str], str, dict[str, Any]]:
-    """Return three descriptions of the quantities of some worlds.
+    """Return three descriptions of the quantities of the worlds in ``sample``.
 
     They are the lines of a table with the ranges of varying quantities, a text about fixed ones, and column -> least,
     median and largest value for JSON.
@@ -226,7 +226,7 @@ def _declared_in_words(scenario: scenarios.Scenario, key: str) -> str:
 
 
 def _in_words(quantity: Any) -> str:
-    """Describe a number, or a distribution of a scenario, in words: ``5 to 9 (uniform)``."""
+    """Describe ``quantity``, a number or a distribution of a scenario, in words: ``5 to 9 (uniform)``."""
     if isinstance(quantity, float):
         return f"{quantity:g}"
     (kind, shape), *more = quantity.model_dump(exclude_none=True).items()

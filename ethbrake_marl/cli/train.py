@@ -196,7 +196,7 @@ def _tell(out: Out, result: training.TrainResult) -> None:
 
 
 def _end(out: Out, result: training.TrainResult) -> None:
-    """Print how a training ended and where it is; an interrupted training ends the command with that status."""
+    """Print how the training of ``result`` ended and where it is; if it was interrupted, exit with status 130."""
     if result.status == "interrupted":
         left = f"go on with: ethbrake train --resume {result.directory} (its policy is there)"
         out.interrupted(f"interrupted after {result.steps:,} training steps; {left}")

@@ -154,7 +154,8 @@ def _estimate(
 def lower_bounds(tally: AgentTally, worlds: int) -> frozenset[str]:
     """Return the names of the measures whose means are only lower bounds for one agent.
 
-    These are the measures of each set whose condition (``MeasureSet.whole``) is not true in all ``worlds``.
+    ``tally`` holds the agent's sums over ``worlds`` worlds. A set of measures may name a condition
+    (``MeasureSet.whole``); unless it is true in all of them, the means of the set are lower bounds.
     """
 
     def is_partial(each: MeasureSet) -> bool:

@@ -169,7 +169,7 @@ def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evalua
 
 
 def _only(outcome: Outcome, names: Sequence[str]) -> Outcome:
-    """Return the outcome with only these registered measures."""
+    """Return the outcome without user measures (``Outcome.metrics``) other than those called ``names``."""
     kept = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
     return replace(outcome, metrics=kept)
 

@@ -80,9 +80,10 @@ def _arrays_sha256(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _arrays(value: Any) -> dict[str, np.ndarray]:
-    """Return the arrays of a dataclass and of the dataclasses inside it, by name, except those without information.
+    """Return the arrays of the dataclass ``value`` and of the dataclasses inside it, by name.
 
-    These are empty arrays of messages and braking pieces, and infinite build-up rates of brakes.
+    Arrays without information are omitted: empty ones, of messages or braking pieces, and infinite build-up rates of
+    brakes.
     """
     found: dict[str, np.ndarray] = {}
     for field in fields(value):

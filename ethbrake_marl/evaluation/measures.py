@@ -90,7 +90,7 @@ class MeasureSet:
     whole: str | None = None
     narrow: tuple[str, ...] = ()  # names of measures that a narrow terminal also shows, if they have values
     notebook: tuple[str, ...] = ()  # names of measures that a notebook shows
-    group_column: GroupColumn | None = None
+    group_column: GroupColumn | None = None  # column in the table of a group of scenarios; None: no column
     # Columns of files with one row per world: name -> function of outcome and context that returns values [n], or None.
     per_world: Mapping[str, Callable[[Outcome, Any], Values | None]] = {}
     texts: frozenset[str] = frozenset()  # names of the ``per_world`` columns that hold texts

@@ -66,7 +66,14 @@ def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[E
 
 
 class _Follower(Tape):
-    """Recorder of every step, and of the decisions in which a shield replaced the policy's action."""
+    """Recorder of every step, and of the decisions in which a shield replaced the policy's action.
+
+    Args:
+        worlds: the worlds at the alert.
+        team: agents that drive.
+        engine: engine that runs the episodes, from which the shield's decisions are read.
+
+    """
 
     def __init__(self, worlds: Worlds, team: Team, engine: Engine) -> None:
         super().__init__(worlds)
@@ -76,7 +83,7 @@ class _Follower(Tape):
         self._engine, self._ruling = engine, engine.ruling
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Record one step, from the worlds ``before`` to the times ``until_s`` [n], under these commands [n, N]."""
+        """Record one step: worlds at its beginning, commands [n, N] during it, time [n] at which it ends."""
         super().see(before, command_mps2, until_s)
         ruling = self._engine.ruling
         if ruling is not None and ruling is not self._ruling:  # ``see`` may be called several times in a step

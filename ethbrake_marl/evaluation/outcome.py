@@ -61,7 +61,7 @@ class Outcome:
         return f"Outcome({count_of(n, 'world')}, {int(self.collided.sum()):,} collided, {means})"
 
     def take(self, rows: Ints | Bools) -> Outcome:
-        """Return the same outcome with some of its worlds only: row numbers, or a mask [n]."""
+        """Return the same outcome with only the worlds ``rows``: row numbers, or a mask [n]."""
         found = {name: getattr(self, name) for name in _COLUMNS}
         columns: dict[str, Any] = {name: None if column is None else column[rows] for name, column in found.items()}
         metrics = {name: column[rows] for name, column in self.metrics.items()}
@@ -125,7 +125,7 @@ class Outcome:
         """Return the harm that each vehicle bears, and its value under each objective, as columns [n] by name (m2/s2).
 
         First-impact and total harm are both included. The columns of Vehicle 2 are ``first_impact_harm_2``,
-        ``total_harm_2`` and, for the objective ``social:45``, ``social:45_first_2`` and ``social:45_total_2``.
+        ``total_harm_2`` and, with ``objectives=["social:45"]``, ``social:45_first_2`` and ``social:45_total_2``.
         """
         told = {"first_impact_harm": self.vehicle_harm("first"), "total_harm": self.vehicle_harm("total")}
         for objective in objectives:

@@ -243,7 +243,10 @@ def read_result(path: Path) -> Result:
 
 
 def told_of(row: Mapping[str, Any], key: str) -> str | None:
-    """Return the value of ``key`` in an agent's JSON object, or else in its ``parameters``, as text; None without."""
+    """Return the value of ``key`` in ``row`` (an agent's JSON object), or else in its ``parameters``, as text.
+
+    None if it is in neither.
+    """
     parameters = row.get("parameters")
     told = row.get(key, parameters.get(key) if isinstance(parameters, dict) else None)
     return None if told is None else str(told)
@@ -252,7 +255,7 @@ def told_of(row: Mapping[str, Any], key: str) -> str | None:
 def _is_mean(mean: Any, interval: Any, episodes: int) -> bool:
     """Return whether these JSON values are a mean harm and an interval ``[low, high]`` around it.
 
-    ``interval`` may be None; for a single episode it must be.
+    ``interval`` may be None; for ``episodes`` = 1 it must be.
     """
     ends = [mean, mean] if interval is None else interval
     if not isinstance(ends, list) or len(ends) != 2 or (interval is not None and episodes == 1):

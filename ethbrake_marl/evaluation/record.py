@@ -98,6 +98,7 @@ def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float)
     """Yield the samples of each step: time [k], gaps [k, P], speeds [k, N], positions [k, N], commands [k, N].
 
     ``segments`` are the steps of one world, each with the world before, the commands [1, N], and the end time [1].
+    Two samples of a step are at most ``sample_s`` apart (s).
     Only the last step includes its end. Worlds hold gaps and speeds, not positions. So Vehicle 1's position is
     measured as its gap to an obstacle ahead, which is the world's own or one out of reach.
     """
@@ -119,5 +120,5 @@ def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float)
 
 
 def line_positions(front: Floats, gaps: Floats) -> Floats:
-    """Return the positions [k, N] of all vehicles from the position of Vehicle 1 [k] and the gaps [k, P]."""
+    """Return the positions [k, N] of all vehicles, ``front`` [k] being that of Vehicle 1, from the gaps [k, P]."""
     return np.concatenate([front[:, np.newaxis], front[:, np.newaxis] - np.cumsum(gaps, axis=1)], axis=1)

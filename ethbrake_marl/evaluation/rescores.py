@@ -34,7 +34,10 @@ class Rescores(list[Rescored]):
         return "\n".join(self.sheet(harm_count).html() for harm_count in HARM_COUNTS)
 
     def sheet(self, harm_count: HarmCount) -> Sheet:
-        """Return the table for one count of harm: one line per agent and objective, one column per vehicle."""
+        """Return the table of first-impact harm (``first``) or total harm (``total``).
+
+        It has one line per agent and objective, and one column per vehicle.
+        """
         shown = [row for row in self if row.harm_count == harm_count]
         vehicles = range(len(shown[0].each) if shown else 0)
         columns = [Column(f"Vehicle {i + 1}", interval="below") for i in vehicles]

@@ -212,7 +212,11 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
 def _roll_out(
     whole: Worlds, agent: Driver, vehicles: tuple[int, ...], scenario: Scenario, aftermath: bool, rows: Ints
 ) -> Outcome:
-    """Let a new team of copies of ``agent`` drive some worlds of ``whole``, the row numbers ``rows``."""
+    """Let a new team of copies of ``agent`` drive the worlds with the row numbers ``rows`` of ``whole``.
+
+    ``vehicles`` are the indices of the controlled vehicles. With ``aftermath``, also measure how far Vehicle 1 is
+    shoved, sampled harm, and measures that the user registered.
+    """
     team = Team.of(agent, vehicles)
     worlds = scenario.play_pieces(whole.take(rows), tuple(team.drivers))
     task = Task(scenario, tuple(team.drivers))
@@ -255,7 +259,10 @@ def outcome_of(team: Team, episodes: Episodes) -> Outcome:
 
 
 def _read_column(team: Team, memory: Any, what: str, n: int) -> NDArray[np.generic] | None:
-    """Return the entry ``what`` of an agent's memory, one number per world [n]; None if there is no such entry."""
+    """Return the entry ``what`` of an agent's memory, one number per world [n]; None if there is no such entry.
+
+    ``team`` is named in errors.
+    """
     value = memory.get(what) if isinstance(memory, Mapping) else None
     if value is None:
         return None

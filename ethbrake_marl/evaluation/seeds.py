@@ -140,6 +140,7 @@ def _resampled(value: float, sides: Sequence[Floats], of: Callable[[Floats], Flo
     """Return ``value`` with a bootstrap interval, or without one for a single world.
 
     The interval holds the percentiles of ``of(means)``, where ``means`` [resamples, sides] are the resampled means.
+    ``seed`` is the seed of the bootstrap.
     """
     if sides[0].shape[1] < 2:
         return Estimate(value, None)
@@ -149,7 +150,7 @@ def _resampled(value: float, sides: Sequence[Floats], of: Callable[[Floats], Flo
 
 
 def _resample_means(sides: Sequence[Floats], resamples: int, seed: int) -> Floats:
-    """Return the mean of each side in each bootstrap resample, [resamples, sides].
+    """Return the mean of each of ``sides`` (arrays [seeds, worlds]) in each bootstrap resample, [resamples, sides].
 
     Seeds are resampled separately for each side; worlds are resampled once for all sides.
     """

@@ -178,7 +178,10 @@ class _Part(NamedTuple):
 def _compare(
     agents: Mapping[str, Driver], worlds: Worlds, task: Task, on_progress: Callable[[str, int], None] | None
 ) -> list[ModeRow]:
-    """Return the rows of all agents and modes; raise ``PhysicsError`` naming the worlds that cannot be advanced."""
+    """Return the rows of all agents and modes, with arguments as in ``compare_modes``.
+
+    Raises ``PhysicsError`` naming the worlds that cannot be advanced.
+    """
     rows = []
     for name, agent in agents.items():
         parts: list[dict[Mode, _Part]] = []
@@ -194,7 +197,7 @@ def _compare(
 
 
 def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[Mode, _Part]:
-    """Return the results of every mode in one chunk of worlds."""
+    """Let an agent or team drive one chunk of worlds in every mode of the shield, and return the results by mode."""
     several, found = len(task.vehicles) > 1, {}
     alone: dict[Mode, Team] = {"none": Team.of(agent, task.vehicles)}
     if not several:

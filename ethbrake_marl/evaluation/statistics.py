@@ -156,7 +156,7 @@ def of_amounts(found: Estimate, *, nothing: bool) -> Estimate:
 
 
 def root(number: Fraction) -> float:
-    """Return the square root of a fraction of at least 0, without overflow even if the fraction exceeds any float."""
+    """Return the square root of ``number`` >= 0 as a float, even if ``number`` itself is too large for a float."""
     shift = (number.numerator.bit_length() - number.denominator.bit_length()) // 2
     return math.ldexp(math.sqrt(number / Fraction(4) ** shift), shift)
 

@@ -46,7 +46,9 @@ class RowsBeside:
 
 
 class SummaryTable(list[SummaryRow]):
-    """Rows of ``summarise``: a list that ``print`` and a notebook show as a table.
+    """Results table of an evaluation: a list of one row per agent, which ``print`` and a notebook show as a table.
+
+    ``beside``: rows from another source to print below; None: no such rows.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")

@@ -56,6 +56,9 @@ class Algorithm(ABC):
         return {}
 
     def log_noise(self, model: BaseAlgorithm) -> Tensor | None:
-        """Return the logarithm of the exploration noise, which must stay finite; None if there is nothing to check."""
+        """Return the logarithm of the model's exploration noise, which is checked to stay finite during the training.
+
+        None if there is nothing to check.
+        """
         found: Tensor | None = getattr(model.policy, "log_std", None)
         return None if found is None else found.detach()

@@ -28,7 +28,11 @@ class CentralCriticPolicy(ActorCriticPolicy):
 
 
 class _OwnPartForTheActor(MlpExtractor):
-    """Hidden layers of actor and critic: the actor's take the first ``own`` entries of a row, the critic's all."""
+    """Hidden layers of actor and critic: the actor's take the first ``own`` entries of a row, the critic's all.
+
+    ``whole`` is the length of a row; ``net_arch`` and ``activation_fn`` are those of Stable-Baselines3's
+    ``ActorCriticPolicy``.
+    """
 
     def __init__(self, own: int, whole: int, net_arch: Any, activation_fn: Any) -> None:
         super().__init__(own, net_arch, activation_fn, device="cpu")

@@ -47,7 +47,7 @@ class TrainingState(NamedTuple):
 
 
 def write_checkpoint(folder: Path, state: TrainingState) -> None:
-    """Write a checkpoint as a new ``folder``, and delete all but the two newest checkpoints beside it.
+    """Write ``state`` as a checkpoint in a new ``folder``, and delete all but the two newest checkpoints beside it.
 
     It is written completely or not at all: all bytes are on the disk before the folder gets its name.
     """

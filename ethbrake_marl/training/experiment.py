@@ -69,7 +69,7 @@ MakeReport = Callable[[Experiment, OnProgress], RunReport]  # writes a report; t
 def register_run_report(name: str, make: MakeReport) -> None:
     """Register a function that writes a report into the folder of every ``ethbrake run``, after its results.
 
-    ``name`` is the name of the report, which no other report may have.
+    ``name`` is the name of the report, which no other report may have; ``make`` writes it from an ``Experiment``.
 
     An installed package does the same with an entry point of the group ``ethbrake_marl.run_reports``.
     """
@@ -235,7 +235,7 @@ def _status(run: RunDirectory, status: str) -> Iterator[None]:
 
 
 def _note(run: RunDirectory, status: str, stage: str, reason: str | None) -> None:
-    """Update status and stage in ``run.json``. Its steps and ``wall_s`` remain those of the training."""
+    """Update status, stage and reason in ``run.json``. Its steps and ``wall_s`` remain those of the training."""
     content = read_object(run.status)
     ended = None if status == "running" else datetime.now(UTC).isoformat(timespec="seconds")
     run.write_json(run.status, {**content, "status": status, "stage": stage, "ended_utc": ended, "reason": reason})

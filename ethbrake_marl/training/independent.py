@@ -154,7 +154,8 @@ class IndependentPPO(PPO):
     def _whose_turn(self, turns: int) -> int:
         """Return the number of the learner (0 = foremost) that learns in the next update.
 
-        It follows from the number of steps so far, so a resumed training agrees.
+        Each learner has ``turns`` turns in a training. The result follows from the number of steps so far, so a resumed
+        training agrees.
         """
         rollout = self.n_envs * self.n_steps
         planned = -(-self._total_timesteps // rollout)

@@ -86,7 +86,7 @@ def restore_model(model: Model, algorithm: Algorithm, state: TrainingState) -> N
 
 
 def _captured_weights(model: Model, algorithm: Algorithm) -> Arrays:
-    """Return the weights of the policy, other learned tensors, and the state of every optimiser."""
+    """Return as arrays by name: weights of the model's policy, other learned tensors, states of its optimisers."""
     arrays = {f"policy.{name}": _copy(tensor) for name, tensor in model.policy.state_dict().items()}
     arrays |= {name: _copy(tensor) for name, tensor in algorithm.learned_beside(model).items()}
     for name, optimizer in algorithm.optimizers(model).items():
@@ -135,7 +135,10 @@ def _restore_rows(model: Model, arrays: Arrays) -> None:
 
 
 def _captured_log(model: Model) -> dict[str, list[Any]]:
-    """Return the values recorded for the next row of the log: name -> [value, count, excluded formats]."""
+    """Return the values that the model has recorded for the next row of its log.
+
+    The result maps the name of a column to [value, count, excluded formats].
+    """
     log, pending = model.logger, {}
     for name, value in log.name_to_value.items():
         number = value.item() if isinstance(value, np.generic | torch.Tensor) else value
@@ -153,7 +156,8 @@ def _restore_log(model: Model, pending: Mapping[str, Any]) -> None:
 def _restore_replay(memory: Any, place: Any, arrays: Arrays) -> None:
     """Restore the content of a replay buffer; raise ``ValueError`` for a position outside it.
 
-    ``memory`` is the buffer of Stable-Baselines3; ``place`` is its (position, whether it is full).
+    ``memory`` is the buffer of Stable-Baselines3, which is changed; ``place`` is its (position, whether it is full),
+    and ``arrays`` hold its content.
     """
     position, full = place
     if (type(position), type(full)) != (int, bool) or not 0 <= position < memory.buffer_size:
@@ -165,7 +169,7 @@ def _restore_replay(memory: Any, place: Any, arrays: Arrays) -> None:
 
 
 def _try_step(optimizer: torch.optim.Optimizer) -> None:
-    """Take a step with a copy of the optimiser, so that torch raises if its state belongs to other weights."""
+    """Take a step with a copy of ``optimizer``, so that torch raises if its state belongs to other weights."""
     tried = copy.deepcopy(optimizer)
     for group in tried.param_groups:
         for weights in group["params"]:
@@ -174,14 +178,14 @@ def _try_step(optimizer: torch.optim.Optimizer) -> None:
 
 
 def check_counter(name: str, value: object, kind: type) -> None:
-    """Raise ``ValueError``, naming the counter, unless ``value`` has the type ``kind`` and is no negative integer."""
+    """Raise ``ValueError``, with ``name``, unless ``value`` has the type ``kind`` and is no negative integer."""
     if type(value) is not kind or (kind is int and not 0 <= value < 1 << 53):  # type: ignore[operator]  # an int
         right = "a whole number, at least 0" if kind is int else f"of type {kind.__name__}"
         raise ValueError(f"{name} = {value!r:.60}: must be {right}")
 
 
 def _like(model: NDArray[Any], arrays: Arrays, name: str) -> NDArray[Any]:
-    """Return the array called ``name``; raise ``ValueError`` unless it is finite, and shaped and typed as ``model``."""
+    """Return ``arrays[name]``; raise ``ValueError`` unless it is finite, and shaped and typed as ``model``."""
     found = arrays[name]
     if (found.shape, found.dtype) != (model.shape, model.dtype) or not np.isfinite(found).all():
         raise ValueError(f"{name}: {model.shape} finite {model.dtype} are needed")

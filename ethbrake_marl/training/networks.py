@@ -67,7 +67,10 @@ def copy_of(tensor: Tensor) -> Float32s:
 
 
 def ppo_arguments(shape: NetworkShape) -> dict[str, Any]:
-    """Return ``policy_kwargs`` of Stable-Baselines3's PPO: separate actor and critic, orthogonal initial weights."""
+    """Return ``policy_kwargs`` of Stable-Baselines3's PPO for a recipe's key ``network``.
+
+    Actor and critic are separate, with orthogonal initial weights.
+    """
     return {
         "net_arch": {"pi": list(shape.policy), "vf": list(shape.value)},
         "activation_fn": ACTIVATIONS[shape.activation],

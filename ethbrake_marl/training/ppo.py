@@ -22,7 +22,10 @@ class Ppo(Algorithm):
     """Stable-Baselines3's PPO with one policy for all learners, optionally a central critic, or one policy for each."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> PPO:
-        """Return a new PPO model for the training's scheme: plain, with a central critic, or independent learners."""
+        """Return a new PPO model for a training, which learns in ``environment``.
+
+        The training's scheme decides whether it has one policy, a central critic, or independent learners.
+        """
         recipe = training.recipe
         assert isinstance(recipe, PpoRecipe)
         settings: dict[str, Any] = {
@@ -54,7 +57,7 @@ class Ppo(Algorithm):
         return tuple(model.policy.policies) if isinstance(model, IndependentPPO) else (model.policy,)
 
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
-        """Return the optimiser as ``policy``, or the optimiser of each independent learner by the vehicle's name."""
+        """Return the model's optimiser as ``policy``, or that of each independent learner by the vehicle's name."""
         if isinstance(model, IndependentPPO):
             return dict(zip(model.names, (member.optimizer for member in model.policy.policies), strict=True))
         return {"policy": model.policy.optimizer}

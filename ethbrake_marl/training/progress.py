@@ -63,7 +63,7 @@ class Course:
             self.best, self.best_harm = policy, metrics[name]
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything but the policies as plain data."""
+        """Return evaluations, least harm and times as plain data for JSON, which ``restore`` takes; no policies."""
         return {
             "evaluations": self.evaluations,
             "best_harm": None if math.isinf(self.best_harm) else self.best_harm,

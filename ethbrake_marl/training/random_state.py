@@ -33,7 +33,7 @@ def own_random_state() -> Iterator[None]:
 def capture_generators() -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Return the states of the global random generators of Python, NumPy and torch.
 
-    Returns numbers (plain data for JSON) and arrays by name, which ``restore_generators`` takes.
+    The first result holds numbers (plain data for JSON), the second arrays by name; ``restore_generators`` takes both.
     """
     state: Any = np.random.get_state(legacy=False)  # noqa: NPY002
     version, python_state, gauss = random.getstate()

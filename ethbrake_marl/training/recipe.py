@@ -395,9 +395,10 @@ def algorithm_names() -> tuple[str, ...]:
 
 
 def load_recipe(name_or_path: str | Path) -> TrainingRecipe:
-    """Read a shipped recipe by name (``ppo``) or a file by path (anything with a separator or ``.yaml``).
+    """Read and check a recipe: a shipped one by name (``ppo``), or a file by path.
 
-    Raises ``UnknownName`` with a suggestion, or ``InvalidInput`` with file, line, key, value and what would be right.
+    A text with a separator or the ending ``.yaml`` is a path. Raises ``UnknownName`` with a suggestion, or
+    ``InvalidInput`` with file, line, key, value and what would be right.
     """
     return _checked(TrainingRecipe.file(name_or_path))
 

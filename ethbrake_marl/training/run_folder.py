@@ -150,5 +150,5 @@ class RunDirectory:
         return {int(steps): float(spent) for steps, spent in kept.items()}
 
     def column(self, name: str) -> dict[int, float]:
-        """Return a column of ``progress.csv`` as number of decisions -> value, without empty cells."""
+        """Return the column ``name`` of ``progress.csv`` as number of decisions -> value, without empty cells."""
         return {int(row["steps"]): float(row[name]) for row in self.rows() if row.get(name)}

@@ -245,7 +245,13 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
 def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
     """Save the best and the last good policy, and record in ``run.json`` how the run ended.
 
-    The checkpoints of a finished run are deleted. ``reason``: why it was interrupted or failed; None: no reason.
+    The checkpoints of a finished run are deleted.
+
+    Args:
+        callback: the callback of the training, with its policies so far.
+        status: how the run ended.
+        reason: why it was interrupted or failed; None: no reason.
+
     """
     run, training, course = callback.run, callback.learner.training, callback.course
     for policy, folder in ((course.kept, run.policy), (course.policy, run.last_policy)):

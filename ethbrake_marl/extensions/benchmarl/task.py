@@ -124,7 +124,8 @@ class LineTask(TaskClass):  # type: ignore[misc]
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
         """Return a function without arguments that makes a ``LineEnv`` with ``num_envs`` worlds.
 
-        ``seed`` is the seed of the worlds (None: 0); the other arguments are those of BenchMARL, and unused.
+        ``seed`` is the seed of the worlds (None: 0). BenchMARL also passes ``continuous_actions`` and ``device``, which
+        are unused.
         """
         config = self.config
         settings = config["reward"], config["horizon_is_end"], config.get("shield")

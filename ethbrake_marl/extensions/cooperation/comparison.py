@@ -101,7 +101,15 @@ def _level(one: Measured, searched: int) -> Json:
 
 
 def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: int) -> Json:
-    """Return the results of the same teams in the same worlds behind the shield that bounds harm by this count."""
+    """Return the results of the same teams in the same worlds behind a shield.
+
+    Args:
+        one: results of the level without a shield.
+        shielded: results behind the shield that bounds the harm of this count.
+        harm_count: count of harm.
+        searched: number of worlds, from the first on, for the part ``searched``.
+
+    """
     before, after = one.reached.vehicle[harm_count], shielded.vehicle_harm
     actions = shielded.decisions * shielded.replaced.shape[2]
     return {
@@ -122,7 +130,10 @@ def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: 
 
 
 def _change(before: Measured, after: Measured, algorithm: str) -> Json:
-    """Return the change of harm from level ``before`` to level ``after`` on the same worlds; positive: more harm."""
+    """Return the change of harm from level ``before`` to level ``after`` on the same worlds; positive: more harm.
+
+    ``algorithm`` is the name of the algorithm, which is recorded.
+    """
     found: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
     for harm_count in HARM_COUNTS:
         pairs = zip(_columns(after.reached, harm_count), _columns(before.reached, harm_count), strict=True)

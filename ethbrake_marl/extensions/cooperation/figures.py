@@ -89,7 +89,10 @@ def _harm_curve(found: Json, caption: str) -> Figure:
 
 
 def _change_figure(found: Json, caption: str) -> Figure:
-    """Draw the change of harm from level to level, and by each worse V2X channel, with intervals; left: less harm."""
+    """Draw the change of harm from level to level, and by each worse V2X channel, with intervals; left: less harm.
+
+    ``found`` is the content of ``ablation.json``; ``caption`` is the text below.
+    """
     changes = found["steps"] + found["channels"]
     figure, panels = new_panels((10.5, max(_LEAST_IN, 1.6 + 0.6 * len(changes))), columns=2, sharey=True)
     for axes, harm_count in zip(panels, HARM_COUNTS, strict=True):
@@ -117,7 +120,10 @@ def _change_figure(found: Json, caption: str) -> Figure:
 
 
 def _who_pays(found: Json, caption: str) -> Figure:
-    """Draw the change of each vehicle's harm from level to level as a matrix; blue is less harm."""
+    """Draw the change of each vehicle's harm from level to level as a matrix; blue is less harm.
+
+    ``found`` is the content of ``ablation.json``; ``caption`` is the text below.
+    """
     changes = found["steps"] + found["channels"]
     figure = new_figure(10.5, max(_LEAST_IN, 1.8 + 0.42 * len(changes)))
     grids = {

@@ -256,7 +256,10 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
 
 
 def _drive(scenario: Scenario, sample: Sample, drivers: Sequence[Driver], tell: OnProgress) -> Harms:
-    """Return the harm of several teams of one level on the same worlds; each team counts as one seed."""
+    """Let each of ``drivers`` (agents or teams) drive the worlds of ``sample``, and return their harm.
+
+    Each of them counts as one seed.
+    """
     outcomes = []
     for driver in drivers:
         result = evaluate(sample, {driver.name: driver}, scenario=scenario).complete()

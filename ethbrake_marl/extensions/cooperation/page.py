@@ -30,7 +30,7 @@ _MOST, _USUAL, _LEAST = 3, 2, 2  # number of example worlds with the largest, a 
 
 
 def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
-    """Choose example worlds to watch, by the total harm that the last level saves against the first.
+    """Choose example worlds to watch, by the total harm that the last level of ``measured`` saves against the first.
 
     These are the worlds with the largest, a median and the least saving by the policies of the first seed. Levels with
     a worse V2X channel do not count.

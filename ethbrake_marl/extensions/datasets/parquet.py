@@ -61,7 +61,7 @@ def decision_columns(recording: Recording) -> Columns:
         return values[: running.shape[1]].swapaxes(0, 1)[running]
 
     def whole(values: NDArray[Any]) -> NDArray[Any]:
-        """Repeat a value of each episode, [n], in every row of the episode."""
+        """Return ``values`` [n], one per episode, repeated in every row (decision) of the episode."""
         return np.repeat(values, recording.decisions)
 
     in_force, chosen = before("command_in_force_mps2"), before("chosen_command_mps2")[1:]

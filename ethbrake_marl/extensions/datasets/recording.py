@@ -185,7 +185,10 @@ def _off_by(actions: Float32s, worlds: Worlds, evaluated: Ledger, task: Task) ->
 
 
 def _learners_engine(worlds: Worlds, task: Task) -> Engine:
-    """Return an engine at the alert of ``worlds`` in which the learners take actions, as in an environment."""
+    """Return an engine at the alert of ``worlds`` in which the learners take actions, as in an environment.
+
+    Scenario, reward, observation and seed are those of ``task``.
+    """
     engine = Engine(
         task.scenario,
         worlds.n,

@@ -142,7 +142,8 @@ def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
 def fuzzy(seen: Seen, p: Parameters) -> tuple[Floats, Floats]:
     """Return the proactive and the critical criterion of the fuzzy safety model of UN R157, each [n] from 0 to 1.
 
-    ``p`` holds the parameters of the law ``r157_fsm``. 0 means no danger, 1 full danger.
+    0 means no danger, 1 full danger. ``seen`` is what the vehicle knows about the one ahead, and ``p`` the parameters
+    of the law ``r157_fsm``.
     """
     speed, front = np.maximum(seen.speed_mps, 0.0), np.maximum(seen.front_mps, 0.0)
     ahead, reacting = np.square(front) / (2.0 * p.b_front), speed * p.reaction

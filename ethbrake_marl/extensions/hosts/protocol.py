@@ -90,9 +90,7 @@ class HostCommand(NamedTuple):
 
     acceleration_mps2: Floats  # [n, N] acceleration over the step, with latency, rest and speed limit applied
     speeds_mps: Floats  # [n, N] speeds at the start of the step: the reported ones, or others after an impact
-    wanted_mps2: (
-        Floats  # [n, N] acceleration that the agents decided, for a host that handles rest and latencies itself
-    )
+    wanted_mps2: Floats  # [n, N] acceleration that agents decided, for a host that handles rest and latencies itself
     until_s: Floats  # [n] time since the alert at which the step ends
 
 
@@ -128,13 +126,13 @@ class Host(Protocol):
         """Return the present state of the vehicles."""
 
     def apply(self, command: HostCommand) -> None:
-        """Move all vehicles by one step."""
+        """Move all vehicles by one step, as ``command`` says."""
 
 
 class HostFailed(EthBrakeError):
     """Raised if a host raises an exception or reports an impossible state.
 
-    Its attributes ``ledger`` and ``worlds`` hold the harm and the last valid state.
+    Its attributes ``ledger`` and ``worlds`` hold the harm and the last valid state; ``reason`` is the message.
 
     >>> import ethbrake_marl as eb
 
@@ -465,7 +463,9 @@ class _Step(NamedTuple):
 
 
 class _Motion:
-    """Ranges in which the vehicles of a host can be, given the commands since the alert.
+    """Ranges in which the gaps and speeds of a host's vehicles can be, given the commands since the alert.
+
+    ``alert`` are the worlds at the alert, ``dt`` is the length of the host's steps (s; infinite: each to a decision).
 
     Three rules refuse an impossible state:
 

@@ -83,7 +83,7 @@ class AveragedActor(Deterministic):
             learns.copy_(mean)
 
     def take_over(self, tensors: Mapping[str, Float32s]) -> None:
-        """Load the weights of a policy bundle, by name, into both the learning and the averaged weights."""
+        """Copy ``tensors``, the weights of a policy bundle by name, into both the learning and the averaged weights."""
         state = self.state_dict()
         for name, theirs in sb3_names(self._spec).items():
             state[theirs].copy_(torch.from_numpy(tensors[name]))

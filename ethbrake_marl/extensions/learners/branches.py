@@ -162,7 +162,7 @@ def other_count(count: HarmCount) -> HarmCount:
 
 
 def moving_rows(moments: State) -> Bools:
-    """Return whether some vehicle moves in each of these states, [n] bool.
+    """Return whether some vehicle moves in each of the states ``moments``, [n] bool.
 
     A decision in which everything stands teaches nothing.
     """

@@ -89,6 +89,9 @@ class ModesModel(CounterfactualModel):
     def _enter(self, stage: Stage, number: int) -> None:
         """Prepare a stage of the training that begins, or is resumed, at update ``number``.
 
+        For a further expert, find the worlds that it will be trained in, and let it imitate templates (random braking
+        profiles) that do better than the experts so far.
+
         The result depends only on finished experts, so it is the same after a resume.
         """
         self._stage, self._own = stage, None

@@ -21,7 +21,11 @@ from ethbrake_marl.training.networks import tensors_of_layers
 
 
 class ModesPolicy(Deterministic):
-    """Mixture of experts: at each decision a gating network chooses which of several actors (experts) acts."""
+    """Mixture of experts: at each decision a gating network chooses which of several actors (experts) acts.
+
+    The arguments are the spaces of Stable-Baselines3, the learning rate as a function of the remaining share of the
+    training, and a recipe with the key ``modes``.
+    """
 
     def __init__(
         self, observation_space: Space[Any], action_space: Any, rate: Schedule, recipe: CounterfactualRecipe

@@ -24,7 +24,7 @@ def adam(rate: float, *networks: nn.Module | None) -> Adam:
 
 
 def descend(optimizer: Optimizer, *losses: Tensor) -> None:
-    """Change the optimiser's weights by one gradient step that lowers the sum of these losses."""
+    """Change the weights of ``optimizer`` by one gradient step that lowers the sum of these losses (scalars)."""
     optimizer.zero_grad()
     for loss in losses:
         loss.backward()  # type: ignore[no-untyped-call]

@@ -20,7 +20,10 @@ class Options(Algorithm):
     """Rollout classification with one actor for all learners."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> OptionsModel:
-        """Return a new model. Before it learns, it brakes fully, or acts as the first policy of the key ``among``."""
+        """Return a new model for a training, which learns in ``environment``.
+
+        Before it learns, it brakes fully, or acts as the first policy of the recipe's key ``among``.
+        """
         recipe = training.recipe
         assert isinstance(recipe, OptionsRecipe)
         environment.engine.branch(environment.engine.moment())  # raises at once if the engine cannot branch

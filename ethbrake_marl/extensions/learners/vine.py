@@ -26,7 +26,10 @@ class Counterfactual(Algorithm):
     """Vine with one actor for all learners, or with a mixture of experts for one learner."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> CounterfactualModel:
-        """Return a new model, with the weights of the policy that the recipe's ``start`` names, or random weights."""
+        """Return a new model for a training, which learns in ``environment``.
+
+        It begins with the weights of the policy that the recipe's key ``start`` names, or with random weights.
+        """
         recipe = training.recipe
         assert isinstance(recipe, CounterfactualRecipe)
         environment.engine.branch(environment.engine.moment())  # raises at once if the engine cannot branch
@@ -45,7 +48,10 @@ class Counterfactual(Algorithm):
         return found
 
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
-        """Return the optimiser as ``policy``, or in a mixture those of ``network_1``, ``network_2``, ..., ``gate``."""
+        """Return the model's optimisers by name.
+
+        The only one is ``policy``, or in a mixture there are ``network_1``, ``network_2``, ..., and ``gate``.
+        """
         if not isinstance(model, ModesModel):
             return {"policy": model.policy.optimizer}
         members = {f"network_{k + 1}": actor.optimizer for k, actor in enumerate(model.policy.actors)}

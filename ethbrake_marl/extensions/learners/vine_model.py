@@ -85,7 +85,7 @@ class CounterfactualModel(BaseAlgorithm):
         self._train(actor, self._try_out(seen, moments, actor))
 
     def _visit(self, told: BaseCallback, act: Act) -> tuple[Float32s, State]:
-        """Drive all worlds for ``n_steps`` decisions with the policy ``act``, and report them to the callback.
+        """Drive all worlds for ``n_steps`` decisions with the policy ``act``, and report them to the callback ``told``.
 
         Returns the observations [n_steps, rows, F], and the states of the worlds at these decisions.
         """
@@ -148,7 +148,10 @@ class CounterfactualModel(BaseAlgorithm):
         return Tried(then, actor.means(then), gradient[good].astype(np.float32), importance[good])
 
     def _train(self, actor: AveragedActor, tried: Tried) -> None:
-        """Train the actor towards better actions within the trust radius, and log the loss."""
+        """Train the actor on the decisions of ``tried`` towards better actions within the trust radius.
+
+        The loss is logged.
+        """
         recipe = self.recipe
         self._update_learning_rate(actor.optimizer)
         target, weight = trusted_targets(tried, recipe.trust_radius, recipe.anchor)

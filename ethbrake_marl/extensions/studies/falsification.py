@@ -89,7 +89,7 @@ def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
 
 
 def far_apart(found: Scored, count: int) -> Ints:
-    """Return the row numbers of the best points that are far apart, best first, at most ``count``.
+    """Return the row numbers of the best points of ``found`` that are far apart, best first, at most ``count``.
 
     Any two of them differ by at least 0.1 in some coordinate. Points that do not count (score not finite) are omitted.
     """
@@ -104,7 +104,7 @@ def far_apart(found: Scored, count: int) -> Ints:
 
 
 def _above_median(found: Scored) -> Scored:
-    """Return the same points, with the score -inf for those that are no better than the median."""
+    """Return the points of ``found`` with the score -inf for those that are no better than the median."""
     good = np.isfinite(found.scores)
     if not good.any():
         return found

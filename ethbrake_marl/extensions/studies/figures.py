@@ -47,7 +47,7 @@ def is_done(job: TrainingJob) -> bool:
 
 
 def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
-    """Bring a training to its end, from where it stopped. Return False if it was stopped before.
+    """Bring the training of ``job`` to its end, from where it stopped. Return False if it was stopped before.
 
     ``stop_at`` takes each evaluation and returns a reason to stop, or None. Raises the exceptions of a training,
     ``InvalidInput`` if the folder holds another training, and ``BlockingIOError`` if another worker has just begun it.
@@ -65,7 +65,7 @@ def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
 
 
 def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
-    """Return the evaluations so far in the training's folder, each with steps and measures by name.
+    """Return the evaluations so far in the folder of ``job``, each with steps and measures by name.
 
     Raises ``InvalidInput`` if its table ``progress.csv`` is damaged.
     """
@@ -84,7 +84,7 @@ def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
 
 
 def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, Any]:
-    """Return the entries of a training for a table, after these evaluations: ``harm`` and ``FIGURES`` by name.
+    """Return the entries of ``job`` for a table, after these evaluations: ``harm`` and ``FIGURES`` by name.
 
     ``harm`` is the quantity by which the best policy is chosen. The policy's hash is missing.
     """
@@ -100,7 +100,7 @@ def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, An
 
 
 def final_figures(job: TrainingJob) -> dict[str, Any]:
-    """Return the entries of a finished training for a table: ``harm`` and all of ``FIGURES`` by name.
+    """Return the entries of ``job``, a finished training, for a table: ``harm`` and all of ``FIGURES`` by name.
 
     Raises ``InvalidInput`` for a damaged file.
     """

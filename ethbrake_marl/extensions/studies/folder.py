@@ -99,7 +99,7 @@ class StudyFolder:
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
-    """Return the differences between two sets of settings, in words: ``["seeds 2, here 5", "recipes"]``.
+    """Return the differences of the settings ``now`` from ``before``, in words: ``["seeds 2, here 5", "recipes"]``.
 
     For a list or an object, only the name is given. ``inside`` is the text before each name.
     """

@@ -30,24 +30,24 @@ class NamedWorld(FileModel):
     """One world: its name, its initial state by the columns of a table, and its measurements (m2/s2)."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
-    score: Number
-    harm: Number
-    reference: Number | None = None
+    score: Number  # value of the measure that was searched for, the larger the worse for the agent (m2/s2)
+    harm: Number  # harm of the agent (m2/s2)
+    reference: Number | None = None  # harm of the agent to compare with, or bound of the shield (m2/s2)
     state: Annotated[dict[str, Number], Field(min_length=1, max_length=1000)]
 
 
 class NamedWorlds(FileModel):
     """Content of a file of named worlds."""
 
-    format: Literal["ethbrake-worlds"]
+    format: Literal["ethbrake-worlds"]  # mark of this kind of file
     version: Annotated[int, Field(ge=1, le=1)]  # not a Literal, which would accept true and 1.0
-    scenario: str
+    scenario: str  # name or path of the scenario of the worlds
     scenario_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     settings: list[str] = Field(default=[])  # settings of the scenario, as for ``--set``
-    agent: str
-    measure: Literal["harm", "regret", "difference", "bound"]
-    against: str | None = None
-    harm_count: HarmCount
+    agent: str  # spec of the agent that drove
+    measure: Literal["harm", "regret", "difference", "bound"]  # what was searched for, as in ``weakness.Measure``
+    against: str | None = None  # spec of the agent to compare with; None: none, or the default
+    harm_count: HarmCount  # impacts that harm counts: each pair's first one (``first``) or all (``total``)
     found_by: str  # command of the search
     worlds: Annotated[list[NamedWorld], Field(min_length=1, max_length=MOST_NAMED_WORLDS)]
 

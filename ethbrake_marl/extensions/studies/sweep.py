@@ -262,18 +262,18 @@ class SweepPlan:
     def folder(path: Path) -> StudyFolder:
         """Return the object that checks and locks the folder ``path`` of a sweep.
 
-        The folder stores no settings of its own, because each job's folder stores that of its training.
+        The folder itself stores no settings, because each job's folder stores the settings of its training.
         """
         return StudyFolder(path, "a sweep", writes=(TABLE, FAILURES))
 
     @staticmethod
     def job(row: Row, path: Path) -> TrainingJob:
-        """Return the training of a job, with its folder inside the sweep's folder ``path``."""
+        """Return the training of the job ``row``, with its folder inside the sweep's folder ``path``."""
         training = Training.of(row.first.recipe, row.first.scenario, seed=row.asked.seed)
         return TrainingJob(training, path / RUNS / row.name, row.asked.settings)
 
     def train(self, row: Row, path: Path) -> None:
-        """Bring the training of a job in the sweep's folder ``path`` to its end, from where it stopped."""
+        """Bring the training of the job ``row`` in the sweep's folder ``path`` to its end, from where it stopped."""
         finish(self.job(row, path))
 
     def results(self, path: Path) -> dict[str, dict[str, Any]]:

@@ -659,7 +659,7 @@ def _check_searched(key: str, recipe: TrainingRecipe, file: TuningFile) -> None:
 
 
 def _value_at(content: Any, key: str) -> Any:
-    """Return the value at a dotted key (``network.policy.0``) of nested data; None if there is none."""
+    """Return the value at a dotted key (``network.policy.0``) of the nested data ``content``; None if there is none."""
     for part in key.removeprefix("recipe.").split("."):
         if isinstance(content, list) and part.isdecimal() and int(part) < len(content):
             content = content[int(part)]
