@@ -98,8 +98,8 @@ class SampledHarm:
     def of(cls, worlds: Worlds, task: Task) -> SampledHarm | None:
         """Return a watcher for ``worlds`` at the alert, or None if the measure is not defined for the task.
 
-        It is not defined with an obstacle or brakes that build up, which the paper's map does not model, nor if
-        another vehicle than Vehicle 2 decides, because the samples of the map are Vehicle 2's decisions.
+        It is not defined with an obstacle or brakes that build up, which the paper's map does not model, nor if another
+        vehicle than Vehicle 2 decides, because the samples of the map are Vehicle 2's decisions.
         """
         obstacle = task.scenario.has_obstacle or worlds.obstacle_ahead.any()
         if task.vehicles != (VEHICLE_2,) or obstacle or worlds.vehicles.build_up.any():

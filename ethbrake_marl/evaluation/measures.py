@@ -215,8 +215,8 @@ def register_measure_set(name: str, measures: MeasureSet) -> None:
     """Add a set of measures to every evaluation, under a name that is a key of ``MEASURE_SETS``.
 
     An installed package does the same with an entry point of the group ``ethbrake_marl.measure_sets``. Raises
-    ``InvalidInput`` if ``measures``
-    is not a ``MeasureSet``, ``AlreadyExists`` if the name of the set or of one of its measures is taken.
+    ``InvalidInput`` if ``measures`` is not a ``MeasureSet``, ``AlreadyExists`` if the name of the set or of one of its
+    measures is taken.
     """
     if not isinstance(measures, MeasureSet):
         raise InvalidInput(f"set of measures {name!r}: must be a MeasureSet")

@@ -97,10 +97,10 @@ def record_episode(
 def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float) -> Iterator[tuple[Floats, ...]]:
     """Yield the samples of each step: time [k], gaps [k, P], speeds [k, N], positions [k, N], commands [k, N].
 
-    ``segments`` are the steps of one world, each with the world before, the commands [1, N], and the end time [1].
-    Two samples of a step are at most ``sample_s`` apart (s).
-    Only the last step includes its end. Worlds hold gaps and speeds, not positions. So Vehicle 1's position is
-    measured as its gap to an obstacle ahead, which is the world's own or one out of reach.
+    ``segments`` are the steps of one world, each with the world before, the commands [1, N], and the end time [1]. Two
+    samples of a step are at most ``sample_s`` apart (s). Only the last step includes its end. Worlds hold gaps and
+    speeds, not positions. So Vehicle 1's position is measured as its gap to an obstacle ahead, which is the world's own
+    or one out of reach.
     """
     front = 0.0  # position of Vehicle 1 at the start of the segment
     for number, (before, command, until_s) in enumerate(segments):

@@ -187,8 +187,8 @@ def driven_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mappi
 def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
     """Return the index (0 = front) of the single controlled vehicle.
 
-    This is ``vehicle`` (name or index), or the scenario's only learner if ``vehicle`` is None. Raises
-    ``InvalidInput`` if there is not exactly one learner, or another learner than ``vehicle``.
+    This is ``vehicle`` (name or index), or the scenario's only learner if ``vehicle`` is None. Raises ``InvalidInput``
+    if there is not exactly one learner, or another learner than ``vehicle``.
     """
     learners = scenario.learners
     names = [scenario.vehicle_names[i] for i in learners]

@@ -134,7 +134,10 @@ class Moments:
         return self._around(1.0 - float(self.total / baseline.total), error)
 
     def _around(self, value: float, error: float) -> Estimate:
-        """Return the estimate ``value -+ t error``, where t has n - 1 degrees of freedom; no interval for one value."""
+        """Return the estimate ``value`` with the interval ``value -+ t error``; no interval for a single value.
+
+        ``error`` is the standard error; t has n - 1 degrees of freedom.
+        """
         if self.count < 2:
             return Estimate(value, None)
         half = float(stdtrit(self.count - 1, _UPPER)) * error
@@ -202,8 +205,8 @@ def mean(values: Floats) -> Estimate:
 def paired_difference(values: Floats, baseline: Floats) -> Estimate:
     """Return the mean of ``values - baseline`` with its t interval.
 
-    ``values`` and ``baseline`` are [n] each, in the same worlds. Raises ``InvalidInput`` if their lengths differ, or
-    if they are empty or not finite.
+    ``values`` and ``baseline`` are [n] each, in the same worlds. Raises ``InvalidInput`` if their lengths differ, or if
+    they are empty or not finite.
     """
     data, reference, products = _check_pair(values, baseline)
     return data.minus(reference, products).estimate

@@ -89,8 +89,8 @@ class SummaryTable(list[SummaryRow]):
     def sheet(self) -> Sheet:
         """Return the table with all columns: agent, its knowledge, and every measure that has a heading.
 
-        Measures that the user registered come last. Means that are only lower bounds (``SummaryRow.bounds``) are
-        marked ``≥``. Rows from other sources stand below.
+        Measures that the user registered come last. Means that are only lower bounds (``SummaryRow.bounds``) are marked
+        ``≥``. Rows from other sources stand below.
         """
         columns = [each.column() for each in measures() if each.heading]
         columns += [Column(heading_of(name), COLUMN + name) for name in (self[0].metrics if self else ())]

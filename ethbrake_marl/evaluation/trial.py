@@ -72,8 +72,8 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
 
     The scripts drive (with few candidates if they search); learners brake fully. The result has the keys:
 
-    - ``early_impacts``, ``moving_at_horizon``, ``vehicle_1_late``: number of worlds with an impact before a learner
-      may act, with something moving at the horizon, and with a latency of Vehicle 1;
+    - ``early_impacts``, ``moving_at_horizon``, ``vehicle_1_late``: number of worlds with an impact before a learner may
+      act, with something moving at the horizon, and with a latency of Vehicle 1;
     - ``commands_out_of_range``: vehicle -> row -> message, for commands beyond the vehicle's capacities;
     - ``not_state_free``: vehicle -> script that depends on the state;
     - ``refused_by``: agent, shield or setting that refuses such scripts -> message.

@@ -116,12 +116,12 @@ def train(
         measure: called with the training; returns the function that measures its policies before the first update,
             every few updates (a key of the recipe), and at the end. By default the recipe's fixed list. None: no
             measurements.
-        stop_at: called with every evaluation (an entry of ``TrainResult.evaluations``); returns a reason to stop
-            there with status ``interrupted``, or None.
+        stop_at: called with every evaluation (an entry of ``TrainResult.evaluations``); returns a reason to stop there
+            with status ``interrupted``, or None.
         on_progress: called with the progress. By default it is shown on stderr; None: silent.
 
-    Raises ``AlreadyExists`` for an existing directory without ``force``, ``InvalidInput`` if recipe and scenario do
-    not fit each other, ``TrainingDiverged`` for numbers that are not finite.
+    Raises ``AlreadyExists`` for an existing directory without ``force``, ``InvalidInput`` if recipe and scenario do not
+    fit each other, ``TrainingDiverged`` for numbers that are not finite.
 
     """
     changes = {"scheme": scheme, "turns": turns, "seed": seed, "total_steps": steps}

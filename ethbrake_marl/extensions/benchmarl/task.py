@@ -113,8 +113,8 @@ class LineTask(TaskClass):  # type: ignore[misc]
 
     Args:
         name: name of the task in BenchMARL, such as ``PAPER_RANDOM``.
-        config: ``scenario`` (a shipped name, a YAML file, its content, or a ``Scenario``) and the arguments
-            ``reward``, ``horizon_is_end`` and, optionally, ``shield`` of ``LineEnv``.
+        config: ``scenario`` (a shipped name, a YAML file, its content, or a ``Scenario``) and the arguments ``reward``,
+            ``horizon_is_end`` and, optionally, ``shield`` of ``LineEnv``.
 
     """
 

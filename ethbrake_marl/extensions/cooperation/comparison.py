@@ -25,8 +25,8 @@ def compare(measured: Sequence[Measured], searched: int) -> Json:
     """Return the comparison of all levels as plain data for JSON; docs/ablate-cooperation.md describes it.
 
     Keys: ``levels``, ``steps`` of the ladder (each level against the one before), ``channels`` (levels that differ only
-    in ``v2x``), and ``undertrained``: a sentence for each level whose trained policies do worse than full braking.
-    Each algorithm has its own ladder; levels without learners belong to all ladders.
+    in ``v2x``), and ``undertrained``: a sentence for each level whose trained policies do worse than full braking. Each
+    algorithm has its own ladder; levels without learners belong to all ladders.
 
     Args:
         measured: results of ``measure``.

@@ -191,7 +191,7 @@ class Plan:
         return TrainingJob(Training.of(recipe.replace(**changes), level.scenario), folder, self.noted)
 
     def settings(self) -> dict[str, Any]:
-        """Return all settings that affect the results, as plain data."""
+        """Return all settings that affect the results as plain data: levels, recipes, numbers and the shield."""
         numbers = ("seeds", "steps_per_learner", "episodes", "list_seed", "search_episodes", "budget")
         return {
             "levels": [level.scenario.model_dump(mode="json", exclude=set(WORDS)) for level in self.levels],

@@ -8,8 +8,8 @@ rest, resolves impacts and keeps the ledger of harm. Every step has three parts:
 3. *Meet.* Pairs that overlap and still close exchange velocity, unless the host resolves impacts itself and reports
    them.
 
-Latencies are rounded up to whole steps of the host, and agents know the rounded value, so no decision falls between
-two steps.
+Latencies are rounded up to whole steps of the host, and agents know the rounded value, so no decision falls between two
+steps.
 """
 
 from __future__ import annotations
@@ -174,9 +174,8 @@ def drive_host(host: Host, agent: Driver, scenario: str | Path | Scenario, world
         worlds: the worlds at the alert with which the host was set up. Only gaps and speeds are read from the host.
 
     Returns the outcome, and the worlds in which the host moved otherwise than a shield predicted. Raises
-    ``InvalidInput`` for a
-    scenario, agent or worlds that a host does not support, and ``HostFailed`` if the host raises or reports an
-    impossible state.
+    ``InvalidInput`` for a scenario, agent or worlds that a host does not support, and ``HostFailed`` if the host raises
+    or reports an impossible state.
 
     """
     scenario = load_scenario(scenario)

@@ -410,7 +410,7 @@ class TuningPlan:
     def proposals(self, path: Path) -> list[Values]:
         """Return the proposals (values of each trial so far) in the tuning's folder ``path``, as Optuna stores them.
 
-        Raises ``InvalidInput`` if one is not in the space.
+        Raises ``InvalidInput`` if one has other keys or values than the file's ``search`` allows.
         """
         file, space = path / PROPOSALS, self.file.search
         if not file.exists():

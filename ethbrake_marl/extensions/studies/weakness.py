@@ -53,7 +53,7 @@ class Measure:
     harm_count: HarmCount  # impacts that harm counts: each pair's first one (``first``) or all (``total``)
 
     def __call__(self, sample: Sample) -> Measured:
-        """Return the measurements in the worlds of ``sample``; a world in which the physics fails has the score -inf."""
+        """Return the measurements in the worlds of ``sample``; if the physics fails in a world, its score is -inf."""
         n = sample.worlds.n
         score, harm, reference = np.full(n, -np.inf), np.full(n, np.nan), np.full(n, np.nan)
         try:
