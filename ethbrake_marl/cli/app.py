@@ -59,11 +59,11 @@ def _about(
         bool, typer.Option("--version", is_eager=True, callback=_show_version, help="Show the version and exit.")
     ] = False,
 ) -> None:
-    """Options of ``ethbrake`` itself."""
+    """Options of ``ethbrake`` without a command: ``--version``."""
 
 
 def main() -> None:
-    """Entry point: run the command line and exit with its status."""
+    """Run the command line of this process, and exit with its status; the entry point of the program ``ethbrake``."""
     gc.set_threshold(20_000)  # Python's 700 costs a run 1.5 CPU-s, and there are hardly any reference cycles
     prepare_streams()
     sys.exit(run_command(sys.argv[1:]))
@@ -120,7 +120,7 @@ def _shell_asks(environment: Mapping[str, str]) -> bool:
 
 
 def _refuse(reason: str) -> int:
-    """Print the reason in one line on stderr, and return the exit status for an error."""
+    """Print the reason in one line on stderr, and return 2, the exit status for an error."""
     Out().note(f"ethbrake: error: {reason}")
     return 2
 
@@ -216,7 +216,7 @@ def add_command(name: str, command: typer.Typer | Callable[..., Any], *, epilog:
 
 
 def _names() -> list[str]:
-    """Return the names of the commands that were added to the app."""
+    """Return the names of the commands and command groups of ``app``, without those of extensions."""
     return [
         *(each.name or each.callback.__name__.replace("_", "-") for each in app.registered_commands if each.callback),
         *(str(group.name) for group in app.registered_groups),

@@ -109,7 +109,7 @@ class Out:
         self._turned = redirect_stdout(sys.stderr)
 
     def __enter__(self) -> Self:
-        """Redirect stdout to stderr, and register the environments for the user's code."""
+        """Redirect stdout to stderr, register the environments for the user's code, and return this object."""
         self._turned.__enter__()
         register_environments()
         return self

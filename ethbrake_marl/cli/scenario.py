@@ -237,7 +237,7 @@ def _in_words(quantity: Any) -> str:
 
 
 def _news_in_words(scenario: scenarios.Scenario) -> str:
-    """Describe the V2X channel: who knows what, and when."""
+    """Return a sentence about the scenario's V2X channel: which vehicle knows what, and when."""
     channel, about = scenario.v2x.channel._asdict(), type(scenario.v2x).model_fields
     usual = scenarios.CHANNELS["paper"]._asdict()
     other = {key: value for key, value in channel.items() if key in about and value != usual[key]}

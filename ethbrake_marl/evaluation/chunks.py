@@ -122,7 +122,7 @@ class Lineup:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _digests(self) -> list[str]:
-        """Return the SHA-256 of every file that the specs name: code, and the weights of an agent that is code."""
+        """Return the SHA-256 of every file that specs and measures name: Python files, and weights for such agents."""
         named = [part for spec in map(parse_spec, self.agents) if spec.file for part in (spec.file[0], spec.policy)]
         named += [name.rpartition(":")[0] for name in self.measures]
         return [file_sha256(Path(each)) for each in named if each is not None and Path(each).is_file()]

@@ -32,7 +32,7 @@ class Difference:
         return f"{self.agent} {MARK}" if any(each.names for each in self.exploits) else self.agent
 
     def to_json(self) -> dict[str, Any]:
-        """Return the difference as plain data for JSON."""
+        """Return plain data for JSON: ``agent``, ``policy``, ``exploits``, each harm's difference with its interval."""
         harms = {f"{name}_difference": estimate for name, estimate in self.harms.items()}
         exploits = [list(each.names) for each in self.exploits]
         return {"agent": self.agent, "policy": self.policy, **Estimate.side_by_side(harms), "exploits": exploits}
@@ -65,7 +65,7 @@ class Comparison:
         return Exploits.sentence(found)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the comparison as plain data for JSON."""
+        """Return the comparison as plain data for JSON, with one object per agent under ``agents``."""
         return {
             "intervals": "paired" if self.unpaired_because is None else "unpaired",
             "unpaired_because": self.unpaired_because,

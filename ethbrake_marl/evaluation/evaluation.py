@@ -228,7 +228,7 @@ class Evaluation:
         )
 
     def _repr_html_(self) -> str:
-        """Return a summary table of the agents, for a notebook."""
+        """Return HTML of a table with collisions and harm of each agent, for a notebook."""
         share = Column("Collisions", digits=1, scale=100.0, unit=" %")
         rows = [
             (agent, rate(int(each.collided.sum()), self.worlds.n), mean(each.first_impact_harm), mean(each.total_harm))
@@ -238,7 +238,7 @@ class Evaluation:
         return Sheet(repr(self), ("Agent", share, Column("First-impact harm"), Column("Total harm")), rows, note).html()
 
     def complete(self) -> Evaluation:
-        """Return the evaluation unchanged; raise ``PhysicsError`` if some worlds were left out."""
+        """Return this evaluation; raise ``PhysicsError``, naming the worlds, if some worlds were left out."""
         if self.left_out:
             raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
         return self

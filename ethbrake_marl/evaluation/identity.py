@@ -113,7 +113,7 @@ def policies_of(drivers: Mapping[int, object]) -> dict[str, str]:
 
 
 def result_versions() -> dict[str, str]:
-    """Return the versions of Python and of every package on which a result's numbers depend, by name.
+    """Return name -> version of Python and of every package on which a result's numbers depend.
 
     This includes packages that provided a part in this process, and the SHA-256 of the user's own Python files that it
     ran.
@@ -122,7 +122,7 @@ def result_versions() -> dict[str, str]:
 
 
 def own_versions() -> dict[str, str]:
-    """Return the versions that are the same whatever else is loaded: Python, this package, numba and numpy."""
+    """Return name -> version of Python, this package, numba and numpy, without other loaded packages."""
     return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
 
 

@@ -155,7 +155,7 @@ def drive_chunk(
 
 
 def _check_request(worlds: object, agents: object, chunk: object) -> None:
-    """Raise ``InvalidInput`` for arguments of ``evaluate`` of the wrong kind."""
+    """Raise ``InvalidInput`` if one of these arguments of ``evaluate`` has a wrong type or value."""
     if not isinstance(worlds, Worlds | Sample):
         raise InvalidInput(
             f"evaluate: worlds = {worlds!r}: must be worlds or a sample, as scenario.sample(n, seed) gives"

@@ -63,7 +63,7 @@ class ModeRow:
     policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle's name -> SHA-256 of its policy
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain data for JSON; missing values are null, intervals are ``[low, high]``."""
+        """Return the row as plain data for JSON; missing values are null, intervals are ``[low, high]``."""
         shares = self.verdicts or (None,) * len(VERDICTS)
         return {
             "agent": self.agent,

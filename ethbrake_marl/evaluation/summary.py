@@ -114,7 +114,10 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", ["Agent", "Knows", *columns], lines)
 
     def terminal(self) -> Sheet:
-        """Return the table for a terminal of 80 columns or more, with rows from other sources and the conditions."""
+        """Return the table to print in a terminal of 80 columns or more.
+
+        Below it stand rows from other sources, and a text about worlds, intervals and other notes.
+        """
         narrow = self._narrow()
         columns = [
             replace(each, wide=each.name not in narrow, interval="below" if each.name in _BELOW else "hidden")
@@ -145,7 +148,7 @@ class SummaryTable(list[SummaryRow]):
         return [self.terminal(), own] if lines else [self.terminal()]
 
     def markdown(self) -> str:
-        """Return the table for a document, with the conditions of all rows below it."""
+        """Return the table as Markdown, with a text about worlds, intervals and other notes below it."""
         return f"{self.sheet().markdown()}\n\n{self._conditions()}\n"
 
     def _conditions(self) -> str:
@@ -158,7 +161,10 @@ class SummaryTable(list[SummaryRow]):
         return "\n\n".join([ours, *(text for _, text in self.notes())])
 
     def notes(self) -> list[Note]:
-        """Return the notes below the table, first about our rows, then about rows from other sources."""
+        """Return the notes to print below the table: those about the agents, then those about rows of other sources.
+
+        Each is a pair: kind (``note`` or ``quiet``) and text.
+        """
         return [*notes_of(self), *(self.beside.notes if self and self.beside else ())]
 
 

@@ -90,7 +90,7 @@ class SummaryRow:
         return f"{self.agent} {MARK}" if self.exploits.names else self.agent
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain data for JSON; missing values are null, intervals are ``[low, high]``."""
+        """Return the agent's object in JSON results; missing values are null, intervals are ``[low, high]``."""
         registered = RegisteredMeasures(n.removeprefix(COLUMN) for n in self.estimates if n.startswith(COLUMN))
         more: dict[str, Any] = {}
         for name, each in MEASURE_SETS.items():

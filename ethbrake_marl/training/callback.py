@@ -43,7 +43,7 @@ class StopRequested(Exception):
 
 
 class Watchers(NamedTuple):
-    """Callables that follow a training, and may stop it."""
+    """Functions that follow a training: they measure its policies, may stop it, and receive its progress."""
 
     evaluate: Evaluate | None  # takes the current policies and returns their metrics; None: no measurements
     stop_at: StopAt | None  # takes the metrics of an evaluation and returns a reason to stop, or None to go on
@@ -116,7 +116,10 @@ class RunCallback(BaseCallback):
             self._write_checkpoint()
 
     def _take_policies(self) -> None:
-        """Copy the current weights, once per update; raise ``TrainingDiverged`` if a weight is not finite."""
+        """Copy the current weights as policies into ``course``, at most once per update.
+
+        Raises ``TrainingDiverged`` if a weight is not finite.
+        """
         course, steps = self.course, self.model.num_timesteps
         if course.policy is None or (course.steps, course.updates) != (steps, self.updates):
             if not weights_are_finite(self.model, self.learner.algorithm):
@@ -195,7 +198,10 @@ class RunCallback(BaseCallback):
         return TrainingState(numbers, arrays)
 
     def restore(self, state: TrainingState) -> None:
-        """Restore model and progress from ``state``; raise ``CorruptBundle`` if the state belongs to another model."""
+        """Restore model and progress from the checkpoint ``state``, so that the training continues there.
+
+        Raises ``CorruptBundle`` if the state belongs to another model.
+        """
         numbers, course = state.numbers, self.course
         try:
             restore_model(self.model, self.learner.algorithm, state)

@@ -63,7 +63,10 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
 
 
 def read_checkpoint(folder: Path) -> TrainingState:
-    """Read a checkpoint. Raise ``CorruptBundle`` if it is damaged, ``InvalidInput`` if it has another format."""
+    """Read and check the checkpoint in ``folder``, and return its state.
+
+    Raises ``CorruptBundle`` if it is damaged, ``InvalidInput`` if it has another format.
+    """
     if not os.path.lexists(folder / NUMBERS):
         raise InvalidInput(
             f"{folder}: has no {NUMBERS}, so another version of this package wrote it; go on with that version, or"

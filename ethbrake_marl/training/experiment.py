@@ -81,7 +81,7 @@ RUN_REPORTS: Registry[MakeReport] = Registry("report of a run", "run_reports", r
 
 @dataclass(frozen=True, slots=True)
 class ExperimentResult:
-    """Result of an experiment: the training, and the tables and notes to print."""
+    """What ``run_experiment`` returns: the training, the results, and the tables and notes to print."""
 
     trained: TrainResult  # result of the training, which may have been interrupted
     results: list[dict[str, Any]]  # content of results.json: one object per agent
@@ -224,7 +224,10 @@ def results_csv(rows: Sequence[SummaryRow]) -> str:
 
 @contextmanager
 def _status(run: RunDirectory, status: str) -> Iterator[None]:
-    """Record in ``run.json`` that the evaluation is running, and afterwards the training's status or the error."""
+    """Context manager that records in ``run.json`` that the evaluation is running, and afterwards how it ended.
+
+    ``status`` is what to record if no exception is raised: the status of the training.
+    """
     _note(run, "running", "evaluation", None)
     try:
         yield

@@ -65,7 +65,7 @@ class SeparatePolicies(BasePolicy):
 
     @property
     def policies(self) -> list[ActorCriticPolicy]:
-        """Policies of the learners, front to rear."""
+        """Policy of each learner, front to rear, as a list; the same objects as ``members``."""
         return [member for member in self.members if isinstance(member, ActorCriticPolicy)]
 
     def forward(self, observation: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:

@@ -193,7 +193,7 @@ def _like(model: NDArray[Any], arrays: Arrays, name: str) -> NDArray[Any]:
 
 
 def group_of(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Arrays:
-    """Return the arrays whose names begin with ``prefix``, under names without it."""
+    """Return those of ``arrays`` whose names begin with ``prefix``, by names without it."""
     return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 

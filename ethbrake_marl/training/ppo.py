@@ -53,7 +53,7 @@ class Ppo(Algorithm):
         return PPO("MlpPolicy", environment, **settings)
 
     def actors(self, model: BaseAlgorithm) -> tuple[BasePolicy, ...]:
-        """Return the model's policy, or the policy of each independent learner."""
+        """Return the model's policy, or the policies of independent learners, front to rear."""
         return tuple(model.policy.policies) if isinstance(model, IndependentPPO) else (model.policy,)
 
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:

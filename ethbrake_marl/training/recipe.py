@@ -43,10 +43,10 @@ Layers = Annotated[tuple[Annotated[int, Field(ge=1, le=4096)], ...], Field(stric
 
 
 class LearningRate(FileModel):
-    """A learning rate that falls from ``start`` to ``end`` over the training."""
+    """Learning rate of the optimiser, which falls from ``start`` to ``end`` over the training."""
 
-    start: Rate
-    end: Rate
+    start: Rate  # learning rate at the beginning
+    end: Rate  # learning rate at the end
     schedule: Literal["cosine"] = Field(
         "cosine", description="end + (start - end) (1 + cos(pi p)) / 2, where p is the share of steps done"
     )
@@ -61,7 +61,7 @@ class LearningRate(FileModel):
 
 
 class Shape(FileModel):
-    """Sizes of an algorithm's networks; a subclass declares them as keys."""
+    """Base class of the key ``network`` of a recipe: the sizes of the networks, which a subclass declares as keys."""
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
         """Return the description of the network in a policy bundle: an actor with one action in [-1, 1].
@@ -95,11 +95,11 @@ class NetworkShape(Shape):
 
 
 class EvaluationPlan(FileModel):
-    """The fixed list on which the policy is measured during training."""
+    """The fixed list of worlds on which the policy is measured during training, and how often."""
 
-    every_updates: Annotated[int, Field(ge=1)]
-    worlds: Annotated[int, Field(ge=1, le=1_000_000)]
-    seed: Annotated[int, Field(ge=0)]
+    every_updates: Annotated[int, Field(ge=1)]  # number of updates between two measurements
+    worlds: Annotated[int, Field(ge=1, le=1_000_000)]  # number of worlds of the list
+    seed: Annotated[int, Field(ge=0)]  # seed from which the worlds are drawn
 
 
 class TrainingRecipe(FileModel):
@@ -175,7 +175,7 @@ class TrainingRecipe(FileModel):
 
     @property
     def rounds(self) -> int:
-        """Decisions of each learner between two updates: the recipe's ``n_steps``."""
+        """Decisions of each learner in each world between two updates: the recipe's ``n_steps``."""
         return int(vars(self)["n_steps"])
 
     @property

@@ -60,7 +60,7 @@ class PpoRecipe(TrainingRecipe):
         return self
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` unless there is at least one update for every turn."""
+        """Raise ``InvalidInput`` if the training has fewer updates than turns of this number of learners."""
         updates = -(-self.total_steps // (self.n_envs * learners * self.n_steps))
         if self.turns is not None and self.turns * learners > updates:
             raise InvalidInput(
@@ -134,7 +134,7 @@ class SacRecipe(TrainingRecipe):
         return self.gradient_steps / (self.n_envs * self.steps_per_update)
 
     def derived(self) -> dict[str, float]:
-        """Return the update ratio, for ``config.json``."""
+        """Return ``{"update_ratio": ...}``, gradient steps per decision, to be recorded in ``config.json``."""
         return {"update_ratio": self.update_ratio}
 
 

@@ -79,7 +79,7 @@ class RunDirectory:
         return self
 
     def write_json(self, file: Path, content: Mapping[str, Any]) -> None:
-        """Replace ``file`` atomically by this content as JSON."""
+        """Write ``content`` as JSON to ``file``, a path in this folder, replacing the file completely or not at all."""
         write_file(file, json.dumps(content, indent=2, allow_nan=False).encode() + b"\n")
 
     def write_status(self, status: RunStatus, **more: Any) -> None:
@@ -116,7 +116,7 @@ class RunDirectory:
         return self.status.is_file() and read_object(self.status).get("status") == "finished"
 
     def wait_for_others(self, longest_s: float) -> None:
-        """Wait until no other process trains in this folder, at most ``longest_s`` seconds."""
+        """Wait until no other process trains in this folder, at most ``longest_s`` seconds; never raise."""
         with suppress(Timeout, OSError), FileLock(self.lock, timeout=longest_s, mode=0o666):
             pass
 

@@ -36,7 +36,7 @@ _BUSY = "another process is training here"
 
 @dataclass(frozen=True, slots=True)
 class TrainResult:
-    """Policies of a training, and how it went.
+    """Result of ``train`` or ``resume``: the policies, and how the training went.
 
     ``trained`` is the policy with the least harm on the fixed list, or the last policy if nothing was measured.
 

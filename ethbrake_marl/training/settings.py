@@ -27,7 +27,8 @@ class Settings(NamedTuple):
     def change(self, recipe: TrainingRecipe, tell: Callable[[str], None] | None = None) -> TrainingRecipe:
         """Return the recipe with the values of ``self.recipe`` for those keys that its class has.
 
-        ``tell`` is called with a note if only one of two keys was set that should be equal.
+        ``tell`` is called with a note for the user if only one of ``gamma`` and ``reward.shaping_discount``, which
+        should be equal, was set.
         """
         own = [override for override in self.recipe if override.top in type(recipe).model_fields]
         if not own:

@@ -37,13 +37,13 @@ _RIGHT_TEAM = (
 
 
 class TeamFile(FileModel):
-    """Content of ``team.json``."""
+    """Content of ``team.json`` in a run's folder, which says which policy drives which vehicle."""
 
-    format: Literal["ethbrake-team"] = "ethbrake-team"
-    format_version: Literal[1] = 1
-    scheme: Scheme
-    vehicles: Annotated[int, Field(ge=2, le=64)]
-    drivers: Annotated[dict[str, str], Field(min_length=1)]
+    format: Literal["ethbrake-team"] = "ethbrake-team"  # mark of this kind of file
+    format_version: Literal[1] = 1  # version of the format
+    scheme: Scheme  # how the learners trained together
+    vehicles: Annotated[int, Field(ge=2, le=64)]  # number of vehicles of the line
+    drivers: Annotated[dict[str, str], Field(min_length=1)]  # learner's name -> folder of its policy in the run
 
     @model_validator(mode="after")
     def _drivers_of_the_line_and_scheme(self) -> TeamFile:

@@ -24,7 +24,10 @@ from ethbrake_marl.training.team import TeamFile, bundle_of
 
 @dataclass(frozen=True, slots=True)
 class Training:
-    """A recipe combined with a scenario, and everything that follows from the two. Create it with ``Training.of``."""
+    """What is to be trained: a recipe combined with a scenario, and everything that follows from the two.
+
+    Create it with ``Training.of``.
+    """
 
     recipe: TrainingRecipe  # the recipe, with all changes
     scenario: Scenario  # the scenario, whose roles determine the learners

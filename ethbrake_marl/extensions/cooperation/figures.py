@@ -60,9 +60,10 @@ def ablation_figures(found: Json, caption: str) -> list[Figure]:
 
 
 def _harm_curve(found: Json, caption: str) -> Figure:
-    """Draw the harm of each level under both counts, between full braking and the joint optimum.
+    """Draw first-impact and total harm at each level, between full braking and the joint optimum.
 
-    All values are over the worlds in which the joint optimum was searched.
+    All values are over the worlds in which the joint optimum was searched. ``found`` is the content of
+    ``ablation.json``; ``caption`` is the text below.
     """
     figure, panels = new_panels((10.5, 4.8), columns=2)
     ladder = list(dict.fromkeys(level["level"] for level in found["levels"] if level["clear"] is None))
@@ -241,7 +242,7 @@ def _algorithms(found: Json) -> list[str]:
 
 
 def _short(name: str) -> str:
-    """Return ``cooperation-2-paper`` as two lines, ``2`` and ``paper``."""
+    """Return the name of a level without ``cooperation-``, in two lines: ``2`` and ``paper``."""
     return name.removeprefix("cooperation-").replace("-", "\n", 1)
 
 

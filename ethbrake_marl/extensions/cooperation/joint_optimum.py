@@ -184,7 +184,7 @@ class Goal(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Results of one level with one training algorithm: harm, best known harm, shielded results and goal."""
+    """Results of one level of cooperation with one training algorithm on the same worlds as all other levels."""
 
     level: Level  # the level
     algorithm: str | None  # name of the algorithm (recipe and scheme); None: the level has no learner

@@ -55,11 +55,11 @@ _DATASET_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]*-v\d+")
 
 
 def check_folder(path: Path, *, force: bool = False) -> None:
-    """Check before any work that ``path`` can become the folder of a Minari dataset.
+    """Check, before any work, that a Minari dataset can be written to the folder ``path``.
 
-    Raises ``AlreadyExists`` if ``path`` exists and ``force`` is off. Raises ``InvalidInput`` if the name is not
-    ``NAME-vNUMBER``, if the parent is missing or cannot be written, or if ``force`` would replace something other than
-    a Minari dataset.
+    ``force``: a dataset that exists there may be replaced. Raises ``AlreadyExists`` if ``path`` exists and ``force`` is
+    off. Raises ``InvalidInput`` if the name is not ``NAME-vNUMBER``, if the parent is missing or cannot be written, or
+    if ``force`` would replace something other than a Minari dataset.
     """
     if _DATASET_NAME.fullmatch(path.name) is None:
         raise InvalidInput(f"{path}: a dataset of Minari is a folder called NAME-vNUMBER, for instance brakes-v0")
@@ -187,7 +187,7 @@ _NEEDED_PACKAGES: dict[DatasetFormat, tuple[str, ...]] = {"parquet": ("pyarrow",
 
 @dataclass(frozen=True, slots=True)
 class DatasetSummary:
-    """Summary of a dataset that ``write_dataset`` wrote."""
+    """What ``write_dataset`` wrote: the file, its format, and numbers of episodes and decisions."""
 
     path: Path  # the file or folder
     format: DatasetFormat  # ``parquet`` or ``minari``

@@ -123,7 +123,7 @@ class Host(Protocol):
     dt: float
 
     def state(self) -> HostState:
-        """Return the present state of the vehicles."""
+        """Return the present time, gaps and speeds, and impacts since the last call if the host reports impacts."""
 
     def apply(self, command: HostCommand) -> None:
         """Move all vehicles by one step, as ``command`` says."""
@@ -329,7 +329,7 @@ class _Run:
 
     # the host's steps
     def _move(self) -> None:
-        """Let the host make one step, then resolve impacts unless the host reported them."""
+        """Let the host make one step, check the state that it reports, and resolve impacts unless it reported them."""
         if self.exact:
             until = np.minimum.reduce([grid.next_s for grid in self.grids])
             until = np.where(self.ended, self.time_s, np.maximum(until, self.time_s))

@@ -90,7 +90,7 @@ class SumoHost:
         self._sumo.simulationStep()
 
     def close(self) -> None:
-        """End the simulation."""
+        """End the SUMO simulation, so that this process can start another one."""
         self._sumo.close()
 
 

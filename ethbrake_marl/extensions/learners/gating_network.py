@@ -62,7 +62,7 @@ class AveragedGate(nn.Module):
         return self.seen[some], self.more[some]
 
     def choose(self, observation: Float32s) -> NDArray[np.int64]:
-        """Return the index of the expert that acts [rows] on observations [rows, F]."""
+        """Return the index of the expert that the averaged gate chooses for each of the observations [rows, F]."""
         with torch.no_grad():
             chosen: NDArray[np.int64] = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen

@@ -11,7 +11,10 @@ from torch.optim import Optimizer
 
 
 class Adam(torch.optim.Adam):
-    """Adam of torch, bit for bit, without its decorators, which import torch's compiler (1 to 3 s of CPU)."""
+    """Adam optimiser of torch with the same results, bit for bit, that does not import torch's compiler.
+
+    Its methods lack torch's decorators, which would import the compiler (1 to 3 s of CPU).
+    """
 
 
 for _name in ("step", "add_param_group", "zero_grad", "state_dict", "load_state_dict"):

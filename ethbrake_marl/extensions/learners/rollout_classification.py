@@ -17,7 +17,7 @@ from ethbrake_marl.training.training import Training
 
 
 class Options(Algorithm):
-    """Rollout classification with one actor for all learners."""
+    """The algorithm rollout classification, with one actor for all learners."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> OptionsModel:
         """Return a new model for a training, which learns in ``environment``.

@@ -25,7 +25,7 @@ class ChoosingShape(Shape):
     """Hidden layers of an actor that scores a number of actions, spread evenly from -1 to 1."""
 
     policy: Layers = Field(description=ACTOR_LAYERS)
-    activation: Activation = "relu"
+    activation: Activation = "relu"  # activation function of the hidden layers
     choices: int = Field(ge=2, le=4096, description="how many actions, evenly from -1 to 1, the network scores")
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:

@@ -34,7 +34,7 @@ class Scout(nn.Module):
         nn.init.zeros_(last.bias)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return the logarithm of the expected size [rows] for observations [rows, F], at most 20."""
+        """Return the logarithm of the expected gradient size, [rows], for observations [rows, F]; at most 20."""
         found: Tensor = self.layers(observation)[:, 0].clamp(max=20.0)
         return found
 

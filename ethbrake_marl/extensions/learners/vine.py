@@ -23,7 +23,10 @@ from ethbrake_marl.training.training import Training
 
 
 class Counterfactual(Algorithm):
-    """Vine with one actor for all learners, or with a mixture of experts for one learner."""
+    """The algorithm vine: it measures gradients of the return, and trains an actor with them.
+
+    All learners share one actor; a single learner may have a mixture of experts instead.
+    """
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> CounterfactualModel:
         """Return a new model for a training, which learns in ``environment``.

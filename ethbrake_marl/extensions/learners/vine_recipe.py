@@ -29,7 +29,7 @@ class ActorShape(Shape):
     """Hidden layers of an actor without a critic."""
 
     policy: Layers = Field(description=ACTOR_LAYERS)
-    activation: Activation = "relu"
+    activation: Activation = "relu"  # activation function of the hidden layers
     initial_action: Annotated[float | None, Field(ge=-1.0, le=1.0, exclude_if=lambda v: v is None)] = Field(
         None, description="about what the network does at first, [-1, 1]; left out: 0, which coasts"
     )

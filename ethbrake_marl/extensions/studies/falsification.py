@@ -129,7 +129,7 @@ def _children(parents: Floats, count: int, rng: np.random.Generator) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Falsified:
-    """The worst worlds of a search, worst first, and the scores of all worlds that were tried."""
+    """Result of a search for worlds in which an agent does badly: the worst worlds, worst first, and all scores."""
 
     sample: Sample  # the worst worlds at the alert
     worlds: list[NamedWorld]  # the same worlds with names, initial states and measurements

@@ -33,7 +33,7 @@ class Machine:
 
 
 def this_machine() -> Machine:
-    """Return the description of this machine."""
+    """Return processor, cores, present load and versions of this machine."""
     information = Path("/proc/cpuinfo")
     lines = information.read_text("utf-8").splitlines() if information.is_file() else []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

@@ -27,17 +27,19 @@ Number = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class NamedWorld(FileModel):
-    """One world: its name, its initial state by the columns of a table, and its measurements (m2/s2)."""
+    """One world of the file: its name, its initial state, and what was measured in it (m2/s2)."""
 
+    # Name of the world, unique in the file.
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
     score: Number  # value of the measure that was searched for, the larger the worse for the agent (m2/s2)
     harm: Number  # harm of the agent (m2/s2)
     reference: Number | None = None  # harm of the agent to compare with, or bound of the shield (m2/s2)
+    # Initial state: column of a table of worlds (``gap_1_m``, ``speed_1_mps``) -> value.
     state: Annotated[dict[str, Number], Field(min_length=1, max_length=1000)]
 
 
 class NamedWorlds(FileModel):
-    """Content of a file of named worlds."""
+    """Content of a YAML file of worlds that a search for an agent's worst worlds found, to be driven again."""
 
     format: Literal["ethbrake-worlds"]  # mark of this kind of file
     version: Annotated[int, Field(ge=1, le=1)]  # not a Literal, which would accept true and 1.0

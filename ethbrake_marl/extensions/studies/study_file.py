@@ -22,7 +22,7 @@ Seed = Annotated[int, Field(ge=0, lt=2**32)]
 
 
 class StudyFile(FileModel):
-    """Common base of the files of a sweep and of a tuning."""
+    """Base class of the content of a study's YAML file, of a sweep or of a tuning."""
 
     title: str = Field(default="", description="one line, for you")
     _document: Document = PrivateAttr(Document("the file", {}, {}))  # source document, for messages

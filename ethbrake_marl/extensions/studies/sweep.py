@@ -38,7 +38,10 @@ _GRID: YamlPath = ("grid",)
 
 
 class _OneOrMore:
-    """Annotation of a list that accepts a single entry in its JSON schema; a validator makes it a list."""
+    """Annotation of a list for which the file may contain a single entry instead.
+
+    It only changes the JSON schema; a validator turns a single entry into a list.
+    """
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
@@ -83,7 +86,7 @@ def _place(path: YamlPath) -> str:
 
 
 class SeedRange(FileModel):
-    """Range of ``count`` seeds, starting with ``first``."""
+    """Seeds of the trainings as a range: ``count`` seeds, from ``first`` on."""
 
     first: Seed = Field(default=0, description="the smallest seed")
     count: int = Field(ge=1, le=MOST_JOBS, description="how many seeds")
@@ -97,7 +100,7 @@ _Seeds = Annotated[
 
 
 class Grid(FileModel):
-    """Jobs for all combinations of the listed values."""
+    """One training for every combination of the listed scenarios, recipes, settings and seeds."""
 
     settings: Annotated[dict[str, _Values], AfterValidator(_check_keys)] = Field(
         default={}, alias="set", description="a list of values for each dotted key"
@@ -120,7 +123,7 @@ class Grid(FileModel):
 
 
 class ListedJob(FileModel):
-    """One single job."""
+    """One training: a scenario, a recipe, settings and a seed."""
 
     settings: _Settings = Field(default={}, alias="set", description="settings by dotted key, as train --set")
     scenario: str = Field(description="a name or a path, as train --scenario")
@@ -129,7 +132,7 @@ class ListedJob(FileModel):
 
 
 class SweepFile(StudyFile):
-    """Content of a sweep's file; ``settings`` apply to every job."""
+    """Content of the YAML file of a sweep: trainings as a grid of combinations, as a list of single jobs, or both."""
 
     settings: _Settings = Field(default={}, alias="set", description="settings of every job, as train --set")
     grid: Grid | None = Field(default=None, description="every combination of what it lists")

@@ -102,7 +102,7 @@ class Told(tune.Callback):  # type: ignore[misc]  # Ray ships no types
         self._name, self._done, self._total, self._tell = name, done, total, tell or (lambda progress: None)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return nothing: Ray's stored state is not read."""
+        """Return an empty state for Ray to store, because it is never read."""
         return {}
 
     def say(self, note: str = "") -> None:

@@ -73,7 +73,7 @@ _Number = Annotated[int | float, PlainValidator(_check_number), WithJsonSchema({
 
 
 class Range(FileModel):
-    """Range of a setting from ``low`` to ``high``, both included.
+    """Numbers that a search may try for one setting: a range from ``low`` to ``high``, both included.
 
     If both ends are written without a point, only whole numbers are tried.
     """
@@ -117,7 +117,7 @@ class Range(FileModel):
         return int(value) if value == int(value) else None
 
     def distribution(self) -> BaseDistribution:
-        """Return the range as an Optuna distribution."""
+        """Return Optuna's distribution from which values of this range are proposed."""
         from optuna.distributions import FloatDistribution, IntDistribution
 
         if self.whole:
@@ -132,7 +132,7 @@ class Range(FileModel):
 
 
 class Choices(FileModel):
-    """List of values of a setting, of any kind."""
+    """Values that a search may try for one setting: a list of values of any kind."""
 
     choices: tuple[Any, ...] = Field(strict=False, min_length=2, description="values of any kind that the recipe takes")
 
@@ -158,7 +158,7 @@ class Choices(FileModel):
         return next((each for each in self.choices if flow_text(each) == flow_text(value)), None)
 
     def distribution(self) -> BaseDistribution:
-        """Return the choices as an Optuna distribution."""
+        """Return Optuna's distribution from which choices, as texts, are proposed."""
         from optuna.distributions import CategoricalDistribution
 
         return CategoricalDistribution([*map(flow_text, self.choices)])
@@ -187,7 +187,7 @@ def _check_recipe_keys(value: dict[str, Any]) -> dict[str, Any]:
 
 
 class Measuring(FileModel):
-    """List of worlds on which trials are judged and pruned, and the number of evaluations in a training."""
+    """How trials are judged: the list of worlds on which their policies are evaluated, and how often in a training."""
 
     worlds: int = Field(default=1000, ge=1, le=1_000_000, description="of the list")
     seed: Seed = Field(default=4007, description="of the list")
@@ -197,7 +197,8 @@ class Measuring(FileModel):
 class Pruning(FileModel):
     """Rule that stops weak trials early (Ray's median stopping rule).
 
-    A trial stops if its least harm so far is above the median of the other trials' mean harm up to the same time.
+    A trial (one training) stops if its least harm so far is above the median of the other trials' mean harm up to the
+    same evaluation.
     """
 
     after_trials: _Count = Field(default=5, description="so many others must have come as far before one is stopped")
@@ -218,7 +219,7 @@ class Pruning(FileModel):
 
 
 class Sampling(FileModel):
-    """Source of the proposals: Optuna's TPE, or random values."""
+    """How the values of the next trial are chosen: by Optuna's TPE from the results of earlier trials, or at random."""
 
     name: Literal["tpe", "random"] = Field(default="tpe", description="Optuna's TPE, or chance")
     seed: Seed = Field(default=0, description="of what is proposed")
@@ -235,7 +236,7 @@ class Sampling(FileModel):
 
 
 class TuningFile(StudyFile):
-    """Content of a tuning's file."""
+    """Content of the YAML file of a tuning: a training, and the settings of its recipe to search for the least harm."""
 
     scenario: str = Field(description="a name or a path, as train --scenario")
     recipe: str = Field(description="a name or a path, as train --recipe")

@@ -40,7 +40,7 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """Measure of how bad a world is for an agent.
+    """Measure of how badly an agent does in a world; calling it with a sample measures every world.
 
     ``harm``: its harm. ``regret``: its harm minus the harm of the reference, by default the best profile that a search
     finds with hindsight. ``difference``: the absolute difference between its harm and that of the reference. ``bound``:
