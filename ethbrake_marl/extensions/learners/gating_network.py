@@ -22,7 +22,8 @@ class AveragedGate(nn.Module):
     """Gating network that learns (``learning``), and the running ``average`` of its weights, which decides.
 
     A memory holds the last decisions at which the experts (networks that drive) were compared: the observation, and the
-    extra cost of each expert over the best one. Its size is M, the number of experts K, of features F.
+    extra cost of each expert over the best one. M is the size of the memory, K the number of experts, F the number of
+    features of an observation.
 
     Args:
         inputs: number of features of an observation.

@@ -40,11 +40,12 @@ PolicyName = Annotated[str, Field(pattern=r"^[a-z]+@.+$", max_length=4096)]
 
 
 class OptionsRecipe(TrainingRecipe):
-    """Recipe that tries several actions at ``tried`` of the ``n_envs x n_steps`` decisions of a round.
+    """Recipe of rollout classification: the policy learns from several actions, each tried to the end of its episode.
 
-    The policy learns to choose between ``network.choices`` actions, spread evenly from -1 to 1, and the policies
-    ``among``. At each such decision it tries: the action that it takes; one below and one above it for each distance of
-    ``near``; the actions ``fixed``; and ``drawn`` random ones (policies if there are any, else actions).
+    It learns to choose between ``network.choices`` actions, spread evenly from -1 to 1, and the policies ``among``. In
+    a round (``n_envs x n_steps`` decisions, then an update), ``tried`` of the decisions are tried with: the action that
+    the policy takes; one below and one above it for each distance of ``near``; the actions ``fixed``; and ``drawn``
+    random ones (policies if there are any, else actions). The *cost* of an action is minus the return after it.
     """
 
     most_decisions = 2**22
@@ -69,9 +70,12 @@ class OptionsRecipe(TrainingRecipe):
         description="how many more are tried there: of the policies among, or where there are none of the choices",
     )
     holds: Holds = Field(description="for how many steps an action is tried, one of these")
+    # Upper limit of an action's extra cost over the best tried action, so that rare large costs do not dominate.
     largest_cost: Positive = Field(
         description="an action that costs more than this beyond the best one counts as this much more"
     )
+    # Factor, growing from 0 to this value during the training, of an additional cost: by how much more an action costs
+    # than braking fully from this decision on.
     caution: float = Field(
         0.0,
         ge=0.0,
@@ -80,6 +84,7 @@ class OptionsRecipe(TrainingRecipe):
         description="how many times the excess over full braking from there on counts besides, at the end; it grows"
         " from 0",
     )
+    # Weight, in the cost, of the line's harm under the count that the reward does not use (first impacts or all).
     tie_break: float = Field(
         0.0,
         ge=0.0,
@@ -87,10 +92,13 @@ class OptionsRecipe(TrainingRecipe):
         exclude_if=not_,
         description="weight of the whole line's harm in the other count, beside the reward",
     )
+    # Whether costs are divided by the mean cost in the same scenario of a mixture, so that all scenarios count alike.
     relative: bool = Field(
         False, exclude_if=not_, description="true: in a mixture, costs count beside the usual ones of the same scenario"
     )
+    # Share of the decisions to learn from that are drawn in proportion to how much the tried actions differ in cost.
     focus: Focus = Field(0.0, description="share of what is learned from that is drawn where a choice matters most")
+    # Weight of a convex term in the loss, which keeps gradients alive where the policy is nearly certain.
     guide: NonNegative = Field(
         description="weight of the convex part of the loss, without which learning can stand still at the beginning"
     )

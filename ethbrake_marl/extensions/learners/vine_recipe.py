@@ -36,10 +36,11 @@ class ActorShape(Shape):
 
 
 class CounterfactualRecipe(TrainingRecipe):
-    """Recipe that tries ``counterfactuals`` of the ``n_envs x n_steps`` decisions of a round in two ways.
+    """Recipe of vine: some decisions are tried with a higher and a lower action, each to the end of its episode.
 
-    The policy learns from the differences. ``start`` names a trained policy to continue from; without it the weights
-    are random. ``ppo@shipped`` is the policy that ships for the scenario; if none ships, the weights are random.
+    These are ``counterfactuals`` of the ``n_envs x n_steps`` decisions of a round. The policy learns from the
+    differences of the returns. ``start`` names a trained policy to continue from; without it the weights are random.
+    ``ppo@shipped`` is the policy that ships for the scenario; if none ships, the weights are random.
     """
 
     most_decisions = 2**22
@@ -55,14 +56,18 @@ class CounterfactualRecipe(TrainingRecipe):
         description="how far an action is moved to see what comes of it; the logarithm of what is drawn is uniform"
     )
     holds: Holds = Field(description="for how many steps an action is tried, one of these")
+    # Largest size of a measured gradient (return per unit of action); larger ones, at jumps of the harm, are cut to it.
     gradient_limit: Positive | Literal["auto"] = Field(
         description="a larger gradient, at a jump, counts as this one; return per action; auto: as measured"
     )
+    # Largest distance from an action to the target that it is trained towards in one update.
     trust_radius: Rate = Field(description="farthest that one update asks an action to move")
+    # Weight that holds actions where they are; the larger, the less small gradients move them.
     anchor: Positive = Field(description="how much an action that makes no difference holds to where it is")
     n_epochs: int = Field(ge=1, le=1000, description="how often an update goes through what was collected")
     batch_size: int = Field(ge=2, description=BATCH_SIZE)
     averaging: Averaging = Field(description=AVERAGING)
+    # Share of the tried decisions that are drawn in proportion to the gradient that a small network expects there.
     focus: Focus = Field(0.0, description="share of what is tried that a scout draws, where a choice matters most")
     network: ActorShape = Field(description=NETWORK)
     modes: Annotated[ModesPlan | None, Field(exclude_if=not_)] = Field(

@@ -150,7 +150,7 @@ class Timed(NamedTuple):
     def seconds(self, steps: int) -> float:
         """Return the estimated seconds for ``steps`` decisions of such trainings, including their evaluations.
 
-        A training evaluates its policies on the fixed list at the start, now and then, and at the end.
+        A training evaluates its policies on the recipe's fixed list at the start, every few updates, and at the end.
         """
         recipe = self.job.training.recipe
         times = recipe.total_steps // self.job.per_update // recipe.evaluation.every_updates + 2
