@@ -47,8 +47,9 @@ class Measure:
     def values(self, outcome: Outcome, context: Any) -> Values | None:
         """Return the measure's value in every world of an outcome, [n].
 
-        ``context`` is what the measure's set prepared for the evaluation (``contexts_of``). Returns None for a
-        comparison, for a set that does not apply (context ``Silent``), and if the outcome lacks the measure.
+        ``context`` is what the measure's set prepared for the evaluation (``contexts_of``). Returns None if the measure
+        only compares another one with a baseline, if its set does not apply (context ``Silent``), or if the outcome
+        lacks it.
         """
         if isinstance(self.of, str) or isinstance(context, Silent):
             return None

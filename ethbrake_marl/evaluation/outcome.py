@@ -44,7 +44,8 @@ class Outcome:
     final: Worlds  # each world at the end of its episode
     at_rest: Bools  # [n] whether the line came to rest before the horizon
     predicted_harm: Floats | None  # [n] harm that the agent predicted at the alert (m2/s2); None if it predicts none
-    # [n] whether a shield in episode mode chose the policy (else its baseline plan); None without such a shield.
+    # [n] whether the policy behind a shield drove to the end: episode mode chose it at the alert, or step mode replaced
+    # none of its actions. None without a shield.
     chosen_policy: Bools | None
     knows: Knowledge = UNSTATED  # the agent's statement of what it knows about the line
     # [n] distance by which Vehicle 1 was shoved beyond its own stopping point; None: not measured.

@@ -131,9 +131,10 @@ def compare_modes(
 ) -> ShieldModes:
     """Compare every agent without a shield, behind a shield in episode mode, and in step mode, on the same worlds.
 
-    If several vehicles are controlled, episode mode is replaced by a step mode that caps each vehicle's harm. Each
-    replaced decision of step mode is simulated again without the shield. A world that cannot be advanced with one agent
-    is left out for all, and listed in ``left_out``.
+    Step mode is also tried without later rollouts of the policy (``step-alert``). If several vehicles are controlled,
+    episode mode is replaced by a step mode that caps each vehicle's harm (``step-cap``). Each replaced decision of step
+    mode is simulated again without the shield. A world that cannot be advanced with one agent is left out for all, and
+    listed in ``left_out``.
 
     Args:
         agents: agents or teams by name, without a shield. They are not changed.

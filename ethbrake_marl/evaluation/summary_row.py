@@ -36,7 +36,7 @@ class SummaryRow:
     collisions: int  # number of worlds with at least one impact
     horizon_ends: int  # number of worlds in which something still moves at the horizon
     parameters: Conditions  # scenario, seed, controlled vehicles and quantities of the worlds
-    # Share of worlds in which a shield in episode mode chose the policy; None without such a shield.
+    # Share of worlds in which the policy behind a shield drove to the end (``Outcome.chosen_policy``); None: no shield.
     policy_share: float | None = None
     # Fields that sets of measures add to the JSON object, by name of the set (``MeasureSet.row``).
     more: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)

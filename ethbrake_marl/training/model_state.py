@@ -112,7 +112,10 @@ def _restore_weights(model: Model, algorithm: Algorithm, rates: Mapping[str, flo
 
 
 def _captured_rows(model: Model) -> Arrays:
-    """Return the last observation of each environment row, and returns and lengths of the latest finished episodes."""
+    """Return as arrays by name: the last observation of each row of the model's environment, and finished episodes.
+
+    Returns and lengths of the latest finished episodes are what Stable-Baselines3 logs.
+    """
     observations: Any = model._last_obs
     episodes = list(model.ep_info_buffer or ())
     return {

@@ -42,8 +42,10 @@ class NamedWorlds(FileModel):
     """Content of a YAML file of worlds that a search for an agent's worst worlds found, to be driven again."""
 
     format: Literal["ethbrake-worlds"]  # mark of this kind of file
-    version: Annotated[int, Field(ge=1, le=1)]  # not a Literal, which would accept true and 1.0
+    # Version of the format; not a Literal, which would accept true and 1.0.
+    version: Annotated[int, Field(ge=1, le=1)]
     scenario: str  # name or path of the scenario of the worlds
+    # Hash of the scenario's content, which must be the same when the worlds are driven again.
     scenario_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     settings: list[str] = Field(default=[])  # settings of the scenario, as for ``--set``
     agent: str  # spec of the agent that drove
@@ -51,6 +53,7 @@ class NamedWorlds(FileModel):
     against: str | None = None  # spec of the agent to compare with; None: none, or the default
     harm_count: HarmCount  # impacts that harm counts: each pair's first one (``first``) or all (``total``)
     found_by: str  # command of the search
+    # The worlds, worst first.
     worlds: Annotated[list[NamedWorld], Field(min_length=1, max_length=MOST_NAMED_WORLDS)]
 
     @classmethod
