@@ -23,22 +23,22 @@ from ethbrake_marl.training.networks import ACTIVATIONS, sb3_names, tensors_of
 
 
 class Deterministic(BasePolicy):
-    """Policy without noise: its actions are its ``means``, clipped to [-1, 1]."""
+    """Base class of policies without exploration noise: actions are the network's outputs, clipped to [-1, 1]."""
 
     def means(self, observation: Float32s) -> Float32s:
-        """Return the outputs [rows] of the learning weights for observations [rows, F], before clipping."""
+        """Return the outputs [rows] of the weights that learn for observations [rows, F], before clipping."""
         raise NotImplementedError
 
     def expect(self, observation: Float32s) -> Floats:
-        """Return the expected size of the gradient, [rows]."""
+        """Return how large the return's gradient is expected to be at observations [rows, F], as [rows]."""
         raise NotImplementedError
 
     def act(self, observation: Float32s) -> Float32s:
-        """Return the actions [rows], in [-1, 1]."""
+        """Return the actions [rows], in [-1, 1], for observations [rows, F]."""
         return np.clip(self.means(observation), -1.0, 1.0)
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of the driving weights, named as in a policy bundle with this network."""
+        """Return copies of the weights that drive, by their names in a policy bundle with this network."""
         return tensors_of(self, network)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> Tensor:
@@ -49,7 +49,8 @@ class Deterministic(BasePolicy):
 class AveragedActor(Deterministic):
     """Actor with weights that learn (``learning``) and the running average of these weights, which drives.
 
-    The average has the parameter names of Stable-Baselines3's PPO.
+    The average has the parameter names of Stable-Baselines3's PPO. The arguments are the spaces of Stable-Baselines3,
+    the learning rate as a function of the remaining share of the training, and the recipe.
     """
 
     def __init__(
@@ -82,7 +83,7 @@ class AveragedActor(Deterministic):
             learns.copy_(mean)
 
     def take_over(self, tensors: Mapping[str, Float32s]) -> None:
-        """Load the tensors of a policy bundle into both sets of weights."""
+        """Copy ``tensors``, the weights of a policy bundle by name, into both the learning and the averaged weights."""
         state = self.state_dict()
         for name, theirs in sb3_names(self._spec).items():
             state[theirs].copy_(torch.from_numpy(tensors[name]))
@@ -98,6 +99,6 @@ class AveragedActor(Deterministic):
         return self.scout.expect(observation)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return the actions [rows, 1] of the averaged weights."""
+        """Return the actions [rows, 1] of the averaged weights for observations [rows, F]."""
         means: Tensor = self.action_net(self.mlp_extractor["policy_net"](observation))
         return means.clamp(-1.0, 1.0)

@@ -28,25 +28,25 @@ Decide = Callable[[Observations, Ints, int], Floats]  # (observations [m, L, F],
 
 
 class Offsets(NamedTuple):
-    """For each row, the learner whose actions are moved, by how much, and for how many steps."""
+    """Changes of actions in n branches: in each one, an offset is added to one learner's actions for some steps."""
 
-    learner: Ints  # [n] index of the learner among the learners
-    size: Floats  # [n] offset of its action; the sum is clipped to [-1, 1]
+    learner: Ints  # [n] number of that learner among the learners (0 = foremost)
+    size: Floats  # [n] offset that is added to its action; the sum is clipped to [-1, 1]
     steps: Ints  # [n] number of steps with the offset
 
 
 def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) -> tuple[Floats, Floats]:
-    """Play every row to the end of its episode. Return the moved learner's return, and the sum of its offsets.
+    """Play every branch to the end of its episode, with offsets added to one learner's actions.
 
     Args:
-        engine: branches to play; changed in place.
-        act: policy of all learners, from observations alone.
-        offsets: for each row the learner whose actions are moved, how far, and for how many steps.
+        engine: engine whose n rows are the branches to play; it is changed.
+        act: policy of all learners, a function of observations alone.
+        offsets: for each row the learner whose actions are changed, by how much, and for how many steps.
         gamma: discount of one time step.
 
-    Returns the return [n] of the moved learner from now on (NaN for a row that could not be advanced), and the sum of
-    its offsets [n] after clipping actions to [-1, 1]. If the reward is harm alone, a row ends as soon as nothing can
-    change any more.
+    Returns the discounted return [n] of that learner from now on (NaN for a row that could not be advanced), and by how
+    much its actions changed in all, [n], after clipping to [-1, 1]. If the reward is harm alone, a row ends as soon as
+    nothing can change any more.
 
     """
     moved, most = np.zeros(engine.n), int(offsets.steps.max(initial=0))
@@ -66,9 +66,18 @@ def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) ->
 
 
 def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) -> Floats:
-    """Play every row to the end of its episode, but at least ``at_least`` steps. Return each learner's return, [n, L].
+    """Play every row of an engine to the end of its episode, and return each learner's discounted return, [n, L].
 
-    ``decide`` returns the learners' actions. See ``play_to_the_end`` for the other arguments.
+    Args:
+        engine: engine whose rows are played; it is changed.
+        decide: function of the observations [m, L, F], the row numbers [m] that still run, and the number of steps so
+            far. It returns the learners' actions [m, L].
+        gamma: discount of one time step.
+        at_least: number of steps before which no row ends early.
+
+    If the reward is harm alone, a row ends early as soon as nothing can change any more. The return is NaN for a row
+    that could not be advanced.
+
     """
     vehicles = np.array(engine.learners, np.int64)
     gained, actions = np.zeros((engine.n, len(vehicles))), np.zeros((engine.n, len(vehicles)))
@@ -90,7 +99,10 @@ def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) 
 
 
 def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
-    """Play every row to its end with ``act``. Return the observations at each decision, [m, L, F], and the states."""
+    """Play every row of an engine to the end of its episode with the policy ``act``.
+
+    Returns the observations at each of the m decisions of all rows, [m, L, F], and the states at these decisions.
+    """
     seen_then, moments = [], []
 
     def decide(seen: Observations, rows: Ints, number: int) -> Floats:
@@ -103,7 +115,7 @@ def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
 
 
 def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
-    """Return the ``rows`` in which everything stands as it stood ``before``, and will keep standing.
+    """Return for each of ``rows`` [m] whether everything stands, as one step ``before``, and will keep standing.
 
     A policy with the same observation acts the same. So a row counts only if no latency or message can change the
     observation.
@@ -117,7 +129,16 @@ def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
 
 @compiled
 def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, stands: Bools) -> None:
-    """Fill ``stands`` [m] for ``rows`` [m] of ``state``; ``before`` [m] holds the rows one step earlier."""
+    """Write into ``stands`` [m] whether nothing can change any more in each of ``rows`` [m].
+
+    Args:
+        state: packed state of all rows of an engine.
+        before: [m, columns] packed state of ``rows`` one step earlier.
+        params: packed constants of all rows.
+        rows: [m] row numbers.
+        stands: [m] result, which is overwritten.
+
+    """
     column = columns(state)
     by_link = params.shape[1] > column.own_latency
     for m in range(rows.shape[0]):
@@ -136,12 +157,15 @@ def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, sta
 
 
 def other_count(count: HarmCount) -> HarmCount:
-    """Return the harm count that is not ``count``."""
+    """Return ``total`` for the harm count ``first``, and ``first`` for ``total``."""
     return "total" if count == "first" else "first"
 
 
 def moving_rows(moments: State) -> Bools:
-    """Return the rows in which some vehicle moves. A row in which everything stands teaches nothing."""
+    """Return whether some vehicle moves in each of the states ``moments``, [n] bool.
+
+    A decision in which everything stands teaches nothing.
+    """
     column = moments.packed.column
     moving: Bools = (moments.motion[:, column.speed : column.command] != 0.0).any(axis=1)
     return moving

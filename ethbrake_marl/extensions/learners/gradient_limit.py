@@ -17,7 +17,7 @@ NARROWEST = 4.0  # least ratio of the largest to the smallest offset, which take
 
 
 def limit_that_cuts(sizes: Floats, share: float) -> float:
-    """Return the limit that removes this share of the sum of the sizes [n]."""
+    """Return the limit for gradient sizes [n] such that cutting larger ones to it removes ``share`` of their sum."""
     rising = np.sort(sizes)
     kept = (
         np.cumsum(rising) + np.arange(len(rising) - 1, -1, -1) * rising
@@ -26,11 +26,19 @@ def limit_that_cuts(sizes: Floats, share: float) -> float:
 
 
 def smallest_offset(measured: Floats, least: float, most: float) -> float:
-    """Return the smallest offset to draw: ``least``, or more if the spread of gradients falls steeply with the offset.
+    """Return the smallest offset of an action to draw when gradients are measured.
+
+    It is ``least``, or more if the spread of gradients falls steeply with the offset.
 
     Where harm jumps, the spread falls with the square root of the offset; where harm is smooth, it is constant. The
-    slope is measured between the smaller and the larger half of the offsets. ``measured`` [n, 2] holds gradient sizes
-    and their offsets (0: no measurement yet).
+    slope is measured between the smaller and the larger half of the offsets.
+
+    Args:
+        measured: [n, 2] sizes of measured gradients, and the offsets with which they were measured (0: no measurement
+            yet).
+        least: lower end of the range of offsets.
+        most: upper end of the range of offsets.
+
     """
     known = measured[measured[:, 1] > 0.0]
     halves = np.array_split(known[np.argsort(known[:, 1], kind="stable")], 2)

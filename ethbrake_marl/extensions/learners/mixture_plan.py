@@ -9,12 +9,12 @@ from ethbrake_marl.training.recipe import Fraction, Layers, NonNegative, Positiv
 
 
 class Shares(FileModel):
-    """Share of all updates that each stage of training has; the stages sum to 1."""
+    """Share, 0 to 1, of all updates that each stage of training a mixture of experts has; the shares sum to 1."""
 
-    alone: Fraction  # the first expert, in all worlds
-    further: Fraction  # the further experts, one after the other, each in its own worlds
-    gate: Fraction  # the gating network
-    together: Fraction  # all experts and the gate; each expert at decisions at which the gate chooses it
+    alone: Fraction  # share for the first expert, in all worlds
+    further: Fraction  # share for the further experts, one after the other, each in worlds of its own
+    gate: Fraction  # share for the gating network, which chooses an expert at each decision
+    together: Fraction  # share for all experts and the gate; each expert learns where the gate chooses it
 
     @model_validator(mode="after")
     def _everything(self) -> Shares:
@@ -25,7 +25,11 @@ class Shares(FileModel):
 
 
 class ModesPlan(FileModel):
-    """Number of experts, choice of the worlds of each further expert, and training of the gating network."""
+    """Settings of a mixture of experts: several networks that drive, and a gate that chooses one at each decision.
+
+    A further expert first imitates templates (random braking profiles) in worlds where one of them does better than all
+    networks before. It is then trained in worlds of its own, those in which it is hardly worse than these networks.
+    """
 
     networks: int = Field(ge=2, le=16, description="how many")
     gate: Layers = Field(description="hidden layers of the gate")

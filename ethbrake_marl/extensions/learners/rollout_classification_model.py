@@ -29,7 +29,14 @@ LEAST_USUAL = 0.1  # m2/s2; least divisor of relative costs, for scenarios with 
 
 
 class OptionsModel(CounterfactualModel):
-    """Model that visits decisions with the actor, tries several actions at some of them, and learns their costs."""
+    """Model that visits decisions with the actor, tries several actions at some of them, and learns their costs.
+
+    Args:
+        environment: environment of the training.
+        recipe: the recipe.
+        among: weights of the trained policies that the actor may choose, each by name.
+
+    """
 
     policy: ChoosingActor  # type: ignore[assignment]
     recipe: OptionsRecipe  # type: ignore[assignment]
@@ -72,9 +79,15 @@ class OptionsModel(CounterfactualModel):
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
 
     def _try_actions(self, seen: Float32s, moments: State) -> tuple[Float32s, Ints, Floats]:
-        """Try actions at some decisions. Return observations [B, F], numbers of the actions [B, C], and costs [B, C].
+        """Try several actions at some of the visited decisions, each to the end of its episode.
 
-        The first action is the one that the actor takes. The costs include ``caution``.
+        Args:
+            seen: [steps, rows, F] observations at the visited decisions.
+            moments: states of the worlds at these decisions.
+
+        Returns observations [B, F], numbers of the tried actions [B, C], and their costs [B, C]. The first action is
+        the one that the actor takes. The costs include the recipe's ``caution``.
+
         """
         recipe, actor, learners = self.recipe, self.policy, len(self.engine.learners)
         observed, first, last = seen.reshape(-1, seen.shape[2]), actor.first, recipe.network.choices - 1
@@ -129,7 +142,13 @@ class OptionsModel(CounterfactualModel):
         return observed[rows], tried, costs
 
     def _usual(self, rows: Ints, least: Floats) -> Floats:
-        """Return the usual cost of a decision in the scenario of each row [B], updated with the ``least`` costs [B]."""
+        """Update the running mean of costs in each scenario of a mixture, and return it for each decision, [B].
+
+        Args:
+            rows: [B] row numbers of the decisions among the visited ones.
+            least: [B] cost of the best tried action at each of them.
+
+        """
         numbers = self._numbers[rows]
         first = int(numbers.min())
         drawn = members_of(

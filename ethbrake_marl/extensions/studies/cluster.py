@@ -15,7 +15,13 @@ _SILENT = ("ray.tune.tune", "ray.tune.analysis.experiment_analysis")  # they adv
 
 @contextmanager
 def connected(address: str, cores: int | None) -> Iterator[None]:
-    """Connect to Ray while the block runs (see ``connect_ray``). SIGTERM acts like Ctrl-C in the block."""
+    """Context manager that connects to Ray while the block runs. SIGTERM acts like Ctrl-C in the block.
+
+    Args:
+        address: address of a running cluster, or ``local`` for a Ray on this machine.
+        cores: number of cores that a local Ray uses; None: all.
+
+    """
     ray = connect_ray(address, cores)
     for name in _SILENT:
         logging.getLogger(name).setLevel(logging.CRITICAL)
