@@ -398,10 +398,9 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
 
 @compiled(apart=True, bare=True)
 def move_on_cubics(table: Floats, duration: float) -> bool:
-    """Move gaps, speeds and forces of ``table`` to the next event, ``duration`` (s) later; return False if a contact
-    was missed.
+    """Move gaps, speeds and forces to the next event, ``duration`` (s) later; return False if a contact was missed.
 
-    Version of ``constant_motion.move`` for brake build-up.
+    Version of ``constant_motion.move`` for brake build-up; ``table`` is one world in the layout of ``physics.rows``.
     """
     vehicles, sound = table.shape[1], True
     for p in range(vehicles - 1):

@@ -208,9 +208,7 @@ def exp_each(values: Floats) -> Floats:
 
 @compiled
 def normal_quantile_each(values: Floats) -> Floats:
-    """Return the standard normal quantile of each probability in ``values`` [n], as ``normal_quantile`` computes it,
-    [n].
-    """
+    """Return the standard normal quantile of each probability in ``values`` [n], by ``normal_quantile``, [n]."""
     found = np.empty(len(values))
     for i in range(len(values)):
         found[i] = normal_quantile(values[i])

@@ -26,8 +26,7 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(bare=True)
 def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) -> int:
-    """Replace the values of touching vehicles by their isotonic regression, in row ``out``; return the number of
-    blocks.
+    """Replace the values of touching vehicles by their isotonic regression, in row ``out``; return the block count.
 
     The regression is weighted by mass: a vehicle that would be faster than the one in front is pooled with it into a
     *block*, and all members of a block get the same bits. Rows BLOCK_* describe the blocks. A vehicle of infinite mass

@@ -136,7 +136,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         return make_concrete_template(self.__name__, self.__name__, signatures), pysig, arguments, {}
 
     def get_overload(self, sig: Any) -> Any:
-        """Return the key under which numba stores the compiled code for the signature ``sig`` (numba's own protocol)."""
+        """Return the key under which numba stores the code for the signature ``sig`` (numba's own protocol)."""
         return self._linked[tuple(normalize_signature(sig)[0])][1] if _KNOWN else super().get_overload(sig)
 
     def _compile_linked(self, arguments: tuple[Any, ...]) -> Any:
@@ -220,7 +220,7 @@ def _symbols(library: Any) -> list[str]:
 
 
 def _described(kind: Any) -> str:
-    """Return a text for a numba type ``kind``, with the field names of named tuples, which numba's own type name omits."""
+    """Return a text for a numba type ``kind``, with the field names of named tuples, which its own name omits."""
     parts = [_described(part) for part in getattr(kind, "types", ())]
     return f"{kind} {getattr(kind, 'fields', '')} {parts}"
 

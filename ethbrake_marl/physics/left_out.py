@@ -59,7 +59,7 @@ def leaving_out_failed(work: Callable[[Ints], Result], rows: Ints) -> tuple[Resu
 
 @dataclass(frozen=True, slots=True)
 class ImpactRows:
-    """Every impact of a segment (a time interval of constant commands), ordered by world and then by time; arrays [k]."""
+    """Every impact of a segment (an interval of constant commands), ordered by world and then by time; arrays [k]."""
 
     world: Ints  # row of the world in the batch
     pair: Ints  # index of the pair; -1: Vehicle 1 and the obstacle ahead

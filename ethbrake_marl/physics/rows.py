@@ -136,7 +136,7 @@ LISTED = _Listed()
 
 @compiled(bare=True)
 def builds_up(table: Floats) -> bool:
-    """Return whether, in the world of this table, some brakes build up (finite rate) or some vehicle brakes in pieces."""
+    """Return whether, in the world of this table, brakes build up (finite rate) or come in pieces."""
     return bool(table.shape[0] > ROW.OF_EPISODE and table[ROW.BUILDS_UP, 0] == 1.0)
 
 

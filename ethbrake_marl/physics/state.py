@@ -245,9 +245,7 @@ class Worlds:
         return parts[0]._each(lambda *columns: np.concatenate(columns), *parts[1:])
 
     def assign(self, rows: Ints, fresh: Worlds) -> Worlds:
-        """Return a copy of the batch in which the worlds at indices ``rows`` [k] are replaced by the k worlds of
-        ``fresh``.
-        """
+        """Return a copy of the batch with the worlds at indices ``rows`` [k] replaced by the k worlds of ``fresh``."""
 
         def assigned(whole: NDArray[Any], part: NDArray[Any]) -> NDArray[Any]:
             copy = whole.copy()
@@ -298,8 +296,7 @@ class Worlds:
         return self._each(_unwritable)
 
     def on_road(self, friction: Floats, dry: Mapping[str, Floats] | None = None) -> Worlds:
-        """Return these worlds on a road with this ``friction`` [n], which limits capacities to ``friction *
-        GRAVITY_MPS2``.
+        """Return these worlds on a road with this ``friction`` [n]; capacities are at most ``friction * GRAVITY_MPS2``.
 
         ``dry`` gives new capacities on a dry road, [n, N] by field name, for example ``{"braking_capacity_mps2":
         array}``; fields that it does not name keep theirs.
@@ -357,8 +354,7 @@ class Worlds:
             )
 
     def first_decision_s(self, deciders: Sequence[int]) -> Floats:
-        """Return the time of the first decision, [n] s: the least latency of the ``deciders``, but not before
-        ``time_s``.
+        """Return the time of the first decision, [n] s: the least latency of the ``deciders``, at least ``time_s``.
 
         ``deciders`` are the indices (from 0) of the vehicles that choose their commands. Without deciders it is
         ``time_s``.

@@ -1,4 +1,4 @@
-"""The motion within a segment (a time interval of constant commands) as intervals of constant jerk, to draw it exactly."""
+"""The motion within a segment (an interval of constant commands) as pieces of constant jerk, to draw it exactly."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ Numbers = Annotated[tuple[Number, ...], Field(strict=False, min_length=1)]
 
 
 class _Distribution(FileModel):
-    """Base class of the ways to draw a quantity."""
+    """Base class of the distributions and of other ways to draw a quantity from a uniform number."""
 
 
 class Uniform(_Distribution):
@@ -107,7 +107,7 @@ class Normal(_Distribution):
         return self
 
     def _bounds(self) -> tuple[float, float]:
-        """Return the probabilities of being below low and below high, before truncation."""
+        """Return the probabilities that the untruncated distribution is below low, and below high."""
         shape = self.normal
         low, high = (normal_probability((end - shape.mean) / shape.sd) for end in (shape.low, shape.high))
         return low, high
@@ -193,10 +193,10 @@ class Choice(_Distribution):
 
 @dataclass(frozen=True, slots=True, repr=False)
 class TableColumn:
-    """A column of a scenario's table; every world takes the value in its row."""
+    """A column of a scenario's table of measured values; every world takes one row of the table, by weight."""
 
-    name: str
-    rows: Floats = data_field(compare=False)  # [rows]
+    name: str  # name of the column, such as ``gap_1_m``
+    rows: Floats = data_field(compare=False)  # [rows] value in each row of the table
     cumulative: Floats = data_field(compare=False)  # [rows] cumulative weight of the rows, up to 1
 
     def __repr__(self) -> str:
@@ -209,7 +209,7 @@ class TableColumn:
 
     @property
     def middle(self) -> TableColumn:
-        """Column with the weighted median as its only row."""
+        """Column whose only row is the weighted median of this column."""
         order = np.argsort(self.rows, kind="stable")
         shares = np.cumsum(np.diff(self.cumulative, prepend=0.0)[order])
         return replace(self, rows=self.rows[order][[np.searchsorted(shares, 0.5)]], cumulative=np.ones(1))
@@ -221,7 +221,11 @@ class TableColumn:
 
 
 def _kind(value: object) -> str | None:
-    """Return the tag of the member of ``Quantity`` that a value means; it decides which error messages are shown."""
+    """Return the tag of the kind of ``Quantity`` that a value from a file means, such as ``"#uniform"``; None if
+    unclear.
+
+    The tag decides which error messages are shown.
+    """
     if isinstance(value, _Distribution):
         return f"#{type(value).__name__.lower()}"
     if isinstance(value, dict):
@@ -246,7 +250,7 @@ Quantity = Annotated[
 class WithLoad(_Distribution):
     """``{with_load: [empty, full]}``, in a vehicle type only: a linear function of the vehicle's load, from 0 to 1.
 
-    ``spread`` is a random amount that each vehicle adds.
+    ``spread`` is a distribution around 0 of a random amount that each vehicle adds.
     """
 
     with_load: Pair = Field(description="[empty, full]: at load 0 and at load 1")
@@ -266,9 +270,9 @@ class WithLoad(_Distribution):
         return min(self.with_load) + low, max(self.with_load) + high
 
     def value(self, load: Floats, u: Floats) -> Floats:
-        """Return ``empty + (full - empty) load`` plus the spread at ``u``.
+        """Return ``empty + (full - empty) load``, plus the random amount that the uniform numbers ``u`` give.
 
-        ``load`` in [0, 1] and ``u`` in [0, 1) have the same shape.
+        ``load`` in [0, 1] and ``u`` in [0, 1) have the same shape, as has the result.
         """
         empty, full = self.with_load
         moved = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))
@@ -286,5 +290,5 @@ def support(quantity: AnyTypeQuantity) -> tuple[float, float]:
 
 
 def values(quantity: AnyQuantity, u: Floats) -> Floats:
-    """Return the quantity's values for uniform numbers ``u`` in [0, 1), in the same shape."""
+    """Return the quantity's values for uniform numbers ``u`` in [0, 1), in the shape of ``u``."""
     return np.full(u.shape, quantity) if isinstance(quantity, float) else quantity.value(u)
