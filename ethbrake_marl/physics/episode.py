@@ -57,8 +57,8 @@ class Grid(NamedTuple):
     """Decision times of one episode: from ``first_s`` on, every ``time_step_s``, up to the horizon."""
 
     first_s: float  # time of the first decision (s)
-    # time between two decisions (s)
-    time_step_s: float  # time between two decisions (s)  # number of steps (a whole number)
+    time_step_s: float  # time between two decisions (s)
+    last_step: float  # number of steps (a whole number)
     horizon_s: float  # end of the last step (s)
 
 
@@ -66,7 +66,7 @@ class Episode(NamedTuple):
     """One world, prepared for simulating profiles: commands of the controlled vehicles in each phase of time."""
 
     table: Floats  # [rows_for(2 K), N], filled with latencies, masses, limits and other vehicles' commands
-    clock: Floats  # [CLOCK.WIDTH]
+    clock: Floats  # [CLOCK.WIDTH] decision times and settings, see ``CLOCK``
     controlled: Ints  # [C] indices of the controlled vehicles
 
 
@@ -81,7 +81,7 @@ class Decisions(NamedTuple):
         return np.ceil((time_s - self.first_s) / self.time_step_s - _ROUNDING)
 
     def latest(self, time_s: Floats) -> Ints:
-        """Return the number of the latest decision at each ``time_s`` (s), counted from 0; negative before the first."""
+        """Return the number of the latest decision at each time (s), counted from 0; negative before the first."""
         number: Floats = np.floor((time_s - self.first_s) / self.time_step_s + _ON_GRID)
         return number.astype(np.int64)
 

@@ -257,7 +257,7 @@ class V2X(FileModel):
 
     @property
     def by_link(self) -> bool:
-        """Whether the channel differs from the paper's rule, by which a vehicle knows everything after its own latency."""
+        """Whether the channel differs from the paper's rule: a vehicle knows everything after its own latency."""
         return self.channel != CHANNELS["paper"]
 
     @property
@@ -359,8 +359,7 @@ class V2X(FileModel):
         return replace(worlds, messages=messages.columns)
 
     def with_fixed_news(self, worlds: Worlds, time_step_s: float, where: str, equipped: Equipped | None) -> Worlds:
-        """Return worlds from the user with this channel; raise ``InvalidInput`` if the channel leaves something to
-        chance.
+        """Return worlds from the user with this channel; raise ``InvalidInput`` if the channel is random.
 
         Args:
             worlds: worlds without a channel.

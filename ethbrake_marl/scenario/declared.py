@@ -339,12 +339,12 @@ class ScenarioFields(FileModel):
 
     @property
     def table_entries(self) -> dict[Entry, TableColumn]:
-        """Columns of the scenario's table, by quantity and index: ``{("gaps_m", 0): column}``; empty without a table."""
+        """Columns of the scenario's table, ``{("gaps_m", 0): column}`` by quantity and index; empty without one."""
         return self._columns
 
     @property
     def by_link(self) -> bool:
-        """Whether the channel differs from the paper's rule, by which a vehicle knows everything after its own latency.
+        """Whether the channel differs from the paper's rule: a vehicle knows everything after its own latency.
 
         For a mixture: in one of its scenarios or more.
         """
@@ -352,7 +352,7 @@ class ScenarioFields(FileModel):
 
     @property
     def types_of_line(self) -> TypesOfLine | None:
-        """The vehicle types that are possible at each place of the line, with their probabilities; None without types."""
+        """The vehicle types that are possible at each place of the line, and their weights; None without types."""
         return None if self.vehicle_types is None else TypesOfLine(self.vehicle_types, self.types, self.vehicles)
 
     def equipped(self, types: Ints | None = None) -> Equipped:
@@ -395,9 +395,7 @@ class ScenarioFields(FileModel):
         return tuple(found)
 
     def supports(self, field: str) -> tuple[tuple[float, float], ...]:
-        """Return (smallest, largest) value of a quantity for each vehicle, pair or world, over all possible vehicle
-        types.
-        """
+        """Return (smallest, largest) value of the quantity ``field`` for each vehicle, pair or world, over all types."""
         found = []
         for each in self.possible_quantities(field):
             lows, highs = zip(*(support(quantity) for quantity in each.values()), strict=True)
@@ -480,8 +478,7 @@ def on_road(found: Mapping[str, Floats]) -> dict[str, Floats]:
 def obstacle_gap(
     scenario: ScenarioFields, found: Mapping[str, Floats], declared: Callable[[str], Floats]
 ) -> Floats | None:
-    """Return the distance from Vehicle 1 to the obstacle ahead in k worlds, [k] m; None if the scenario has no
-    obstacle.
+    """Return the distance from Vehicle 1 to the obstacle ahead in k worlds, [k] m; None without an obstacle.
 
     The distance is declared, or it is ``margin + v_1 tau_1 + v_1^2 / (2 a_1)``: the margin beyond the point where
     Vehicle 1 stops by full braking.

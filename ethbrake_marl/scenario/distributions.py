@@ -221,10 +221,9 @@ class TableColumn:
 
 
 def _kind(value: object) -> str | None:
-    """Return the tag of the kind of ``Quantity`` that a value from a file means, such as ``"#uniform"``; None if
-    unclear.
+    """Return the tag of the kind of ``Quantity`` that a value from a file means, such as ``"#uniform"``.
 
-    The tag decides which error messages are shown.
+    None for a list, or a mapping without a known distribution. The tag decides which error messages are shown.
     """
     if isinstance(value, _Distribution):
         return f"#{type(value).__name__.lower()}"

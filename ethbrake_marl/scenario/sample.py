@@ -58,18 +58,15 @@ class Sample:
 
     @property
     def kinds(self) -> dict[str, _Texts]:
-        """Columns of text, [n] each: ``scenario`` for a mixture, ``vehicle_1_type`` and so on for worlds with vehicle
-        types.
-        """
+        """Columns of text, [n] each: ``scenario`` of a mixture, and ``vehicle_1_type`` and so on if there are types."""
         columns = {} if self.scenarios is None else {"scenario": self.scenarios}
         types = () if self.types is None else self.types.T
         return columns | {f"vehicle_{i + 1}_type": column for i, column in enumerate(types)}
 
     def count_kinds(self) -> str:
-        """Return a text that counts the worlds of each scenario of a mixture and of each vehicle type; empty without
-        them.
+        """Return a text that counts the worlds of each scenario of a mixture and of each vehicle type.
 
-        For example ``"; vehicle_1_type: car 7, truck 3"``.
+        For example ``"; vehicle_1_type: car 7, truck 3"``; empty without mixture and types.
         """
         told = ""
         for kind, column in self.kinds.items():

@@ -197,8 +197,9 @@ def uniform_numbers(
 
 
 def _draw_numbers(scenario: ScenarioFields, index: Ints, seed: int, channel: Channel) -> Sample:
-    """Return the worlds with the ascending numbers ``index`` [n] of the scenario's list, rejecting early impacts if
-    required.
+    """Return the worlds with the ascending numbers ``index`` [n] of the scenario's list.
+
+    Early impacts are rejected if the scenario says so.
     """
     drawn = _draw(scenario, seed, channel, 0, index)
     if scenario.early_impacts == "keep" or not scenario.learners:
