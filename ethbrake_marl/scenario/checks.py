@@ -107,9 +107,7 @@ def _check_speeds(scenario: ScenarioFields) -> None:
 
 
 def _check_derived(scenario: ScenarioFields) -> None:
-    """Raise an error if a gap derived from a time gap, or an obstacle's distance derived from its margin, is out of
-    range.
-    """
+    """Raise an error if a gap from a time gap, or an obstacle's distance from its margin, is out of range."""
     largest = QUANTITY.usual["gaps_m"].high
     for pair, (_, high) in enumerate(scenario.bounds("gaps_m") if scenario.time_gaps_s is not None else ()):
         right = f"is up to {high:g} m at the speed of vehicle_{pair + 2}; a gap must not be above {largest:g} m"

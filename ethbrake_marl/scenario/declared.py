@@ -395,7 +395,10 @@ class ScenarioFields(FileModel):
         return tuple(found)
 
     def supports(self, field: str) -> tuple[tuple[float, float], ...]:
-        """Return (smallest, largest) value of the quantity ``field`` for each vehicle, pair or world, over all types."""
+        """Return (smallest, largest) value of the quantity ``field`` for each vehicle, pair or world.
+
+        All vehicle types that are possible are considered.
+        """
         found = []
         for each in self.possible_quantities(field):
             lows, highs = zip(*(support(quantity) for quantity in each.values()), strict=True)

@@ -159,8 +159,9 @@ def _role_text(role: object) -> object:
 
 
 def _role_content(role: str) -> str | dict[str, list[list[float]]]:
-    """Convert a role to its form in a scenario file: ``profile:0=3`` to ``{"profile": [[0.0, 3.0]]}``, others
-    unchanged.
+    """Convert a role to its form in a scenario file: ``profile:0=3`` to ``{"profile": [[0.0, 3.0]]}``.
+
+    Other roles stay as they are.
     """
     pieces = ScriptSpec.parse(role).pieces
     return {_PROFILE: [list(piece) for piece in pieces]} if pieces else role

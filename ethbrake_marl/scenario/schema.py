@@ -69,8 +69,7 @@ class ScenarioWording(Wording):
         return f"the {rule.meaning} is needed, for instance {key}: {rule.example}{other}"
 
     def owner(self, path: YamlPath) -> str:
-        """Return the vehicle or pair that a value at ``path`` belongs to, such as ``vehicle_2``; empty for other
-        values.
+        """Return the vehicle or pair that the value at ``path`` belongs to, such as ``vehicle_2``; else an empty text.
 
         ``path``: keys and indices inside the file, for example ``("speeds_mps", 1)``.
         """
