@@ -54,9 +54,7 @@ class Game(Protocol):
 
     @property
     def observation(self) -> Any:
-        """The features that vehicles observe: a list for all, or lists by vehicle; None: the default of
-        ``observations_of``.
-        """
+        """The features that vehicles observe: a list for all, or lists by vehicle; None: see ``observations_of``."""
 
     @property
     def has_obstacle(self) -> bool:

@@ -28,12 +28,12 @@ Of = Literal["own", "neighbour"]
 class Feature:
     """One number of an observation: ``clip(value / scale, low, high)``."""
 
-    name: str
-    unit: str
-    scale: float
-    low: float
-    high: float
-    meaning: str
+    name: str  # full name, such as ``own.speed``, or the name inside a group
+    unit: str  # unit of the value
+    scale: float  # the value is divided by this, in ``unit``
+    low: float  # least number that is observed
+    high: float  # largest number that is observed
+    meaning: str  # what it is, in words
 
 
 CONTACT_COMMANDS = ("brake", "coast", "drive")  # own commands of the forecasts: full braking, coasting, full driving
@@ -135,15 +135,13 @@ class RegisteredFeature:
     """A registered feature, or a built-in one that belongs to no group."""
 
     feature: Feature  # name, unit, scale, bounds and meaning
-    function: Callable[..., Floats]
-    of: Of
+    function: Callable[..., Floats]  # (worlds, vehicle) or (worlds, vehicle, neighbour) -> value, [n]
+    of: Of  # ``own``: of the vehicle itself; ``neighbour``: of a neighbour
     unknown: float  # value for an unknown neighbour, in the feature's unit
     tried: tuple[float, ...]  # values in a few test worlds, which reveal a changed function
 
     def scaled(self, value: Floats) -> Floats:
-        """Return the observed number ``clip(value / scale, low, high)``, in the shape of ``value`` (in the feature's
-        unit).
-        """
+        """Return the observed number ``clip(value / scale, low, high)`` for a ``value`` in the feature's unit."""
         feature = self.feature
         return np.clip(value * (1.0 / feature.scale), feature.low, feature.high)
 
@@ -274,7 +272,7 @@ ListedFeatures = Annotated[tuple[str, ...], Field(strict=False), _ListSchema]
 
 
 def feature_named(name: str) -> Feature:
-    """Return the feature with the full name ``name``, such as ``front_1.gap``; raise ``UnknownName`` if there is none."""
+    """Return the feature with the full name ``name``, such as ``front_1.gap``; raise ``UnknownName`` if none has it."""
     group, dot, own = name.partition(".")
     if name in FEATURES and FEATURES[name].of == "own":
         return FEATURES[name].feature

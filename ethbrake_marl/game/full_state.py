@@ -30,10 +30,9 @@ _PAIR_FEATURES = tuple(replace(f, meaning=_PAIR_MEANING[f.name]) for f in GROUPS
 
 
 def state_features(scenario: Game) -> tuple[Feature, ...]:
-    """Return the features of the full state in order: own features of each vehicle, gap and hit flag of each pair,
-    time.
+    """Return the features of the full state in order: own features of each vehicle, then pairs, then time.
 
-    With an obstacle ahead of Vehicle 1, its gap and hit flag follow.
+    A pair has the features gap and hit flag. With an obstacle ahead of Vehicle 1, its gap and hit flag follow.
     """
     vehicles = [replace(f, name=f"{name}.{f.name}") for name in scenario.vehicle_names for f in GROUPS.own]
     pairs = [replace(f, name=f"pair_{p}.{f.name}") for p in range(1, scenario.vehicles) for f in _PAIR_FEATURES]

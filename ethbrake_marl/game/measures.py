@@ -39,7 +39,7 @@ MeasureFunction = Callable[[Any], Any]  # from a ``StepOutcome`` or ``EpisodeImp
 class NamedMeasure:
     """A measure that can be reported and rewarded under its name."""
 
-    name: str
+    name: str  # key of its weight in a reward
     meaning: str  # what it measures, in words
     unit: str  # unit of its value; ``1`` for a plain number
     by: By  # ``step`` or ``impacts``: what it is computed from

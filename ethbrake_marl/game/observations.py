@@ -85,9 +85,7 @@ class ObservationSpec:
 
     @property
     def whole(self) -> tuple[Feature, ...]:
-        """Built-in features of every group of which the observation has at least one feature, in the order of the
-        groups.
-        """
+        """All built-in features of every group of which the observation has at least one feature, in order."""
         groups = [("own", GROUPS.own), *((prefix, GROUPS.neighbour) for prefix, _ in self.sides)]
         groups += [("role", GROUPS.role)] if self.role else []
         groups += [("obstacle", GROUPS.obstacle)] if self.obstacle else []
@@ -182,8 +180,8 @@ class Scaling(NamedTuple):
     """Arguments of the kernel that computes all groups of features except the contact features."""
 
     offsets: Ints  # place of each observed neighbour relative to the observer: -1 is the next vehicle ahead
-    role: bool
-    obstacle: bool
+    role: bool  # whether the place in the line is observed
+    obstacle: bool  # whether the obstacle ahead is observed
     features: Floats  # [3, F] 1 / scale, low, high of each feature
 
 

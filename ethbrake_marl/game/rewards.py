@@ -154,9 +154,7 @@ class RewardParams(FileModel):
 
     @property
     def counted(self) -> tuple[str, ...]:
-        """Names of the terms with a weight other than 0: built-in terms in the order of the table, then registered
-        ones.
-        """
+        """Names of the terms with a weight other than 0: built-in terms in order, then registered measures."""
         return tuple(name for name, weight in self.weights.items() if weight != 0.0)
 
     def shared(self, harm: Value, safe_end: Value) -> dict[str, Value]:
@@ -248,8 +246,7 @@ Reward = str | RewardParams | Mapping[str, Any]  # a name, or settings
 
 
 def reward_params(reward: Reward) -> RewardParams:
-    """Return the ``RewardParams`` for a name in ``REWARDS`` or a mapping of settings; parameters are returned
-    unchanged.
+    """Return the ``RewardParams`` for a name in ``REWARDS``, a mapping of settings, or parameters (unchanged).
 
     Raises ``UnknownName`` for an unknown name or setting and ``InvalidInput`` for a value out of its range.
     """

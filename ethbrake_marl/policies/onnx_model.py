@@ -15,7 +15,16 @@ from ethbrake_marl.policies.network_spec import Activation, Float32s, NetworkSpe
 
 
 def onnx_model(manifest: Manifest, observation: ObservationSpec, tensors: Mapping[str, Float32s]) -> bytes:
-    """Return the ONNX model of a policy with these tensors; it computes actions and the accelerations they command."""
+    """Return the ONNX model of a policy, as bytes; it computes actions and the accelerations that these command.
+
+    Raises ``MissingExtra`` without the package onnx.
+
+    Args:
+        manifest: manifest of the policy.
+        observation: its observation, which must contain the own braking and driving capacities.
+        tensors: its tensors, by name.
+
+    """
     with naming_extras():
         import onnx  # an optional extra, imported only here
     helper, float32, spec = onnx.helper, onnx.TensorProto.FLOAT, manifest.network

@@ -32,7 +32,7 @@ _UNUSED = 0.5  # value of uniform numbers without effect
 class Ranges:
     """The numbers that a scenario draws, as coordinates of a unit cube: names and places."""
 
-    scenario: ScenarioFields
+    scenario: ScenarioFields  # the scenario that draws them
     names: tuple[str, ...]  # name of each coordinate, such as ``mass_t of vehicle_1``
     places: tuple[Place, ...]  # stream and column of each coordinate among a world's uniform numbers
 
