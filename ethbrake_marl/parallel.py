@@ -45,8 +45,7 @@ def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = N
 
     Args:
         calls: tuples (function, argument, ...), functions of a module; each is taken from the iterable shortly before
-            it
-            starts.
+            it starts.
         jobs: number of calls that run at once. None: one, or as many as Ray has cores. One call at a time runs in this
             process.
         ray: ``local`` for a Ray on this machine alone, or the address of a Ray cluster. None: no Ray.

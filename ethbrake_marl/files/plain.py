@@ -61,8 +61,7 @@ def open_plain(
         path: path of the file.
         limit_bytes: largest accepted size.
         refusal: class of the error to raise, with path and reason: the file does not exist, is a folder, device or
-            pipe, is
-            too large, or cannot be read (also inside the block).
+            pipe, is too large, or cannot be read (also inside the block).
         follow_links: whether a symbolic link is accepted.
 
     """

@@ -14,7 +14,7 @@ class Drawn(Protocol):
 
     @property
     def worlds(self) -> Worlds:
-        """The drawn worlds [n], at the alert."""
+        """The drawn worlds [n], at the alert (time 0)."""
 
 
 class Game(Protocol):

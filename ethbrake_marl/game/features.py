@@ -259,7 +259,7 @@ def listed_features(listed: object) -> tuple[str, ...]:
 
 
 class _ListSchema:
-    """JSON schema of an observation: a list of the features that are registered when the schema is generated."""
+    """Adds to a field the JSON schema of an observation: a list of the features that are registered at that time."""
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:

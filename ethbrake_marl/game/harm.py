@@ -157,7 +157,7 @@ def line_sum(pair_values: Floats, obstacle_values: Floats) -> Floats:
 
 
 def empty_ledger(worlds: Worlds) -> Ledger:
-    """Return the ledger of ``worlds`` at the alert, without harm."""
+    """Return the ledger of ``worlds`` at the alert (time 0), without harm."""
     shape = worlds.gaps_m.shape
     pairs = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64)
     of_worlds = worlds.vehicles.mass_t, worlds.vehicles.restitution

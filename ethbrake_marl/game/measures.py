@@ -132,9 +132,8 @@ def register_measure(name: str, function: MeasureFunction, *, unit: str = "1", b
             ``_interval``, ``_low`` or ``_high``. It is the key of the weight in a reward; columns of results are called
             ``metric_NAME``, infos of a step ``reward_NAME``.
         function: takes an ``EpisodeImpacts`` or, by step, a ``StepOutcome``; returns one number for each world [n] or
-            each
-            vehicle [n, N]; by step also for each learner [n, L]. Its docstring describes the measure. It must work for
-            lines of any length. Truth values by impacts are shown as a rate.
+            each vehicle [n, N]; by step also for each learner [n, L]. Its docstring describes the measure. It must work
+            for lines of any length. Truth values by impacts are shown as a rate.
         unit: unit of the numbers.
         by: ``impacts`` or ``step``, what it is computed from.
 

@@ -109,7 +109,7 @@ def check_declared(declared: object) -> None:
 
 
 def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
-    """Return the objective of each of ``vehicles`` vehicles; raise ``InvalidInput`` for a wrong number of objectives.
+    """Return the parsed objective of each of ``vehicles`` vehicles; raise ``InvalidInput`` if their number is wrong.
 
     ``declared``: the text of one objective for all vehicles, or one text per vehicle.
     """
@@ -208,9 +208,10 @@ def register_objective(name: str, function: ObjectiveFunction) -> None:
 
 
 def scored(ledger: Ledger, harm_count: HarmCount, declared: Sequence[Declared] | None = None) -> dict[str, Floats]:
-    """Evaluate one ledger under several objectives: objective -> amount for each vehicle, [n, N] (m2/s2).
+    """Evaluate one ledger under several objectives; return the amount for each vehicle: ``{"own": [n, N], ...}``.
 
-    So a policy can be judged under objectives that it was not trained for.
+    So a policy can be judged under objectives that it was not trained for. Amounts are in m2/s2, or injuries in 1,000
+    lines; less is better.
 
     Args:
         ledger: harm of n worlds since the start of the episode.

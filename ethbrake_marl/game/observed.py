@@ -32,8 +32,7 @@ def observations_of(scenario: Game, given: Observation | None = None) -> tuple[O
     Args:
         scenario: the game, whose own declaration applies unless ``given`` replaces it.
         given: one observation for all vehicles, or by name for some: ``{"vehicle_2": ["own", "front_1"]}``; None: what
-            the
-            scenario declares.
+            the scenario declares.
 
     """
     names, step_s, said = scenario.vehicle_names, scenario.time_step_s, scenario.observation

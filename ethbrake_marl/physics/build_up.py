@@ -345,8 +345,8 @@ def accelerate_moving(table: Floats) -> float:
 def next_moving_event(table: Floats, now: float, end: float, parting: float) -> float:
     """Return the time from ``now`` to the next event, at most ``end - now`` (s).
 
-    Version of ``constant_motion.next_event`` for brake build-up. Also writes into the table when each vehicle reaches
-    its next speed event and when each pair comes into contact.
+    Version of ``constant_motion.next_event`` for brake build-up. Also writes into the table when each vehicle next
+    comes to rest or reaches its speed limit, and when each pair comes into contact.
 
     Args:
         table: one world in the layout of ``physics.rows``, after ``accelerate_moving``.
@@ -443,10 +443,11 @@ def move_on_cubics(table: Floats, duration: float) -> bool:
 
 @compiled(apart=True, bare=True)
 def move_apart_on_cubics(table: Floats, duration: float) -> bool:
-    """Move every vehicle alone by ``duration`` (s) if no two can meet; otherwise keep speeds and gaps and return False.
+    """Move every vehicle alone by ``duration`` (s) and return True if no two can meet; otherwise return False.
 
-    Version of ``segment.move_apart`` for brake build-up. A bound decides whether two vehicles can meet: their gap must
-    exceed ``duration`` times the largest possible closing speed.
+    In the second case speeds and gaps do not change. Version of ``segment.move_apart`` for brake build-up; ``table`` is
+    one world in the layout of ``physics.rows``. A bound decides whether two vehicles can meet: their gap must exceed
+    ``duration`` times the largest possible closing speed.
     """
     vehicles = table.shape[1]
     slowest_in_front = math.inf

@@ -47,7 +47,8 @@ def accelerate(table: Floats) -> None:
 def next_event(table: Floats, now: float, end: float) -> float:
     """Return the time from ``now`` to the next event, at most ``end - now`` (s).
 
-    Also writes into the table when each vehicle reaches its next speed event and when each pair comes into contact.
+    Also writes into the table when each vehicle next comes to rest or reaches its speed limit, and when each pair comes
+    into contact.
 
     Args:
         table: one world in the layout of ``physics.rows``, after ``accelerate``.
@@ -102,9 +103,10 @@ def move(table: Floats, duration: float) -> bool:
 
 @compiled(bare=True)
 def move_speeds(table: Floats, duration: float) -> None:
-    """Set the speeds of ``table`` to those after ``duration`` (s).
+    """Set the speeds of ``table`` to those after ``duration`` (s), before or at the next event.
 
-    Joined vehicles get one common speed; the speeds of a pair in contact differ exactly by its closing speed.
+    Vehicles that move as one body get one common speed; the speeds of a pair that comes into contact differ exactly by
+    its closing speed.
     """
     vehicles = table.shape[1]
     first = 0

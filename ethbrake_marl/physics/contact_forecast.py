@@ -36,13 +36,11 @@ def forecast_contacts(table: Floats, restitution: float, duration: float, found:
 
     Args:
         table: the world in the layout of ``physics.rows``: a row per quantity, a column per vehicle or pair. Its motion
-            and
-            harm rows are overwritten.
+            and harm rows are overwritten.
         restitution: coefficient of restitution of every impact, in [0, 1].
         duration: length of the forecast, s.
         found: result, [CONTACT.WIDTH, N]; column p is pair p, the last column is not used. Row ``CONTACT.TIME`` is the
-            time
-            to the impact (s; infinite: none), row ``CONTACT.CLOSING`` its closing speed (m/s).
+            time to the impact (s; infinite: none), row ``CONTACT.CLOSING`` its closing speed (m/s).
 
     """
     for p in range(table.shape[1] - 1):

@@ -225,7 +225,10 @@ def value_of(table: Floats, total: float) -> float:
 
 @compiled
 def save(table: Floats, state: Floats) -> None:
-    """Save the state of a world, and its harm so far, from its ``table`` into a row ``state`` [S]."""
+    """Save the state of a world, and its harm so far, from its ``table`` into the row ``state`` [S].
+
+    The columns are listed at S at the top of this file.
+    """
     vehicles = table.shape[1]
     pairs = vehicles - 1
     for i in range(vehicles):

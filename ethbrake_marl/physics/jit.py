@@ -324,7 +324,7 @@ def kernel_sources(source: Path) -> list[Path]:
 
 @cache
 def _imports(source: Path) -> list[tuple[Path, bool]]:
-    """Return the files with kernels or constants that ``source`` imports, each with whether it has kernels."""
+    """Return (file, whether it has kernels) for the files with kernels or constants that ``source`` imports."""
     found = []
     for module, names in _IMPORT.findall(source.read_bytes()):
         for imported, taken in _homes(module.decode(), set(re.findall(r"\w+", names.decode()))):

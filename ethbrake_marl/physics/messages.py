@@ -77,7 +77,10 @@ _ON_GRID = 1e-9
 
 @compiled
 def place_at(vehicles: int) -> int:
-    """Return the first column of the places of N = ``vehicles`` vehicles, counted from the head's first column."""
+    """Return the column at which the places of the vehicles begin, counted from the first column of the messages.
+
+    A place is a position along the road (m). ``vehicles``: number N of vehicles.
+    """
     return CHANNEL.WIDTH
 
 
@@ -138,15 +141,15 @@ class Messages(NamedTuple):
         cls, heard_s: Floats, seen_s: Floats, key: Floats, samples: int, *, period_s: float, delay_s: float,
         loss_begins: float, loss_ends: float,
     ) -> Messages:  # fmt: skip
-        """Return the messages of n worlds at the alert, before any message is sent.
+        """Return the messages of n worlds at the alert (time 0), before any message is sent.
 
         Args:
-            heard_s: when vehicle i can first use a message of vehicle j, [n, N, N] s; infinite: never.
-            seen_s: from when on vehicle i measures vehicle j, [n, N, N] s; infinite: never.
+            heard_s: time at which vehicle i can first use a message of vehicle j, [n, N, N] s; infinite: never.
+            seen_s: time from which vehicle i measures vehicle j, [n, N, N] s; infinite: never.
             key: seed of the message losses, [n], whole numbers below 2^53.
             samples: length of the ring buffer, see ``ring_length``.
-            period_s: time between two messages of a link.
-            delay_s: time from sending a message to its use.
+            period_s: time between two messages of a link, s.
+            delay_s: time from sending a message to its use, s.
             loss_begins: probability that a good channel turns bad, per message.
             loss_ends: probability that a bad channel turns good again, per message.
 
@@ -236,7 +239,8 @@ def hear_rows(
         until_s: end times, [n] s.
         decision_s: time of the next decision, [n] s.
         time_step_s: time between decisions, s.
-        pieces: braking in pieces, [N, 2 K], equal in all worlds; see ``Vehicles.pieces``.
+        pieces: start (s) and command (m/s2) of the K intervals of a fixed sequence of commands, [N, 2 K], equal in all
+            worlds; see ``Vehicles.pieces``.
 
     """
     column = columns(moving)
@@ -294,7 +298,7 @@ def _move(
     state: Floats, params: Floats, column: Columns, wanted: Floats, end: float, pieces: Floats, table: Floats,
     no_rows: Floats,
 ) -> bool:  # fmt: skip
-    """Advance one world, and the places of its vehicles, to the time ``end`` (s); return False if the kernel fails.
+    """Advance one world, and the places of its vehicles, to the time ``end``; return whether the kernel succeeded.
 
     After a failure nothing has changed.
 
@@ -304,7 +308,8 @@ def _move(
         column: first column of each group of quantities in the two rows.
         wanted: commands of the vehicles, [N] m/s2.
         end: time to advance to, s.
-        pieces: braking in pieces, [N, 2 K]; see ``Vehicles.pieces``.
+        pieces: start (s) and command (m/s2) of the K intervals of a fixed sequence of commands, [N, 2 K]; see
+            ``Vehicles.pieces``.
         table: workspace in the layout of ``physics.rows``, N + 1 columns; overwritten.
         no_rows: empty list of impacts, [0, LISTED.WIDTH].
 

@@ -136,7 +136,10 @@ LISTED = _Listed()
 
 @compiled(bare=True)
 def builds_up(table: Floats) -> bool:
-    """Return whether, in the world of this table, brakes build up (finite rate) or come in pieces."""
+    """Return whether brakes of this world build up (finite rate) or follow a fixed sequence of commands.
+
+    ``table``: the world in this layout.
+    """
     return bool(table.shape[0] > ROW.OF_EPISODE and table[ROW.BUILDS_UP, 0] == 1.0)
 
 
@@ -151,15 +154,16 @@ def rows_for(pieces: int) -> int:
 
 @compiled(bare=True)
 def place_rates(table: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats) -> None:
-    """Write the brake and release rates, and the pieces of braking, of one world's vehicles into its table.
+    """Write brake rates, release rates and sequences of commands of one world's vehicles into its table.
 
-    If all rates are infinite and no vehicle brakes in pieces, BUILDS_UP is 0 and forces are not used.
+    A piece is one interval of a fixed sequence of commands. If all rates are infinite and no vehicle has pieces,
+    BUILDS_UP is 0 and forces are not used.
 
     Args:
         table: table to fill, [rows_for(2 K), N or N + 1]; with N + 1 columns, column 0 is an obstacle.
         brake_rate: rate at which each vehicle's force falls, [N] m/s3; infinite: at once.
         release_rate: rate at which it rises, [N] m/s3; infinite: at once.
-        pieces: start and command of each piece, [N, 2 K], as in ``Vehicles.pieces``.
+        pieces: start (s) and command (m/s2) of each piece, [N, 2 K], as in ``Vehicles.pieces``.
 
     """
     at, least = table.shape[1] - brake_rate.shape[0], math.inf
@@ -180,10 +184,10 @@ def place_rates(table: Floats, brake_rate: Floats, release_rate: Floats, pieces:
 def place_forces(
     table: Floats, force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats
 ) -> None:  # fmt: skip
-    """Write the present forces of the vehicles into a table, after their rates and pieces (``place_rates``).
+    """Write rates, pieces and present forces of one world's vehicles into its table.
 
     ``force``: present acceleration by brakes or engine, [N] m/s2. The other arguments are those of ``place_rates``.
-    Forces are written only if brakes build up or come in pieces.
+    Forces are written only if BUILDS_UP is 1.
     """
     place_rates(table, brake_rate, release_rate, pieces)
     if table[ROW.BUILDS_UP, 0] == 1.0:

@@ -1,4 +1,4 @@
-"""Advance one world through a segment of constant commands, from event to event. Compiled."""
+"""Advance one world through a segment (an interval of constant commands), from event to event. Compiled."""
 
 from __future__ import annotations
 
@@ -47,7 +47,10 @@ def advance_table(
 def advance_on_cubics(
     table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int
 ) -> tuple[int, int]:
-    """Version of ``advance_table`` for worlds whose brakes build up or come in pieces: same arguments and result."""
+    """Version of ``advance_table`` for brakes that build up or follow a fixed sequence of commands.
+
+    Same arguments and result.
+    """
     for i in range(table.shape[1]):
         if not command_acts(table[ROW.ONSET, i], duration):
             table[ROW.ONSET, i] = max(table[ROW.ONSET, i], duration)
@@ -81,10 +84,11 @@ def _advance(
 
 @compiled(bare=True)
 def move_apart(table: Floats, duration: float, building: bool) -> bool:
-    """Move a world to the end of the segment if no two vehicles can touch; otherwise leave it and return False.
+    """Move a world to the end of the segment and return True if no two vehicles can touch; otherwise return False.
 
-    If both vehicles of a pair have constant accelerations, the time of contact decides exactly. Otherwise a bound
-    decides: speeds are monotone within a segment, so a pair closes by at most ``(max rear speed - min front speed) T``.
+    In the second case the world does not move. If both vehicles of a pair have constant accelerations, the time of
+    contact decides exactly. Otherwise a bound decides: speeds are monotone within a segment, so a pair closes by at
+    most ``(max rear speed - min front speed) T``.
 
     Args:
         table: the world in the layout of ``physics.rows``.

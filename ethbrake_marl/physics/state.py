@@ -122,7 +122,7 @@ class Vehicles:
 
     @property
     def build_up(self) -> Bools:
-        """Whether some vehicle of a world has a finite brake or release rate, or brakes in pieces, [n]."""
+        """Whether some vehicle of a world has a finite brake or release rate, or a fixed sequence of commands, [n]."""
         rates = np.minimum(self.brake_rate_mps3, self.release_rate_mps3)
         return np.asarray(np.isfinite(rates).any(axis=1) | self.in_pieces)
 
@@ -337,9 +337,9 @@ class Worlds:
         return replace(self, vehicles=replace(self.vehicles, pieces=found.reshape(self.n, self.N, 2 * most)))
 
     def refuse_build_up(self, who: str) -> None:
-        """Raise ``InvalidInput`` if brakes of some world build up or come in pieces.
+        """Raise ``InvalidInput`` if some vehicle has a finite brake or release rate, or follows a sequence of commands.
 
-        ``who`` names the caller in the message; it has no exact answer for such brakes.
+        For callers that have no exact answer in these worlds. ``who`` names the caller in the message.
         """
         slow = self.vehicles.build_up
         if self.vehicles.in_pieces.any():

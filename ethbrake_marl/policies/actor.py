@@ -33,7 +33,10 @@ class Actor:
         self._among = [type(self)(each, tensors, f"among_{m}.") for m, each in enumerate(spec.among, 1)]
 
     def __call__(self, observation: Float32s) -> Float32s:
-        """Return the action of each row, [n, A]; raise ``InvalidInput`` for a wrong shape, dtype or non-finite entry."""
+        """Return the action of each row, [n, A].
+
+        Raises ``InvalidInput`` for a wrong shape, dtype or non-finite entry.
+        """
         seen = self._check(observation)
         action = np.empty((seen.shape[0], self.spec.action_size), dtype=np.float32)
         for start in range(0, seen.shape[0], BLOCK_ROWS):

@@ -32,8 +32,7 @@ def shipped_name(kind: str, scenario: Scenario | None, harm_count: HarmCount) ->
 
     Args:
         kind: ``universal``: the policy for all scenarios; ``ppo`` or ``sac``: one trained on this scenario; ``policy``:
-            the
-            policy whose name ends in the scenario's, otherwise ``universal``.
+            the policy whose name ends in the scenario's, otherwise ``universal``.
         scenario: scenario in which the policy will be used; None: any.
         harm_count: preferred harm of the training: ``"first"`` impact of each pair, or ``"total"``.
 
@@ -74,8 +73,7 @@ def load_named_policy(
 
     Args:
         path: a run or a bundle, ``shipped/NAME``, or ``shipped``: the one that ``shipped_name`` selects. A folder of
-            that
-            name is written ``./shipped``.
+            that name is written ``./shipped``.
         kind: see ``shipped_name``; used only for ``shipped``.
         scenario: see ``shipped_name``.
         harm_count: see ``shipped_name``.

@@ -87,21 +87,21 @@ class Equipped(NamedTuple):
 
 
 class Channel(NamedTuple):
-    """All settings that decide what each vehicle knows, and when."""
+    """All settings that decide what each vehicle knows, and when; symbols as at the top of this file."""
 
-    timing: Literal["latency", "fixed", "messages"]  # tau: own latency, link_latency_s, or the formula above
+    timing: Literal["latency", "fixed", "messages"]  # delay tau of a link: own latency, link_latency_s, or generated
     hears: Hears = "all"  # whose messages a vehicle receives: everyone's, those of vehicles ahead, nobody's
     senses: Senses = "both"  # which direct neighbours are in sight
-    link_latency_s: float = 0.0  # tau for timing "fixed"
-    loss_begins: float = 0.0  # p, per message period
-    loss_ends: float = 1.0  # r, per message period; mean burst 1 / r
+    link_latency_s: float = 0.0  # delay tau of every link for timing "fixed" (s)
+    loss_begins: float = 0.0  # p, probability per message period that a burst of losses begins
+    loss_ends: float = 1.0  # r, probability per message period that it ends; mean burst 1 / r periods
     lost: float = 0.0  # share of links on which no message ever arrives
-    message_period_s: float = 0.1  # T
-    radio_s: float = 0.02  # L_radio
-    processing_s: float = 0.1  # t_proc
-    actuation_s: float = 0.2  # t_act
-    sensing_s: tuple[float, float] = (0.8, 1.1)  # range from which a hop is drawn uniformly
-    persistence: Persistence = "first"  # after the first message, the present is known, or the newest message
+    message_period_s: float = 0.1  # T, time between two messages (s)
+    radio_s: float = 0.02  # L_radio, time on the air (s)
+    processing_s: float = 0.1  # t_proc, time until the receiver has read the message (s)
+    actuation_s: float = 0.2  # t_act, time until the brakes answer (s)
+    sensing_s: tuple[float, float] = (0.8, 1.1)  # range of a hop, the delay of seeing a neighbour (s)
+    persistence: Persistence = "first"  # known after the first message: the present, or the newest message (periodic)
 
     @property
     def delay_s(self) -> float:
@@ -337,10 +337,10 @@ class V2X(FileModel):
         return heard, np.where(in_sight[channel.senses], hop, np.inf)
 
     def with_channel(self, worlds: Worlds, u: Floats, key: Floats, time_step_s: float, equipped: Equipped) -> Worlds:
-        """Return these worlds, at the alert, with what each vehicle knows when, and the columns of periodic messages.
+        """Return these worlds with what each vehicle knows when, and the columns of periodic messages.
 
         Args:
-            worlds: worlds without a channel.
+            worlds: worlds without a channel, at the alert (time 0).
             u: uniform numbers for the links, [n, N * N * PER_LINK] in [0, 1).
             key: seed of each world's later losses, [n] in [0, 1).
             time_step_s: time between two decisions, at which vehicles sample their states.

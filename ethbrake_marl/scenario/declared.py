@@ -376,11 +376,11 @@ class ScenarioFields(FileModel):
         return Equipped(np.stack(sends, axis=1), np.stack(hears, axis=1))
 
     def possible_quantities(self, field: str) -> tuple[dict[int, AnyTypeQuantity], ...]:
-        """Return the declaration of a quantity for every possible vehicle type: one mapping type -> quantity per entry.
+        """Return the declarations of a quantity by vehicle type, one mapping for each vehicle, pair or world.
 
-        There is one entry per vehicle, pair or world, as in ``quantities``. Types are indices; without types the only
-        one is 0. A type that does not declare the quantity gets the declaration outside the types. Raises like
-        ``quantities``.
+        For example ``({0: 2.0, 1: 9.5}, ...)`` for ``mass_t``. The keys are indices of the types that are possible
+        there; without types the only one is 0. A type that does not declare the quantity gets the declaration outside
+        the types. Raises like ``quantities``.
         """
         line = self.types_of_line
         if line is None or field not in QUANTITY.of_a_type:

@@ -1,4 +1,7 @@
-"""Mixtures of scenarios: each world is drawn from one member, by weight, and equals that member's own world."""
+"""Mixtures of scenarios: each world is drawn from one of them, the *members*, and equals this member's own world.
+
+The member is drawn by weight.
+"""
 
 from __future__ import annotations
 

@@ -15,13 +15,12 @@ _Texts = NDArray[np.str_]
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Worlds at the alert, with their numbers in the list.
+    """Worlds at the alert (time 0), with their numbers in the list.
 
     >>> import ethbrake_marl as eb
     >>> sample = eb.load_scenario("paper-random").sample(2, seed=7)
     >>> sample.index, sample.worlds.gaps_m.round(2)
     (array([0, 1]), array([[6.62, 8.49], [5.33, 7.79]]))
-
     """
 
     worlds: Worlds  # at t = 0

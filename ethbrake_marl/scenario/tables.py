@@ -197,7 +197,16 @@ def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
 
 
 def _number_at(file: Path, header: list[str], row: list[str], line: int, column: str) -> float:
-    """Return the number in one column of a CSV row."""
+    """Return the number in one column of a CSV row; raise ``InvalidInput`` if it is not a number.
+
+    Args:
+        file: the file, for messages.
+        header: names of the columns.
+        row: texts of the row.
+        line: line on which the row begins, for messages.
+        column: name of the column to read.
+
+    """
     if len(row) != len(header):
         raise InvalidInput(f"{file}, line {line}: {len(row)} values, but the header has {len(header)} columns")
     text = row[header.index(column)]

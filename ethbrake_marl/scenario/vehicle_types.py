@@ -161,7 +161,7 @@ PerVehicle = Annotated[
 
 
 class _ObjectiveSchema:
-    """JSON schema of an objective: the objectives that are registered when it is generated."""
+    """Adds to a text field the JSON schema of an objective, with all objectives that are registered at that time."""
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
@@ -175,7 +175,7 @@ ObjectiveName = Annotated[str, _ObjectiveSchema]
 
 
 class _MemberSchema:
-    """JSON schema of a mixture's member: in a file also a scenario's name or the path of its file."""
+    """Adds the JSON schema of a mixture's member: in a file also a scenario's name or the path of its file."""
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
