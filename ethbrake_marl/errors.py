@@ -47,7 +47,10 @@ def one_line(text: str) -> str:
 
 
 def count_of(n: int, thing: str) -> str:
-    """Return a count with its noun, as messages write it: ``1 world``, ``10,000 worlds``."""
+    """Return the number ``n`` with its noun, as messages write it: ``1 world``, ``10,000 worlds``.
+
+    ``thing``: the noun in the singular.
+    """
     return f"{n:,} {thing}{'' if n == 1 else 's'}"
 
 

@@ -225,7 +225,10 @@ def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
 
 
 def _show(detail: ErrorDetails) -> str:
-    """Format the value, unless the whole file is meant; a float instead of a whole number keeps its decimal point."""
+    """Format the invalid value for the message; empty if the whole file is meant.
+
+    A float instead of a whole number keeps its decimal point.
+    """
     given = detail["input"]
     if isinstance(given, BaseModel) or not detail["loc"]:
         return ""

@@ -68,7 +68,7 @@ class Override:
 
 
 def _placed(part: Any, path: tuple[str, ...], override: Override) -> Any:
-    """Return a copy of ``part`` with the setting's value inserted at ``path``, its remaining keys."""
+    """Return a copy of ``part`` with the value of ``override`` inserted at ``path``, the keys that are left."""
     if not path:
         return override.value
     key, rest = path[0], path[1:]

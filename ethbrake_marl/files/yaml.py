@@ -250,7 +250,10 @@ class _Reader:
         return key
 
     def _scalar(self, event: yaml.ScalarEvent) -> str | int | float | bool | None:
-        """Convert a scalar by the core schema of YAML 1.2; a quoted or block scalar is always text."""
+        """Convert the scalar of a YAML event by the core schema of YAML 1.2.
+
+        A quoted or block scalar is always text.
+        """
         text = str(event.value)
         if not event.implicit[0]:
             return text

@@ -208,7 +208,7 @@ def release_time(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> 
 def place(worlds: Worlds, vehicle: int) -> Floats:
     """Return the number of vehicles ahead of ``vehicle`` (index from 0) in the line, [n].
 
-    It tells the vehicles of a shared policy apart.
+    It distinguishes the vehicles of a shared policy.
     """
     return np.full(worlds.n, float(vehicle))
 

@@ -55,12 +55,13 @@ class EpisodeImpacts:
         return change
 
     def and_then(self, way: Iterable[tuple[Worlds, Floats, Floats]], some: Bools) -> EpisodeImpacts:
-        """Return these impacts and those of the next stretch of time.
+        """Return the impacts after the episodes have gone on: these impacts, and the new ones of some worlds.
 
         Args:
-            way: parts of the stretch, in order of time: worlds at its start, commands [n, N] m/s2, and end [n] s, as
+            way: consecutive parts of the new motion: worlds at its start, constant commands [n, N] m/s2, and end [n] s,
+                as
                 ``Engine.segments`` yields them.
-            some: worlds whose impacts are added, a mask [n].
+            some: worlds whose new impacts are added, a mask [n].
 
         """
         parts, found = list(way), [self.rows]

@@ -256,7 +256,7 @@ def _social_weights(angle_deg: float) -> tuple[float, float]:
 def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
     """Return the injuries in 1,000 lines, [n], summed front to rear; the same number for all vehicles.
 
-    Of a vehicle's two impacts the larger risk counts, not the larger change of speed, so that no further impact can
+    If a vehicle has two impacts, the larger risk counts, not the larger change of speed, so that no further impact can
     lower the number.
     """
     del vehicle

@@ -123,9 +123,9 @@ Observation = ObservationSpec | Sequence[str] | Mapping[str, Any]  # list: group
 def choose_observation(listed: Observation, time_step_s: float | None = None) -> ObservationSpec:
     """Return the observation for a list of groups and single features: ``[own, front_1, rear_1.gap, my_feature]``.
 
-    A mapping gives the fields of an ``ObservationSpec``, as in JSON. ``time_step_s`` (s) is the time between two
-    decisions; only contact features outside an environment need it. Raises ``UnknownName`` with a suggestion,
-    ``InvalidInput`` for an invalid list.
+    A mapping gives the fields of an ``ObservationSpec``, as in JSON; an ``ObservationSpec`` is returned unchanged.
+    ``time_step_s`` (s) is the time between two decisions; only contact features outside an environment need it. Raises
+    ``UnknownName`` with a suggestion, ``InvalidInput`` for an invalid list.
     """
     if isinstance(listed, ObservationSpec):
         spec = listed

@@ -525,7 +525,7 @@ def move_alone(table: Floats, i: int, wanted: float, duration: float) -> tuple[f
 def move_alone_by_events(table: Floats, i: int, wanted: float, duration: float) -> tuple[float, float]:
     """Version of ``move_alone`` for a vehicle that may come to rest or reach its speed limit: it moves event by event.
 
-    Same arguments, result and updated rows as ``move_alone``.
+    Arguments, result and updated rows are the same as in ``move_alone``.
     """
     speed, limit, now = table[ROW.SPEED_VALUE, i], table[ROW.LIMIT, i], 0.0
     slowest, fastest = speed, speed

@@ -113,7 +113,7 @@ def step_end_s(step: float, last_step: float, first_s: float, time_step_s: float
 
 @compiled
 def time_of(grid: Grid, step: int) -> float:
-    """Return the time of decision number ``step`` (s), counted from 0: the time at which that step begins."""
+    """Return the time of decision number ``step`` (s), counted from 0; ``grid`` holds the decision times."""
     return step_end_s(step, grid.last_step, grid.first_s, grid.time_step_s, grid.horizon_s)
 
 
@@ -128,7 +128,7 @@ def onset_s(latency_s: float, time_s: float) -> float:
 
 @compiled
 def stands(speed_mps: float, command_mps2: float) -> bool:
-    """Return whether a vehicle stands still and its command does not start it moving."""
+    """Return whether a vehicle stands still and its command (negative brakes) does not start it moving."""
     return speed_mps == 0.0 and command_mps2 <= 0.0
 
 

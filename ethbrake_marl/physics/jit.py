@@ -81,7 +81,7 @@ class _Linkable(JITCodeLibrary):  # type: ignore[misc]
 
 
 class Kernel(CPUDispatcher):  # type: ignore[misc]
-    """A compiled function like that of numba's ``njit``, with its own cache and less to compile.
+    """A compiled function like the result of numba's ``njit``, with its own cache and less to compile.
 
     Numba generates machine code and two wrappers for each compiled function that another one calls, although the caller
     already contains its code. And it compiles once per integer literal that is passed as an argument. This class does

@@ -272,7 +272,10 @@ def sample_on(worlds: Worlds, command: Floats, until: Floats, step_s: float) -> 
 
 
 def _refuse_unsampled(worlds: Worlds, until: Floats, step_s: float) -> None:
-    """Raise ``InvalidInput`` for a step, an end or a state that the map does not cover."""
+    """Raise ``InvalidInput`` for a step length, an end time or a state that the fixed-step map does not cover.
+
+    ``until``: end times, [n] s; ``step_s``: sampling period, s.
+    """
     if not (SHORTEST_STEP_S <= step_s < math.inf):
         raise InvalidInput(f"step_s = {step_s:g}: must be finite and at least {SHORTEST_STEP_S:g} s")
     good = (until >= worlds.time_s) & (until <= worlds.time_s + MOST_STEPS * step_s)

@@ -240,7 +240,7 @@ class Worlds:
 
     @staticmethod
     def concatenate(parts: Sequence[Worlds]) -> Worlds:
-        """Join worlds with the same number of vehicles into one batch."""
+        """Join the batches ``parts``, all with the same number of vehicles, into one batch, in this order."""
         parts = _alike(parts)
         return parts[0]._each(lambda *columns: np.concatenate(columns), *parts[1:])
 
@@ -422,7 +422,10 @@ class Worlds:
 
 
 def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
-    """Return the same worlds, all with equally many pieces; if some have a road, the others get infinite friction."""
+    """Return the batches ``parts`` in a form in which they can be joined: with equally many pieces and road columns.
+
+    If some have a road, the others get infinite friction.
+    """
     most = max(part.vehicles.pieces.shape[2] for part in parts)
     if any(part.vehicles.pieces.shape[2] < most for part in parts):
         parts = [
@@ -550,7 +553,7 @@ def make_worlds(
         speed_limit_mps: speed up to which a vehicle drives, m/s, broadcast to [n, N].
         brake_rate_mps3: rate at which the acceleration in force falls to a lower command, m/s3, broadcast to [n, N];
             inf: at once.
-        release_rate_mps3: rate at which the acceleration in force rises to a higher command, likewise.
+        release_rate_mps3: rate at which it rises to a higher command, m/s3, broadcast to [n, N]; inf: at once.
         obstacle_gap_m: gap from Vehicle 1 to an obstacle ahead, m, broadcast to [n]; None: no obstacle.
         friction: friction of the road, broadcast to [n]; it limits capacities to ``friction * GRAVITY_MPS2``. None: no
             limit.

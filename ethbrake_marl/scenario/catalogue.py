@@ -1,4 +1,4 @@
-"""The catalogue of scenarios: shipped ones and those of registered folders, found by name, and files, found by path."""
+"""The catalogue of scenarios. Shipped and registered scenarios are found by name, other files by path."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ class Channel(NamedTuple):
     """All settings that decide what each vehicle knows, and when; symbols as at the top of this file."""
 
     timing: Literal["latency", "fixed", "messages"]  # delay tau of a link: own latency, link_latency_s, or generated
-    hears: Hears = "all"  # whose messages a vehicle receives: everyone's, those of vehicles ahead, nobody's
+    hears: Hears = "all"  # whose messages a vehicle receives: everybody's, only from vehicles ahead, nobody's
     senses: Senses = "both"  # which direct neighbours are in sight
     link_latency_s: float = 0.0  # delay tau of every link for timing "fixed" (s)
     loss_begins: float = 0.0  # p, probability per message period that a burst of losses begins

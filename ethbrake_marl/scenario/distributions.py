@@ -86,8 +86,8 @@ class LogUniform(_Distribution):
 class NormalShape(_Distribution):
     """Mean and standard deviation of a normal distribution before truncation, and the bounds of the truncation."""
 
-    mean: Number
-    sd: Number
+    mean: Number  # before truncation
+    sd: Number  # standard deviation before truncation
     low: Number
     high: Number
 
@@ -128,8 +128,8 @@ class Normal(_Distribution):
 class LogNormalShape(_Distribution):
     """Median and standard deviation of the logarithm, before truncation, and the bounds of the truncation."""
 
-    median: Number
-    sigma: Number
+    median: Number  # before truncation
+    sigma: Number  # standard deviation of the logarithm, before truncation
     low: Number
     high: Number
 
@@ -138,7 +138,7 @@ class LogNormal(_Distribution):
     """``{lognormal: {median, sigma, low, high}}``: the logarithm is normal; truncated to [low, high]."""
 
     lognormal: LogNormalShape
-    _of_logarithm: Normal = PrivateAttr()
+    _of_logarithm: Normal = PrivateAttr()  # distribution of the logarithm
 
     @model_validator(mode="after")
     def _possible(self) -> LogNormal:
@@ -167,8 +167,8 @@ class LogNormal(_Distribution):
 class Choice(_Distribution):
     """``{choice: [a, b, ...]}``: one of these values, with equal probability or in proportion to ``weights: [...]``."""
 
-    choice: Numbers
-    weights: Numbers | None = None
+    choice: Numbers  # the possible values
+    weights: Numbers | None = None  # weight of each value; None: equal
 
     @model_validator(mode="after")
     def _weighted(self) -> Choice:

@@ -26,7 +26,7 @@ AnyScenario = TypeVar("AnyScenario", bound=ScenarioFields)
 
 
 def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a scenario file with some keys changed.
+    """Return ``content`` of a scenario file with the keys and values of ``changes``.
 
     A new way to declare gaps or speeds replaces the old one: with ``time_gaps_s`` in the changes, ``gaps_m`` is
     dropped.
@@ -98,7 +98,11 @@ def _member_document(document: Document, i: int, entry: Mapping[str, Any], besid
 
 
 def _check_members(document: Document, members: Sequence[ScenarioFields]) -> None:
-    """Raise ``InvalidInput`` for nested mixtures, repeated names, and scenarios that cannot share one batch."""
+    """Raise ``InvalidInput`` if the scenarios ``members`` of a mixture cannot be drawn together.
+
+    None may be a mixture, their names must differ, and they must fit into one batch. ``document``: the mixture's file,
+    for messages.
+    """
     where = f"{document.where(('mixture',))}: mixture"
     first = members[0]
     if (given := document.content.get("vehicles", first.vehicles)) != first.vehicles:

@@ -87,7 +87,7 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
 def members_of(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Ints:
     """Return the scenario of a mixture from which each world is drawn, as an index into ``scenario.members``, [n].
 
-    The index is 0 without a mixture. Arguments are those of ``sample``.
+    The index is 0 without a mixture. Arguments are the same as in ``sample``.
     """
     cumulative = np.cumsum([member.weight for member in scenario.mixture or ()] or [1.0])
     u = uniform_numbers(seed, channel, 0, first, n, OF_WORLD, of=MIXTURE)[:, 0]
@@ -199,7 +199,7 @@ def uniform_numbers(
 def _draw_numbers(scenario: ScenarioFields, index: Ints, seed: int, channel: Channel) -> Sample:
     """Return the worlds with the ascending numbers ``index`` [n] of the scenario's list.
 
-    Early impacts are rejected if the scenario says so.
+    Early impacts are rejected if the scenario says so. Other arguments are the same as in ``sample``.
     """
     drawn = _draw(scenario, seed, channel, 0, index)
     if scenario.early_impacts == "keep" or not scenario.learners:
@@ -259,7 +259,7 @@ def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample
 def _redraw_one(scenario: ScenarioFields, seed: int, channel: Channel, index: Ints) -> None:
     """Draw the one world numbered ``index`` [1] up to the last attempt; raise ``InvalidInput`` if all are rejected.
 
-    So a list whose draws are all rejected fails early.
+    So a list whose draws are all rejected fails early. Other arguments are the same as in ``sample``.
     """
     for attempt in range(_PATIENCE, MOST_ATTEMPTS):
         if not early_impact(scenario, _draw(scenario, seed, channel, attempt, index).worlds)[0]:
@@ -277,7 +277,11 @@ def _unusable(scenario: ScenarioFields, world: int) -> InvalidInput:
 
 
 def _draw(scenario: ScenarioFields, seed: int, channel: Channel, attempt: int, index: Ints) -> Sample:
-    """Draw the worlds with the ascending numbers ``index`` [n] once, with the random numbers of this attempt."""
+    """Draw the worlds with the ascending numbers ``index`` [n] once; early impacts are not rejected.
+
+    ``attempt``: number of the draw, from 0, which selects the random numbers. Other arguments are the same as in
+    ``sample``.
+    """
     first, last = int(index[0]), int(index[-1])
 
     def numbers(width: int, of: tuple[int, ...] = ()) -> Floats:

@@ -273,7 +273,10 @@ def _build(scenario: Scenario, document: Document) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """Convert numpy numbers and arrays to Python's, which the strict schema accepts, and scenarios to their content."""
+    """Convert numpy numbers and arrays in ``value`` to Python's, which the strict schema accepts.
+
+    Scenarios become their content; mappings and lists are converted inside.
+    """
     if isinstance(value, Scenario):
         return value.declared()
     if isinstance(value, np.ndarray | np.generic):
