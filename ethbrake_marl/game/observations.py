@@ -190,8 +190,8 @@ class Extra(NamedTuple):
 
     column: int  # its column in the observation
     entry: RegisteredFeature  # the feature and its function
-    offset: int  # offset of the neighbour in the line; 0: the vehicle itself
-    known: int  # column of the neighbour's ``known`` in the whole groups
+    offset: int  # place of the neighbour relative to the vehicle, -1 is the next one ahead; 0: the vehicle itself
+    known: int  # column of the neighbour's feature ``known`` among the built-in features
 
 
 class Plan(NamedTuple):
@@ -199,7 +199,7 @@ class Plan(NamedTuple):
 
     scaling: Scaling
     contacts: Contacts | None  # contact features, after all other groups; None: no such features
-    picked: Ints | None  # [F] columns to take from the whole groups; None: all
+    picked: Ints | None  # [F] columns to take from the features of whole groups; None: all
     extras: tuple[Extra, ...]  # registered features
 
     def observe(self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None = None) -> Observations:

@@ -122,7 +122,7 @@ def _check_derived(scenario: ScenarioFields) -> None:
 
 
 def _check_scripts(scenario: ScenarioFields) -> None:
-    """Raise an error for a script with a command beyond capacity, or an obstacle-free learner at the front.
+    """Raise an error for a script with a command beyond capacity, or if vehicle_1 learns without an obstacle ahead.
 
     If early impacts are rejected, also for a script that depends on the state.
     """
