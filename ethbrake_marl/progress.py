@@ -30,7 +30,7 @@ class Progress:
 
     @property
     def harm(self) -> str:
-        """Harm in the last evaluation, as text with the name of the count or objective; empty without an evaluation."""
+        """Harm in the last evaluation, as text with its name: ``total harm 24.19``; empty without an evaluation."""
         if self.objective and "objective" in self.metrics:
             return f"{self.objective} {self.metrics['objective']:.2f}"
         words = {"first_impact_harm": "first-impact harm", "total_harm": "total harm"}

@@ -59,8 +59,7 @@ class EpisodeImpacts:
 
         Args:
             way: consecutive parts of the new motion: worlds at its start, constant commands [n, N] m/s2, and end [n] s,
-                as
-                ``Engine.segments`` yields them.
+                as ``Engine.segments`` yields them.
             some: worlds whose new impacts are added, a mask [n].
 
         """

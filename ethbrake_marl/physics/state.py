@@ -95,8 +95,8 @@ class Vehicles:
         """Return vehicles without a channel: each has only its own latency and knows everything from then on.
 
         Arguments are arrays as in the fields of this class: capacities, latency, mass (t) and speed limit are [n, N],
-        ``restitution`` is [n], rates are [n, N]. None: a command takes full effect at once, and no vehicle brakes in
-        pieces.
+        ``restitution`` is [n], rates are [n, N]. Rates None: a command takes full effect at once. ``pieces`` None: no
+        vehicle follows a fixed sequence of commands.
         """
         known = cls.known_at_once(latency_s)
         at_once = np.full(mass_t.shape, np.inf)
@@ -422,9 +422,9 @@ class Worlds:
 
 
 def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
-    """Return the batches ``parts`` in a form in which they can be joined: with equally many pieces and road columns.
+    """Return the batches ``parts``, made alike so that their columns can be joined.
 
-    If some have a road, the others get infinite friction.
+    All get columns for equally many pieces of braking; if some have a road, the others get one with infinite friction.
     """
     most = max(part.vehicles.pieces.shape[2] for part in parts)
     if any(part.vehicles.pieces.shape[2] < most for part in parts):

@@ -502,5 +502,5 @@ def obstacle_gap(
 
 
 def _supports_of(scenario: ScenarioFields) -> Callable[[str], Floats]:
-    """Return a function that maps a key to the smallest and largest value of each of its entries, [2, entries]."""
+    """Return a function: key of a quantity -> smallest and largest value for each vehicle or pair, [2, entries]."""
     return lambda key: np.array(scenario.supports(key)).T

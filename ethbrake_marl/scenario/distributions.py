@@ -51,9 +51,9 @@ class Uniform(_Distribution):
         return self.uniform
 
     def value(self, u: Floats) -> Floats:
-        """Return ``low + (high - low) u`` for ``u`` in [0, 1), in the same shape.
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape: ``low + (high - low) u``.
 
-        The result is never above high: u is at most 1 - 2^-53, so (high - low) u rounds to less than the rounded high -
+        A value is never above high: u is at most 1 - 2^-53, so (high - low) u rounds to less than the rounded high -
         low.
         """
         low, high = self.uniform
@@ -78,7 +78,7 @@ class LogUniform(_Distribution):
         return self.loguniform
 
     def value(self, u: Floats) -> Floats:
-        """Return ``low (high / low)^u`` for ``u`` in [0, 1), in the same shape."""
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape: ``low (high / low)^u``."""
         low, high = self.loguniform
         return np.clip(low * exp_each((u * log(high / low)).ravel()).reshape(u.shape), low, high)
 
@@ -118,7 +118,11 @@ class Normal(_Distribution):
         return self.normal.low, self.normal.high
 
     def value(self, u: Floats) -> Floats:
-        """Return ``mean + sd Q(p_low + (p_high - p_low) u)``, Q the normal quantile; same shape as ``u`` in [0, 1)."""
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+
+        A value is ``mean + sd Q(p_low + (p_high - p_low) u)``; Q is the normal quantile, p_low and p_high are the
+        probabilities of being below the bounds.
+        """
         shape = self.normal
         below, above = self._bounds()
         quantile = normal_quantile_each((below + (above - below) * u).ravel()).reshape(u.shape)
@@ -159,7 +163,7 @@ class LogNormal(_Distribution):
         return self.lognormal.low, self.lognormal.high
 
     def value(self, u: Floats) -> Floats:
-        """Return ``exp`` of the normally distributed logarithm for ``u`` in [0, 1), in the same shape."""
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape: ``exp`` of a normal number."""
         drawn = exp_each(self._of_logarithm.value(u).ravel()).reshape(u.shape)
         return np.clip(drawn, *self.support)
 
@@ -185,7 +189,10 @@ class Choice(_Distribution):
         return min(self.choice), max(self.choice)
 
     def value(self, u: Floats) -> Floats:
-        """Return the first entry whose cumulative weight is above ``u``, for ``u`` in [0, 1), in the same shape."""
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+
+        It is the first entry whose cumulative weight (of a total of 1) is above u.
+        """
         cumulative = np.cumsum(np.asarray(self.weights or (1.0,) * len(self.choice)))
         cumulative /= cumulative[-1]
         return np.asarray(self.choice)[np.searchsorted(cumulative, u, side="right")]
@@ -215,7 +222,10 @@ class TableColumn:
         return replace(self, rows=self.rows[order][[np.searchsorted(shares, 0.5)]], cumulative=np.ones(1))
 
     def value(self, u: Floats) -> Floats:
-        """Return the value of the first row whose cumulative weight is above ``u``; same shape as ``u`` in [0, 1)."""
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+
+        It is the value of the first row whose cumulative weight is above u.
+        """
         found: Floats = self.rows[np.searchsorted(self.cumulative, u, side="right")]
         return found
 
@@ -284,10 +294,10 @@ AnyTypeQuantity = AnyQuantity | WithLoad
 
 
 def support(quantity: AnyTypeQuantity) -> tuple[float, float]:
-    """Return the smallest and largest possible value of a quantity."""
+    """Return the smallest and largest value that ``quantity`` can have."""
     return (quantity, quantity) if isinstance(quantity, float) else quantity.support
 
 
 def values(quantity: AnyQuantity, u: Floats) -> Floats:
-    """Return the quantity's values for uniform numbers ``u`` in [0, 1), in the shape of ``u``."""
+    """Return the values of ``quantity`` drawn by uniform numbers ``u`` in [0, 1), in the shape of ``u``."""
     return np.full(u.shape, quantity) if isinstance(quantity, float) else quantity.value(u)
