@@ -41,10 +41,11 @@ class WorkerLost(EthBrakeError):
 
 
 def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = None) -> Iterator[Any]:
-    """Run the calls in parallel and yield their results in the order of the calls.
+    """Run function calls in parallel and yield their results in the order of the calls.
 
     Args:
-        calls: functions with their arguments; each call is taken from the iterable shortly before it starts.
+        calls: tuples (function, argument, ...), functions of a module; each is taken from the iterable shortly before
+            it starts.
         jobs: number of calls that run at once. None: one, or as many as Ray has cores. One call at a time runs in this
             process.
         ray: ``local`` for a Ray on this machine alone, or the address of a Ray cluster. None: no Ray.
@@ -80,7 +81,10 @@ def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = N
 
 
 def _answer(call: bytes) -> Any:
-    """Run a pickled call in a worker; what the call prints goes to stderr."""
+    """Run the pickled call ``(function, argument, ...)`` in a worker and return its result.
+
+    Text that the call prints goes to stderr.
+    """
     _end_with_parent()
     with redirect_stdout(sys.stderr):
         function, *given = pickle.loads(call)
@@ -115,7 +119,10 @@ def _sigterm_as_ctrl_c() -> Iterator[None]:
 
 @contextmanager
 def _backend(ray: str | None, jobs: int | None) -> Iterator[tuple[dict[str, Any], int]]:
-    """Start joblib's backend; yield its settings and the number of calls that run at once."""
+    """Context manager: start joblib's backend; yield its settings and the number of calls that run at once.
+
+    Arguments are those of ``run_each``.
+    """
     if ray is None:
         yield {"backend": "loky", "inner_max_num_threads": 1}, jobs or 1
         return

@@ -14,11 +14,11 @@ class FileSchema(GenerateJsonSchema):
     """JSON Schema generator for files, in which an unused key is left out and never ``null``."""
 
     def nullable_schema(self, schema: NullableSchema) -> JsonSchemaValue:
-        """Return the schema of the value that is not null."""
+        """Return the JSON schema of an optional value without ``null`` (pydantic's hook)."""
         return self.generate_inner(schema["schema"])
 
     def default_schema(self, schema: WithDefaultSchema) -> JsonSchemaValue:
-        """Return the usual schema, but without ``"default": null``."""
+        """Return the JSON schema of a value with a default, but without ``"default": null`` (pydantic's hook)."""
         described = super().default_schema(schema)
         return {key: value for key, value in described.items() if key != "default" or value is not None}
 
@@ -29,9 +29,12 @@ class FileSchema(GenerateJsonSchema):
 
 
 def schema_lines(kind: str, command: str) -> str:
-    """Return the comment in a new file that names its schema, and the command that prints the schema.
+    """Return a comment for a new YAML file that names its JSON schema, and the command that prints the schema.
 
-    ``kind``: ``scenario`` or ``recipe``.
+    Args:
+        kind: ``scenario`` or ``recipe``.
+        command: subcommand of ``ethbrake`` that prints the schema, such as ``scenario schema``.
+
     """
     return (
         f"# yaml-language-server: $schema={kind}.schema.json\n"

@@ -76,7 +76,7 @@ _FRACTIONS = 150  # terms of the continued fraction: for x >= 2 its remainder is
 
 @compiled
 def _polynomial(coefficients: tuple[float, ...], x: float) -> float:
-    """Evaluate a polynomial by Horner's rule; coefficients from the highest power down."""
+    """Evaluate the polynomial with these coefficients (highest power first) at ``x``, by Horner's rule."""
     total = 0.0
     for coefficient in coefficients:
         total = total * x + coefficient
@@ -98,7 +98,7 @@ def power_of_two(k: int) -> float:
 
 @compiled
 def exp_rest(x: float, k: int) -> float:
-    """Return ``e^x / 2^k`` for the whole k nearest to ``x / ln 2``.
+    """Return ``e^x / 2^k``; pass the whole number k nearest to ``x / ln 2``.
 
     Taylor's series to the 13th power of ``x - k ln 2``, which lies within ``ln(2) / 2`` of 0; relative error 5e-18.
     """
@@ -199,7 +199,7 @@ def normal_probability(x: float) -> float:
 
 @compiled
 def exp_each(values: Floats) -> Floats:
-    """Return ``exp`` of each of ``values`` [n]."""
+    """Return ``e^x`` of each entry x of ``values`` [n], as ``exp`` computes it, [n]."""
     found = np.empty(len(values))
     for i in range(len(values)):
         found[i] = exp(values[i])
@@ -208,7 +208,7 @@ def exp_each(values: Floats) -> Floats:
 
 @compiled
 def normal_quantile_each(values: Floats) -> Floats:
-    """Return ``normal_quantile`` of each of ``values`` [n]."""
+    """Return the standard normal quantile of each probability in ``values`` [n], by ``normal_quantile``, [n]."""
     found = np.empty(len(values))
     for i in range(len(values)):
         found[i] = normal_quantile(values[i])
