@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.evaluation.measures import BASELINE, Measure, MeasureSet, every_set
+from ethbrake_marl.evaluation.measure_sets import BASELINE, Measure, MeasureSet, every_set
 from ethbrake_marl.evaluation.outcome import COLUMN, Outcome, Values
 from ethbrake_marl.evaluation.own_measures import registered_measure
 from ethbrake_marl.evaluation.statistics import Moments, exact_sum, rate

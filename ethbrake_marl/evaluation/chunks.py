@@ -21,7 +21,7 @@ from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import CHUNK, own_versions, policies_of, result_versions, scenario_sha256
 from ethbrake_marl.evaluation.lineup import make_lineup
-from ethbrake_marl.evaluation.measures import MEASURE_SETS, silent_in_long_lists
+from ethbrake_marl.evaluation.measure_sets import MEASURE_SETS, silent_in_long_lists
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.own_measures import LOADED, load_measures
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk

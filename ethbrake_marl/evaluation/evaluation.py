@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, unknown_name
 from ethbrake_marl.evaluation.conditions import Conditions
-from ethbrake_marl.evaluation.measures import MEASURE_SETS, Silent, contexts_of, silent_because
+from ethbrake_marl.evaluation.measure_sets import MEASURE_SETS, Silent, contexts_of, silent_because
 from ethbrake_marl.evaluation.outcome import LeftOut, Outcome, none_for_nan
 from ethbrake_marl.evaluation.rescores import Rescored, Rescores
 from ethbrake_marl.evaluation.statistics import mean, rate
@@ -36,7 +36,6 @@ _TEXTS = {"agent", "scenario", "ended", "knows"}  # columns of texts, in additio
 _ALWAYS_SHOWN = ("gaps_m", "speeds_mps", "obstacle_gap_m")  # quantities in these tables even if all worlds agree
 
 _LIBRARIES = ("pandas", "polars", "columns")  # kinds of frame, in order of preference
-
 
 T = TypeVar("T")
 

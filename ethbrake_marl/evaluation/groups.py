@@ -6,7 +6,7 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.measures import BASELINE
+from ethbrake_marl.evaluation.measure_sets import BASELINE
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
 
 NO_TYPE = "no type"  # group of worlds in which the vehicle has no type

@@ -8,7 +8,7 @@ from typing import Literal
 from ethbrake_marl.agents.protocol import Source
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.exploits import Exploits
-from ethbrake_marl.evaluation.measures import MEASURE_SETS, MeasureSet
+from ethbrake_marl.evaluation.measure_sets import MEASURE_SETS, MeasureSet
 from ethbrake_marl.evaluation.outcome import LeftOut
 from ethbrake_marl.evaluation.summary_row import SummaryRow
 

@@ -12,7 +12,7 @@ from ethbrake_marl.evaluation.agent_tally import AgentTally, estimate_all, lower
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import result_versions, scenario_sha256, worlds_sha256
-from ethbrake_marl.evaluation.measures import BASELINE, EPISODE, MEASURE_SETS, contexts_of, every_set, measures
+from ethbrake_marl.evaluation.measure_sets import BASELINE, EPISODE, MEASURE_SETS, contexts_of, every_set, measures
 from ethbrake_marl.evaluation.notes import SEES_THROUGH, Note, notes_of, warnings_of
 from ethbrake_marl.evaluation.outcome import COLUMN
 from ethbrake_marl.evaluation.own_measures import heading_of, registered_measure

@@ -9,7 +9,7 @@ from typing import Any
 from ethbrake_marl.agents.protocol import Knowledge
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.exploits import MARK, Exploits
-from ethbrake_marl.evaluation.measures import EPISODE, MEASURE_SETS, MeasureSet, RegisteredMeasures
+from ethbrake_marl.evaluation.measure_sets import EPISODE, MEASURE_SETS, MeasureSet, RegisteredMeasures
 from ethbrake_marl.evaluation.outcome import COLUMN, UNSTATED, LeftOut
 from ethbrake_marl.evaluation.own_measures import heading_of
 from ethbrake_marl.files.sheet import Estimate

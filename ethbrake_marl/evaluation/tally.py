@@ -10,7 +10,7 @@ import numpy as np
 from ethbrake_marl.evaluation.agent_tally import AgentTally, tally_agents
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import HASHES, hash_of_chunks
-from ethbrake_marl.evaluation.measures import contexts_of, silent_because
+from ethbrake_marl.evaluation.measure_sets import contexts_of, silent_because
 from ethbrake_marl.evaluation.outcome import LeftOut
 from ethbrake_marl.evaluation.rescores import Rescored, Rescores
 from ethbrake_marl.game.harm import HARM_COUNTS

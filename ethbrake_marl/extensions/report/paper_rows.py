@@ -7,7 +7,7 @@ from typing import Literal
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.measures import BASELINE
+from ethbrake_marl.evaluation.measure_sets import BASELINE
 from ethbrake_marl.evaluation.notes import Note
 from ethbrake_marl.evaluation.summary import RowsBeside, SummaryTable, summarise
 from ethbrake_marl.extensions.report.three_tests import is_as_shipped
