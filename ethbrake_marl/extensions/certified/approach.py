@@ -42,7 +42,9 @@ SLOWEST = 0.05  # below this mean closing speed (m/s) an impact is assumed possi
 
 
 class Approach(NamedTuple):
-    """The way a pair may come into contact within one piece (time interval of constant command), as affine forms."""
+    """The way a pair may come into contact within one piece (time interval of constant command), as affine forms
+    (centre, slopes, remainder).
+    """
 
     closing: Floats  # [W] closing speed at the start of the piece, m/s
     squared: Floats  # [W] squared closing speed at contact, m2/s2

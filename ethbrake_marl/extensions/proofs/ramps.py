@@ -26,7 +26,9 @@ _MEETING_HALVINGS = 30
 
 @compiled
 def empty_legs() -> Floats:
-    """Return an uninitialised plan [3, LEGS] (a profile of piecewise linear acceleration) to fill in."""
+    """Return an uninitialised plan [3, LEGS] to fill in: the end (s), initial acceleration (m/s2) and jerk (m/s3) of
+    each leg.
+    """
     return np.empty((3, LEGS))
 
 
@@ -170,9 +172,9 @@ def force_of(plan: Floats, now: float) -> float:
 
 @compiled(apart=True)
 def least_on_cubic(constant: float, pressing: float, jerk: float, since: float, until: float) -> float:
-    """Return the least ``constant / t + pressing t / 2 + jerk t^2 / 3`` for t from ``since`` to ``until``.
+    """Return the least ``(constant / t) + (pressing * t / 2) + (jerk * t^2 / 3)`` for t from ``since`` to ``until``.
 
-    -inf if the function falls without bound towards t = 0.
+    The result is -inf if the function falls without bound towards t = 0.
     """
     if since <= 0.0 and constant <= 0.0:
         return -math.inf
