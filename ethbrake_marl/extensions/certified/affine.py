@@ -27,7 +27,8 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 @compiled(apart=True)
 def radius(x: Floats) -> float:
-    """Return the largest distance of a value of the affine form ``x`` [W] (centre, slopes, remainder) from its centre.
+    """Return the largest distance of a value of the affine form ``x`` [W] from its centre: the sum of the sizes of its
+    slopes, plus its remainder.
     """
     whole: float = x[-1]
     for k in range(1, x.shape[0] - 1):

@@ -16,8 +16,8 @@ from ethbrake_marl.shield.factories import shield_episodes
 
 
 def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make the shield ``+robust`` or ``+robust:interior`` around ``policy``: it certifies actions for all worlds of an
-    uncertainty.
+    """Make the shield ``+robust`` or ``+robust:interior`` around ``policy``: it certifies actions in the corners or the
+    whole interior of an uncertainty (an interval around each quantity).
 
     Args:
         policy: the agent to shield.
@@ -34,8 +34,8 @@ def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings
 
 
 def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make the shield ``+robust:believed`` or ``+robust:interior:believed``: it certifies actions for all values of
-    what the vehicle did not receive.
+    """Make the shield ``+robust:believed`` or ``+robust:interior:believed``: the same shield for the ranges of what the
+    vehicle did not receive.
 
     Args:
         policy: the agent to shield.

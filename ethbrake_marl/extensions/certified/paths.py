@@ -168,7 +168,7 @@ def branch(
 @compiled(apart=True)
 def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
     """Record the affine form ``harm`` [W] (centre, slopes, remainder), to which at most ``rest`` (m2/s2) will be added;
-    return the largest one recorded.
+    return the largest harm recorded, m2/s2.
 
     ``worst`` is the largest harm recorded so far; ``out`` [W] receives the affine form of a new largest harm.
     """

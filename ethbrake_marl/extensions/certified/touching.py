@@ -245,7 +245,7 @@ def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, har
 
 @compiled(apart=True)
 def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
-    """Update pair ``p``, which is in contact, at the end of a piece in which its centre of mass stands.
+    """Update pair ``p``, which is in contact, over a piece in which the affine form of its speed stands at 0.
 
     In each world either both vehicles stand, or the world *creeps* and the brakes slow it. A world creeps if one
     vehicle of the pair stands or moves backwards.

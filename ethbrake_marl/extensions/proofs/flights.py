@@ -130,8 +130,8 @@ def largest_lead(
     """Return an upper bound (m/s) on how much faster the controlled vehicle is than the speed of both vehicles' centre
     of mass.
 
-    Both vehicles have met already. The centre of mass moves as if the best command always acted; until the end of the
-    *window* an earlier command still acts, which costs the speed ``lost``.
+    Both vehicles have met already. The centre of mass is the one that the best command alone would lead to. In the
+    *window* an earlier command still acts instead, which costs the speed ``lost``.
 
     The bound covers three cases: the last time apart before the meeting with the other neighbour began with the first
     impact, within the window, or after it.
@@ -145,7 +145,7 @@ def largest_lead(
         lost: speed that is lost in the window, m/s.
         late: start of the window, s.
         end: end of the window, s.
-        since: earliest time of the meeting with the rear vehicle, s.
+        since: earliest time of the meeting with the other neighbour, s.
         until: latest time of that meeting, s.
 
     """

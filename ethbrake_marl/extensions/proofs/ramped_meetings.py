@@ -157,10 +157,10 @@ def gentlest_ramped(kind: int, at: Floats, time: float) -> float:
 def slack_of(
     kind: int, at: Floats, early: float, late: float, v: float, hard: float, plan: Floats
 ) -> tuple[float, float]:
-    """Return the largest distance (m) and the largest closing speed (m/s) of controlled vehicle and neighbour at
-    ``early``.
+    """Return the largest distance (m) to the neighbour at ``early``, and by how much (m/s) the closing speed may then
+    exceed ``hard``.
 
-    It meets the neighbour between ``early`` and ``late``.
+    The controlled vehicle meets the neighbour between ``early`` and ``late``.
 
     Args:
         kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
@@ -207,7 +207,8 @@ def force_of_meeting(kind: int, at: Floats, early: float, late: float, hard: flo
     """Return the largest acceleration (m/s2) of the controlled vehicle with which it can meet a neighbour at no more
     than ``hard``.
 
-    For a contact with the rear vehicle the acceleration is multiplied by -1.
+    For a contact with the rear vehicle, accelerations count with the opposite sign, so the largest one is the hardest
+    braking.
 
     Args:
         kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
