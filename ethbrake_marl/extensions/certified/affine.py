@@ -75,8 +75,8 @@ def negative(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def between(least: float, most: float, width: int) -> Floats:
-    """Return the affine form [width] (centre, slopes, remainder) of an arbitrary number between ``least`` and ``most``;
-    ``width`` is W.
+    """Return the affine form [width] (centre, slopes, remainder) of an arbitrary number between ``least`` and ``most``.
+    ``width`` is the length W of the form.
     """
     out = np.zeros(width)
     out[0], out[-1] = 0.5 * (least + most), 0.5 * (most - least)
@@ -253,8 +253,8 @@ class Path(NamedTuple):
     # Both speeds of a pair in contact are the speed of its centre of mass, and the gaps to its neighbours are measured
     # from there.
     touch: Floats
-    # [2 P + 1] first P: 1 if the pair had an impact, else 0; next P: the pair is FREE, TOUCHES or PARTS; last: index of
-    # the present piece
+    # [2 P + 1] first P: 1 if the pair had an impact, else 0; next P: the pair is FREE (not in contact), TOUCHES (in
+    # contact) or PARTS (it opens in the present piece); last: index of the present piece
     marks: Ints
 
 

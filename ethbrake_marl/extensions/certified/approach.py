@@ -54,8 +54,8 @@ class Approach(NamedTuple):
 
 @compiled(apart=True)
 def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
-    """Return by how much neighbouring pairs in contact may change the relative speed (m/s) or the gap (m) of pair
-    ``p``.
+    """Return by how much, at most, bounces of neighbouring pairs may change the relative speed (m/s) or the gap (m) of
+    pair ``p``.
 
     Args:
         cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of

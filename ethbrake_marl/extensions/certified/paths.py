@@ -582,7 +582,7 @@ def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out
 
 @compiled(apart=True)
 def go_on(cell: Cell, path: Path, motion: Motion) -> bool:
-    """Advance the path to the end of the present piece without an impact. Return False if every world has one.
+    """Advance the path to the end of the present piece without an impact. Return False if every world has an impact.
 
     Args:
         cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of

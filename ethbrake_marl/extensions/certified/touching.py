@@ -153,7 +153,7 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
         cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
             constant command).
         path: worlds of the box that had the same impacts so far; changed in place.
-        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        motion: motion of each vehicle in the present piece, as if alone (``move_alone``); changed in place.
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         length: length of the piece, s.
 

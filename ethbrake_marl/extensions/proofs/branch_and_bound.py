@@ -252,8 +252,9 @@ def least_harm(
         first: earliest time of the contact, s after the controlled vehicle may act.
         last: latest time of the contact, s.
         floor: known lower bound on the harm at the other pair, m2/s2.
-        best: harm that is possible in any case, m2/s2.
-        enough: if some contact does no more harm than this (m2/s2), 0 is returned, because this is proven elsewhere.
+        best: result if no contact does less harm, m2/s2.
+        enough: if some contact does no more harm than this (m2/s2), 0 is returned, because a bound of ``enough`` is
+            proven elsewhere.
         plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
         other: further working memory of the same kind.
         heap: working memory of the search, [CELLS, NEAR].

@@ -111,7 +111,8 @@ def piece_at(plan: Floats, now: float, v: float) -> tuple[float, float, bool]:
     """Return the acceleration in force at ``now`` (m/s2), the time at which it ends (s), and whether the vehicle then
     stops.
 
-    ``plan`` [2, PIECES] is the vehicle's acceleration profile, ``v`` its speed at ``now`` (m/s).
+    ``plan`` [2, PIECES] holds the ends (s) and accelerations (m/s2) of the pieces of its motion, ``v`` its speed at
+    ``now`` (m/s).
     """
     k = 0
     while now >= plan[ENDS, k]:
@@ -140,9 +141,9 @@ def walk(
     Args:
         gap: gap now, m.
         v_front: speed of the front vehicle, m/s.
-        front: [2, PIECES] plan of the front vehicle.
+        front: [2, PIECES] ends (s) and accelerations (m/s2) of the pieces of its motion.
         v_rear: speed of the rear vehicle, m/s.
-        rear: [2, PIECES] plan of the rear vehicle.
+        rear: [2, PIECES] the same for the rear vehicle.
         until: end of the motion, s.
 
     """

@@ -103,7 +103,7 @@ def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, flo
     That speed is NaN if the interval ends otherwise than at rest or at the speed limit.
 
     Args:
-        plan: [3, LEGS] plan of the vehicle.
+        plan: [3, LEGS] end (s), initial acceleration (m/s2) and jerk (m/s3) of each leg of the motion.
         now: present time, s.
         v: present speed, m/s.
         limit: speed limit, m/s.
@@ -149,7 +149,8 @@ def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, f
     """Return speed (m/s) and distance (m) at ``until`` (s) of a vehicle that starts with speed ``v`` and follows
     ``plan``.
 
-    ``plan`` is [3, LEGS]; ``limit`` is the speed limit, m/s.
+    ``plan`` [3, LEGS] holds end (s), initial acceleration (m/s2) and jerk (m/s3) of each leg; ``limit`` is the speed
+    limit, m/s.
     """
     now, way = 0.0, 0.0
     while now < until:

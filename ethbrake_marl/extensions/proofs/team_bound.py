@@ -103,7 +103,7 @@ def _combined_bound_of_line(
 class TeamBound:
     """Proven bounds on the harm of each world, [n] m2/s2 each."""
 
-    harm: Floats  # lower bound on the total harm: no joint command does less
+    harm: Floats  # lower bound on the total harm, whatever the controlled vehicles do
     early: Floats  # harm before any controlled vehicle may act
     obstacle: Floats  # bound of Vehicle 1 and the obstacle ahead, from that moment on
     pairs: Floats  # [n, P] bound of each pair alone, from that moment on

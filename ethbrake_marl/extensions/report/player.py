@@ -33,7 +33,8 @@ class Played:
 
     @staticmethod
     def drive(played: Sequence[Played], worlds: Worlds, name: str, agent: Driver, scenario: Scenario) -> None:
-        """Let one agent control the worlds of ``played``, and store each motion there under the agent's name.
+        """Let one agent control the worlds of ``played``, and store the motion in the ``motions`` of each entry, under
+        the agent's name.
 
         Args:
             played: one entry for each world.

@@ -48,7 +48,7 @@ def extreme_profiles(problem: ProfileProblem, states: Floats, has_front: Bools, 
 
     Args:
         problem: the worlds, with the commands of the other vehicles and the harm to minimise.
-        states: [n, WIDTH] each world at the first decision, as the columns of ``proofs.line.LINE``.
+        states: [n, WIDTH] one row for each world at the first decision, with the columns of ``proofs.line.LINE``.
         has_front: [n] True if a vehicle is ahead.
         has_rear: [n] True if a vehicle is behind.
 
@@ -68,7 +68,7 @@ def _fill_extremes(
 
     Args:
         problem: the worlds, with the commands of the other vehicles and the harm to minimise.
-        states: [n, WIDTH] each world at the first decision, as the columns of ``proofs.line.LINE``.
+        states: [n, WIDTH] one row for each world at the first decision, with the columns of ``proofs.line.LINE``.
         has_front: [n] True if a vehicle is ahead.
         has_rear: [n] True if a vehicle is behind.
         ends: [n, KEPT, K] receives the steps at which the phases end.
@@ -99,7 +99,7 @@ def try_changes(
     Args:
         world: the world, with its commands, bounds and random stream.
         kind: ``FRONT_FIRST`` or ``REAR_FIRST``: the neighbour to meet.
-        at: the world at the first decision, as the columns of ``proofs.line.LINE``.
+        at: the world at the first decision, an array with the columns of ``proofs.line.LINE``.
         start: [S] state of the simulation at the first decision.
         low: earliest first change, s.
         high: latest first change, s.
