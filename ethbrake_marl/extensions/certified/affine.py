@@ -27,7 +27,9 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 @compiled(apart=True)
 def radius(x: Floats) -> float:
-    """Return the largest distance of a value of the affine form ``x`` [W] from its centre."""
+    """Return the largest distance of a value of the affine form ``x`` [W] from its centre: the sum of the sizes of its
+    slopes, plus its remainder.
+    """
     whole: float = x[-1]
     for k in range(1, x.shape[0] - 1):
         whole += abs(x[k])
@@ -36,13 +38,13 @@ def radius(x: Floats) -> float:
 
 @compiled(apart=True)
 def low(x: Floats) -> float:
-    """Return the least value that the affine form ``x`` [W] takes in the box."""
+    """Return the least value that the affine form ``x`` [W] (centre, slopes, remainder) takes in the box."""
     return float(x[0] - radius(x))
 
 
 @compiled(apart=True)
 def high(x: Floats) -> float:
-    """Return the largest value that the affine form ``x`` [W] takes in the box."""
+    """Return the largest value that the affine form ``x`` [W] (centre, slopes, remainder) takes in the box."""
     return float(x[0] + radius(x))
 
 
@@ -50,7 +52,7 @@ def high(x: Floats) -> float:
 def add(out: Floats, share: float, x: Floats) -> None:
     """Add ``share * x`` to ``out`` in place; exact except for rounding.
 
-    ``x`` and ``out`` are affine forms [W], ``share`` is any number.
+    ``x`` and ``out`` are affine forms [W] (centre, slopes, remainder), ``share`` is any number.
     """
     for k in range(x.shape[0] - 1):
         out[k] += share * x[k]
@@ -59,7 +61,7 @@ def add(out: Floats, share: float, x: Floats) -> None:
 
 @compiled(apart=True)
 def difference(x: Floats, y: Floats) -> Floats:
-    """Return the affine form ``x - y`` [W] of two affine forms."""
+    """Return the affine form ``x - y`` [W] (centre, slopes, remainder) of two affine forms."""
     out = x.copy()
     add(out, -1.0, y)
     return out
@@ -67,13 +69,15 @@ def difference(x: Floats, y: Floats) -> Floats:
 
 @compiled(apart=True)
 def negative(x: Floats) -> Floats:
-    """Return the affine form ``-x`` [W] of an affine form."""
+    """Return the affine form ``-x`` [W] (centre, slopes, remainder) of an affine form."""
     return linear(x, -1.0, 0.0, 0.0)
 
 
 @compiled(apart=True)
 def between(least: float, most: float, width: int) -> Floats:
-    """Return the affine form [width] of an arbitrary number between ``least`` and ``most``; ``width`` is W."""
+    """Return the affine form [width] (centre, slopes, remainder) of an arbitrary number between ``least`` and ``most``.
+    ``width`` is the length W of the form.
+    """
     out = np.zeros(width)
     out[0], out[-1] = 0.5 * (least + most), 0.5 * (most - least)
     return out
@@ -81,7 +85,7 @@ def between(least: float, most: float, width: int) -> Floats:
 
 @compiled(apart=True)
 def product(x: Floats, y: Floats) -> Floats:
-    """Return an affine form [W] that encloses ``x * y``, for two affine forms.
+    """Return an affine form [W] (centre, slopes, remainder) that encloses ``x * y``, for two affine forms.
 
     The second-order part of the product goes to the remainder.
     """
@@ -95,7 +99,7 @@ def product(x: Floats, y: Floats) -> Floats:
 
 @compiled(apart=True)
 def square(x: Floats) -> Floats:
-    """Return an affine form [W] that encloses ``x * x``.
+    """Return an affine form [W] (centre, slopes, remainder) that encloses ``x * x``.
 
     Its remainder is half of that of ``product(x, x)``, because a square is never negative.
     """
@@ -110,7 +114,9 @@ def square(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def linear(x: Floats, slope: float, start: float, error: float) -> Floats:
-    """Return the affine form [W] of ``start + slope * x``, widened by ``error`` on either side."""
+    """Return the affine form [W] (centre, slopes, remainder) of ``start + slope * x``, widened by ``error`` on either
+    side.
+    """
     out = np.empty_like(x)
     for k in range(x.shape[0] - 1):
         out[k] = slope * x[k]
@@ -121,7 +127,8 @@ def linear(x: Floats, slope: float, start: float, error: float) -> Floats:
 
 @compiled(apart=True)
 def square_root(x: Floats) -> Floats:
-    """Return an affine form [W] that encloses the square root of ``x`` where ``x >= 0``. Needs ``high(x) >= 0``.
+    """Return an affine form [W] (centre, slopes, remainder) that encloses the square root of ``x`` where ``x >= 0``.
+    Needs ``high(x) >= 0``.
 
     Where ``x`` is negative the result means nothing. On [a, b] the root lies between its chord, with slope 1 / (sqrt a
     + sqrt b), and the parallel tangent.
@@ -137,7 +144,7 @@ def square_root(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def reciprocal(x: Floats) -> Floats:
-    """Return an affine form [W] that encloses ``1 / x``. Needs ``low(x) > 0``.
+    """Return an affine form [W] (centre, slopes, remainder) that encloses ``1 / x``. Needs ``low(x) > 0``.
 
     On [a, b] it lies between its chord, with slope -1 / (a b), and the parallel tangent.
     """
@@ -150,7 +157,7 @@ def reciprocal(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def positive_part(x: Floats) -> Floats:
-    """Return an affine form [W] that encloses ``max(x, 0)``.
+    """Return an affine form [W] (centre, slopes, remainder) that encloses ``max(x, 0)``.
 
     The function lies between its chord and the parallel line through 0.
     """
@@ -166,7 +173,8 @@ def positive_part(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def cut(x: Floats, least: float, most: float) -> Floats:
-    """Return an affine form [W] of the same number as ``x``, which is known to lie between ``least`` and ``most``.
+    """Return an affine form [W] (centre, slopes, remainder) of the same number as ``x``, if that number is known to lie
+    between ``least`` and ``most``.
 
     The result is the form of that interval if the interval is tighter than ``x``, else ``x`` itself.
     """
@@ -209,7 +217,11 @@ class Forces(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """A box of worlds as affine forms [W], with the commands and the pieces (time intervals of constant command)."""
+    """A box of worlds as affine forms [W], with the commands and the pieces (time intervals of constant command).
+
+    An *affine form* stands for a number that depends on the world: a centre, a slope for each uncertain number of the
+    box, and a remainder.
+    """
 
     speed: Floats  # [N, W] speeds at the start of the first piece, m/s
     gap: Floats  # [P, W] gaps at the start of the first piece, m
@@ -230,8 +242,10 @@ class Cell(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Worlds of a box (``Cell``) that had the same sequence of impacts and contacts so far, with their present
-    state.
+    """Worlds of a box (``Cell``) that had the same sequence of impacts and contacts so far, with their present state.
+
+    An affine form [W] is a number that depends on the world: a centre, a slope for each uncertain number of the box,
+    and a remainder.
     """
 
     forms: Floats  # [N + P + 1, W] affine forms of the speeds (m/s), the gaps (m) and the harm so far (m2/s2)
@@ -239,13 +253,16 @@ class Path(NamedTuple):
     # Both speeds of a pair in contact are the speed of its centre of mass, and the gaps to its neighbours are measured
     # from there.
     touch: Floats
-    # [2 P + 1] first P: 1 if the pair had an impact, else 0; next P: the pair is FREE, TOUCHES or PARTS; last: index of
-    # the present piece
+    # [2 P + 1] first P: 1 if the pair had an impact, else 0; next P: the pair is FREE (not in contact), TOUCHES (in
+    # contact) or PARTS (it opens in the present piece); last: index of the present piece
     marks: Ints
 
 
 class Motion(NamedTuple):
-    """Motion of each vehicle, as if alone, through one piece (time interval of constant command)."""
+    """Motion of each vehicle, as if alone, through one piece (time interval of constant command).
+
+    Each [W] is an affine form: centre, a slope for each uncertain number of the box, remainder.
+    """
 
     pull: Floats  # [N, W] acceleration by the command, m/s2
     onward: Floats  # [N, W] speed at the end under the command alone, m/s, as if the vehicle never stopped
@@ -329,7 +346,7 @@ def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
     that it would have reached.
 
     Args:
-        speed: affine form [W] of the speed at the start of the piece, m/s.
+        speed: affine form [W] (centre, slopes, remainder) of the speed at the start of the piece, m/s.
         i: index of the vehicle.
         length: length of the piece (time interval of constant command), s.
         motion: motion of all vehicles in the piece; ``onward`` and ``reach`` of vehicle ``i`` are changed.
@@ -344,7 +361,9 @@ def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
 
 @compiled(apart=True)
 def between_shifted(x: Floats, shift: float) -> Floats:
-    """Return the affine form [W] of any number between the affine form ``x`` and ``x + shift``."""
+    """Return the affine form [W] (centre, slopes, remainder) of any number between the affine form ``x`` and ``x +
+    shift``.
+    """
     out = x.copy()
     add(out, 1.0, between(min(shift, 0.0), max(shift, 0.0), x.shape[0]))
     return out
@@ -414,7 +433,8 @@ def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def since(cell: Cell, i: int, time: float) -> Floats:
-    """Return for how long the command of vehicle ``i`` has acted at ``time``, as an affine form [W] in s, at least 0.
+    """Return for how long the command of vehicle ``i`` has acted at ``time``, as an affine form [W] (centre, slopes,
+    remainder), in s, at least 0.
 
     ``time`` counts from the first decision, in s. ``cell`` is the box of worlds.
     """
@@ -429,7 +449,7 @@ def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> 
 
     Args:
         moving: True if the command of any vehicle builds up.
-        speed: affine form [W] of the speed at the start of the piece, m/s.
+        speed: affine form [W] (centre, slopes, remainder) of the speed at the start of the piece, m/s.
         i: index of the vehicle.
         length: length of the piece (time interval of constant command), s.
         motion: receives ``rest``, ``speed`` and ``way`` of vehicle ``i``; its other fields are read.
@@ -451,7 +471,7 @@ def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> 
 
 @compiled(apart=True)
 def deceleration(pull: Floats, vague: float) -> Floats:
-    """Return the affine form [W] of the mean deceleration over any part of a piece, m/s2.
+    """Return the affine form [W] (centre, slopes, remainder) of the mean deceleration over any part of a piece, m/s2.
 
     Args:
         pull: affine form [W] of the mean acceleration in the piece (time interval of constant command), m/s2.

@@ -42,7 +42,9 @@ SLOWEST = 0.05  # below this mean closing speed (m/s) an impact is assumed possi
 
 
 class Approach(NamedTuple):
-    """The way a pair may come into contact within one piece (time interval of constant command), as affine forms."""
+    """The way a pair may come into contact within one piece (time interval of constant command), as affine forms
+    (centre, slopes, remainder).
+    """
 
     closing: Floats  # [W] closing speed at the start of the piece, m/s
     squared: Floats  # [W] squared closing speed at contact, m2/s2
@@ -52,8 +54,8 @@ class Approach(NamedTuple):
 
 @compiled(apart=True)
 def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
-    """Return by how much neighbouring pairs in contact may change the relative speed (m/s) or the gap (m) of pair
-    ``p``.
+    """Return by how much, at most, bounces of neighbouring pairs may change the relative speed (m/s) or the gap (m) of
+    pair ``p``.
 
     Args:
         cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of

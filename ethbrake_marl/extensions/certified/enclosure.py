@@ -64,7 +64,7 @@ class Known(NamedTuple):
 
 @compiled(apart=True)
 def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
-    """Return the affine form [K + 2] of one number of a box.
+    """Return the affine form [K + 2] (centre, slopes, remainder) of one number of a box.
 
     Args:
         low_: [Q] least values of the box.
@@ -400,7 +400,7 @@ def bound_box(
         known: the certain quantities.
         plan: [L] action of the shielded vehicle at each decision.
         enough: bound that needs no refinement, m2/s2.
-        cells: most parts to examine.
+        cells: largest number of parts to examine.
         only_enough: True: stop in a part once its harm is above ``enough``; a result above ``enough`` is then no bound.
 
     """
@@ -462,8 +462,8 @@ class Boxes(NamedTuple):
     def check_possible(robust: str, scenario: Scenario, harm_count: HarmCount, others: Mapping[int, Script]) -> None:
         """Raise ``InvalidInput`` for a setting that ``robust="interior"`` cannot certify in any world.
 
-        These are total harm, more than three vehicles, an obstacle ahead, and other vehicles that do anything else than
-        brake fully, coast, or hold one deceleration.
+        Such settings are: total harm; more than three vehicles; an obstacle ahead; another vehicle whose script is not
+        to brake fully, to coast, or to hold one deceleration.
 
         Args:
             robust: ``corners`` (never raises) or ``interior``.
@@ -580,7 +580,7 @@ class Boxes(NamedTuple):
             rows: [m] indices of the boxes.
             plans: [m, L] action of the shielded vehicle at each decision, for each box.
             enough: [m] bound that needs no refinement, m2/s2.
-            cells: most parts of a box to examine.
+            cells: largest number of parts of a box to examine.
             only_enough: True: a result above ``enough`` is no bound; it only says that no bound of at most ``enough``
                 was established.
 

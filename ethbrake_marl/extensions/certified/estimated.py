@@ -89,7 +89,8 @@ class Told(NamedTuple):
         return told
 
     def _hear_messages(self, worlds: Worlds, vehicle: int, periodic: Bools) -> None:
-        """Replace the present state of other vehicles by their newest message, except where they are in sight.
+        """Replace, in place, the present state of other vehicles by their newest message, except where they are in
+        sight.
 
         ``periodic`` [n] is True for worlds in which vehicles send messages periodically.
         """

@@ -119,7 +119,7 @@ class BelievedShield:
 
     @property
     def members(self) -> int:
-        """Number of certified worlds for each true world: 1 for the median, plus the number of corners."""
+        """Number of worlds that are certified for each true world: 1 for the median, plus 1 for each corner."""
         return 1 + len(self._corners())
 
     def __copy__(self) -> BelievedShield:

@@ -111,8 +111,8 @@ class Believing(AgentAround):
         return believed
 
     def _heard(self, worlds: Worlds, vehicle: int) -> Floats:
-        """Return flags [n, 2 N], 0 or 1: whether ``vehicle`` knows each vehicle, and whether that one sent that it
-        reacts.
+        """Return flags [n, 2 N], 0 or 1: whether ``vehicle`` knows each vehicle, and whether a message says that this
+        vehicle reacts already.
 
         Where a flag changes, the policy starts again. ``worlds`` are the true worlds now.
         """
@@ -127,7 +127,8 @@ class Believing(AgentAround):
 
 
 class BelievingHybrid(Believing):
-    """The paper's Algorithm 1 in the estimated world: the first decision chooses between the policy and E-V2X-BM.
+    """The paper's Algorithm 1 in the estimated world: the first decision chooses between the policy and E-V2X-BM, the
+    best constant deceleration.
 
     The one that predicts less harm controls the vehicle for the whole episode.
     """
@@ -140,8 +141,8 @@ class BelievingHybrid(Believing):
         return Knowledge.of(self.policy.policy, also=Source.BELIEFS)
 
     def _shown_at_first(self, believed: Worlds) -> Worlds:
-        """Return the estimated worlds with their clock at 0 and without past impacts, as the comparison's rollouts need
-        them.
+        """Return the estimated worlds with their clock at 0 and without past impacts, because the rollouts that compare
+        the policy with E-V2X-BM start there.
         """
         v, n = believed.vehicles, believed.n
         latency = np.maximum(v.latency_s - believed.time_s[:, np.newaxis], 0.0)

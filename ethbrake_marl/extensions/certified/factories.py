@@ -16,7 +16,8 @@ from ethbrake_marl.shield.factories import shield_episodes
 
 
 def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make the shield ``+robust`` or ``+robust:interior`` against the uncertainty of the settings.
+    """Make the shield ``+robust`` or ``+robust:interior`` around ``policy``: it certifies actions in the corners or the
+    whole interior of an uncertainty (an interval around each quantity).
 
     Args:
         policy: the agent to shield.
@@ -33,7 +34,8 @@ def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings
 
 
 def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make the shield ``+robust:believed`` or ``+robust:interior:believed``: robust against all that was not received.
+    """Make the shield ``+robust:believed`` or ``+robust:interior:believed``: the same shield for the ranges of what the
+    vehicle did not receive.
 
     Args:
         policy: the agent to shield.
@@ -66,7 +68,11 @@ def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: Ag
 
 
 def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """Make ``+episode:believed`` or ``+episode:pairwise:believed``: Algorithm 1 compares in the estimated world.
+    """Make the shield ``+episode:believed`` or ``+episode:pairwise:believed``: the paper's Algorithm 1 in the estimated
+    world.
+
+    At the first decision it predicts the harm of ``policy`` and of E-V2X-BM (the best constant deceleration) in that
+    world; the better one controls the whole episode.
 
     Raises ``InvalidInput`` for an agent that already decides on received information.
 
@@ -83,7 +89,8 @@ def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: 
 
 
 def make_estimating_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
-    """Make the agent ``e_v2x_bm:believed`` or ``e_v2x_bm:pairwise:believed``: E-V2X-BM in the estimated world.
+    """Make the agent ``e_v2x_bm:believed`` or ``e_v2x_bm:pairwise:believed``: E-V2X-BM (the best constant deceleration)
+    in the estimated world.
 
     ``argument`` is ``pairwise`` or None; ``settings`` hold the scenario.
     """

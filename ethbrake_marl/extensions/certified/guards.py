@@ -25,10 +25,10 @@ class RobustMode(IntEnum):
 
 
 class RobustGuard(StepGuard):
-    """Guard of mode ``robust``: connects a ``RobustShield`` with a running engine."""
+    """Guard of mode ``robust``: lets a ``RobustShield`` decide on the actions in each step of a running engine."""
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a step, with ``members``: the number of certified worlds for each world.
+        """Return the infos of a step as a mapping, with ``members``: the number of certified worlds for each world.
 
         Args:
             memory: shield and policies after the step.
@@ -39,8 +39,8 @@ class RobustGuard(StepGuard):
 
 
 class BelievedGuard(ShieldGuard):
-    """Guard of modes ``step`` and ``robust`` in the estimated world: connects a ``BelievedShield`` with a running
-    engine.
+    """Guard of modes ``step`` and ``robust`` in the estimated world: lets a ``BelievedShield`` decide on the actions in
+    each step of a running engine.
 
     Its bound on harm exists from the first decision on and holds in the estimated world. The motion is not compared
     with the prediction, because an estimate may be wrong without a fault of the system.
@@ -51,8 +51,7 @@ class BelievedGuard(ShieldGuard):
         return shield
 
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
-        """Return the shield's decision: the proposed actions, and the actions that it certifies in the estimated
-        worlds.
+        """Return the proposed actions and the actions to apply, which the shield certifies in the estimated worlds.
 
         Args:
             running: the engine before the step.
@@ -69,7 +68,7 @@ class BelievedGuard(ShieldGuard):
         return Ruling(proposed, applied, stepped_in, ~running.ended, after.decision, Guarded(after, memories))
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a step that is certified in the estimated worlds.
+        """Return, as a mapping, the infos of a step that is certified in the estimated worlds.
 
         ``trusted`` is true if the mode is ``robust``, so that the bound also says something about the true world.
         ``memory`` holds the shield after the step, ``ruling`` its decision (None at the reset).

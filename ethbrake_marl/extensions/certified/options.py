@@ -68,7 +68,9 @@ class RobustOptions(ShieldOptions):
 
     @property
     def written(self) -> str:
-        """The mode as written after the ``+`` of an agent spec, for instance ``robust:interior:believed``."""
+        """Text of the mode in an agent spec, after the ``+``: ``robust:interior:believed`` in
+        ``ppo+robust:interior:believed``.
+        """
         robust = "" if self.robust == CORNERS else f":{self.robust}"
         return f"{self.mode}{robust}{':believed' if self.believed else ''}"
 
@@ -113,7 +115,7 @@ class RobustOptions(ShieldOptions):
             engine: the engine whose learners are shielded.
             policies: agents that propose the actions, by vehicle index.
             several: True: one shield for several learners.
-            how: further keywords of the guard.
+            how: further keyword arguments of ``StepGuard``.
 
         """
         scenario, scripts, where = as_scenario(engine.scenario), engine.scripts, self.where

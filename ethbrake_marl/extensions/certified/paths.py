@@ -85,7 +85,8 @@ def new_stack(N: int, width: int) -> Stack:
 
 @compiled(apart=True)
 def keep_worst(harm: Floats, worst: float, out: Floats) -> float:
-    """Return the larger of ``worst`` and the largest value of the affine form ``harm`` [W], m2/s2.
+    """Return the larger of ``worst`` and the largest value of the affine form ``harm`` [W] (centre, slopes, remainder),
+    m2/s2.
 
     If ``harm`` reaches a new maximum, it is copied to ``out`` [W].
     """
@@ -97,7 +98,9 @@ def keep_worst(harm: Floats, worst: float, out: Floats) -> float:
 
 @compiled(apart=True)
 def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
-    """Record the rough bound on the harm of a path that is not followed any further; return the new ``worst``.
+    """Record a bound on the harm of a path that is not followed any further; return the largest harm recorded so far.
+
+    The bound is ``rough_harm``, which uses only the largest speeds that are still possible.
 
     Args:
         cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
@@ -114,10 +117,12 @@ def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
 def branch(
     cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, how: Approach, worst: float, out: Floats
 ) -> float:
-    """Handle the worlds in which pair ``p`` has an impact in the present piece; return the new ``worst``.
+    """Record the harm of the worlds in which pair ``p`` has an impact in the present piece, or follow them as a new
+    path.
 
-    If their harm is final it is recorded, else they become a path of their own. Where that path cannot be followed, the
-    rough bound is recorded instead.
+    If no other impact can follow, their harm is final and recorded. Else they are put on the stack as a path of their
+    own. Where that path cannot be followed, ``rough_harm`` is recorded instead: a bound from the largest speeds that
+    are still possible. Returns the largest harm recorded so far.
 
     Args:
         cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
@@ -162,7 +167,8 @@ def branch(
 
 @compiled(apart=True)
 def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
-    """Record the affine form ``harm`` [W], to which at most ``rest`` (m2/s2) will be added; return the new ``worst``.
+    """Record the affine form ``harm`` [W] (centre, slopes, remainder), to which at most ``rest`` (m2/s2) will be added;
+    return the largest harm recorded, m2/s2.
 
     ``worst`` is the largest harm recorded so far; ``out`` [W] receives the affine form of a new largest harm.
     """
@@ -212,7 +218,8 @@ def strike(
 ) -> bool:
     """Put the worlds in which pair ``p`` has its impact in the present piece on the stack as a new path.
 
-    Returns False if this path cannot be followed.
+    Returns False, and puts nothing on the stack, if the stack is full or the rear vehicle may move backwards
+    (``thrown_back``).
 
     Args:
         cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
@@ -516,7 +523,10 @@ def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
 
 @compiled(apart=True)
 def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
-    """Handle all pairs that are, or may come, into contact in the present piece. Return the new ``worst``.
+    """Move the pairs in contact through the present piece, and branch off the worlds in which a pair has an impact.
+
+    Pairs in contact move as one from here on, or separate. The worlds with an impact are recorded or put on the stack
+    (``branch``). Returns the largest harm recorded so far.
 
     Args:
         cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
@@ -572,7 +582,7 @@ def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out
 
 @compiled(apart=True)
 def go_on(cell: Cell, path: Path, motion: Motion) -> bool:
-    """Advance the path to the end of the present piece without an impact. Return False if no world can do so.
+    """Advance the path to the end of the present piece without an impact. Return False if every world has an impact.
 
     Args:
         cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of

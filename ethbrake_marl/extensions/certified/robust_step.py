@@ -80,12 +80,14 @@ class RobustShield(StepShield):
     def _bound_at_alert(
         self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
     ) -> tuple[Floats, Boxes | None]:
-        """Return the bound on the harm of each plan at the alert, [m] m2/s2, and the boxes of all episodes (or None).
+        """Return the bound on the harm of each plan at the alert, [m] m2/s2, and the boxes of all episodes (None in
+        corners mode).
 
-        In interior mode the bound covers all worlds of each box, else the members only.
+        In interior mode the bound covers all worlds of each box, else only its members (the reported world and the
+        corners of its box).
 
         Args:
-            possible: [m * M] members of the new worlds.
+            possible: [m * M] members of the new worlds, M consecutive ones for each.
             problem: the same worlds as columns of numbers.
             rows: [m] indices of the new episodes.
             plan: [m, L] action at each decision.
@@ -103,7 +105,7 @@ class RobustShield(StepShield):
         """Return the decision; in interior mode, plans that are not certified for all worlds of their box are replaced.
 
         Args:
-            now: state of the members before the decision.
+            now: state of the members (the corners of the boxes) before the decision.
             memory: memory of the shield.
             budget: [n] largest harm that a new plan may have, m2/s2.
             decision: the decision, certified in the members only.
@@ -114,8 +116,8 @@ class RobustShield(StepShield):
         return decision if boxes is None else certify_inside(boxes, now, memory.backup, budget, decision, asked)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Return a mask [n] of the worlds that may leave the range spanned by their members, now in the states
-        ``running``.
+        """Return a mask [n] of the worlds that may leave the range spanned by their members (the reported world and the
+        corners of its uncertainty), now in the states ``running``.
 
         Besides the worlds of ``StepShield``: worlds whose own latency is uncertain, because a decision then falls at a
         different time in each world of the box, and all worlds if one uncertain number moves several quantities
@@ -141,8 +143,8 @@ def certify_inside(
         held: plans and bounds from before the decision.
         budget: [n] largest harm that a new plan may have, m2/s2.
         decision: the decision, certified in the corners only.
-        asked: [n] True for episodes that decide now. They end at the horizon only, because a box may hold moving worlds
-            when all its corners are at rest.
+        asked: [n] True for episodes that decide now. Such an episode counts as ended only at the horizon, because a box
+            may hold moving worlds when all its corners are at rest.
 
     """
     plan, other = decision.backup.plan.copy(), (decision.backup.plan != held.plan).any(axis=1)

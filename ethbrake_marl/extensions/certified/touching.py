@@ -48,7 +48,8 @@ UNEVEN = 3.0  # largest ratio of closing to separating speed of a flight for the
 
 @compiled(apart=True)
 def common(cell: Cell, p: int, front: Floats, rear: Floats) -> Floats:
-    """Return the value of the centre of mass of pair ``p`` (speed, acceleration or distance) as an affine form [W].
+    """Return the value of the centre of mass of pair ``p`` (speed, acceleration or distance) as an affine form [W]
+    (centre, slopes, remainder).
 
     ``front`` and ``rear`` are the values of the two vehicles; ``cell`` holds their shares of the mass.
     """
@@ -152,7 +153,7 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
         cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
             constant command).
         path: worlds of the box that had the same impacts so far; changed in place.
-        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        motion: motion of each vehicle in the present piece, as if alone (``move_alone``); changed in place.
         p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         length: length of the piece, s.
 
@@ -244,11 +245,14 @@ def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, har
 
 @compiled(apart=True)
 def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
-    """Update pair ``p`` in contact if its affine form stands: each of its worlds stands, or creeps and is braked.
+    """Update pair ``p``, which is in contact, over a piece in which the affine form of its speed stands at 0.
+
+    In each world either both vehicles stand, or the world *creeps* and the brakes slow it. A world creeps if one
+    vehicle of the pair stands or moves backwards.
 
     The brakes b reduce the rear vehicle's speed. The front vehicle's speed is at most ``faster`` times the rear one's.
 
-    A world creeps if one vehicle of the pair stands or moves backwards.
+    The motion of the pair in ``path`` and ``motion`` is changed in place.
 
     Args:
         cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
@@ -402,13 +406,16 @@ def settle(touch: Floats, e: float, length: float) -> None:
 
 @compiled(apart=True)
 def is_blurred(path: Path, motion: Motion, N: int, p: int, length: float) -> bool:
-    """Return whether pair ``p`` may meet again at such a wide range of times that it is better treated as in contact.
+    """Return whether the gap of pair ``p`` is too uncertain to follow a further impact in this piece.
+
+    That is so if the uncertainty of the gap exceeds the distance that the pair can close in the piece. The pair is then
+    treated as in contact from the start of the piece.
 
     Args:
         path: worlds of the box that had the same impacts so far.
         motion: motion of each vehicle in the present piece (time interval of constant command).
         N: number of vehicles.
-        p: index of the pair.
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         length: length of the piece, s.
 
     """

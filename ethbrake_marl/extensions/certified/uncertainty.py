@@ -109,7 +109,9 @@ class Uncertainty:
 
     @property
     def moves_together(self) -> bool:
-        """True if one uncertain number changes several quantities; gaps and speeds are then not extreme in corners."""
+        """True if one uncertain number (friction) changes several quantities; gaps and speeds are then not extreme in
+        corners.
+        """
         return any(each.quantity == "friction" and each.half_width > 0.0 for each in self.intervals)
 
     def members(self, worlds: Worlds) -> Worlds:

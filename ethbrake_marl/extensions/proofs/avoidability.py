@@ -63,9 +63,9 @@ def drive_before_braking(
     """Return how long a vehicle may drive with constant ``u >= 0`` so that full braking still keeps it behind the
     leader.
 
-    Returns its duration, the time at which the gap becomes 0, and whether both vehicles move at that time (then ``a_f >
-    a_l`` and the speeds are equal; else the follower stops at the standing leader). Infinite if the follower never
-    moves. Assumes ``spare_gap >= 0``.
+    Returns the duration of the drive (s), the time at which the gap becomes 0 (s), and whether both vehicles move at
+    that time (then ``a_f > a_l`` and the speeds are equal; else the follower stops at the standing leader). Both times
+    are infinite if the follower never moves. Assumes ``spare_gap >= 0``.
 
     Args:
         gap: gap to the leader (the vehicle in front, which brakes from now on), m.
@@ -222,8 +222,9 @@ def plan_behind(
         limit: [N] speed limits, m/s.
         i: index of the controlled vehicle.
         keep: distance to keep to the front vehicle, m.
-        plan: [2, PIECES] receives the trajectory as a braking profile.
-        out: [RESULT_WIDTH] receives columns DRIVE, TOUCH and FOLLOW.
+        plan: [2, PIECES] receives the trajectory: ends (s) and accelerations (m/s2) of its pieces.
+        out: [RESULT_WIDTH] receives columns DRIVE (s; end of the drive), TOUCH (s; end of the full braking after it)
+            and FOLLOW (m/s2; the command after that).
 
     """
     a_f, u = braking[i], driving[i]
@@ -323,7 +324,7 @@ def decide_worlds(
         driving: [n, N] driving capacities, m/s2.
         limit: [n, N] speed limits, m/s.
         i: index of the controlled vehicle.
-        out: [n, RESULT_WIDTH] receives columns REASON to FOLLOW.
+        out: [n, RESULT_WIDTH] receives the verdicts, columns REASON to FOLLOW as in ``decide_world``.
 
     """
     plan, rear = empty_plan(), empty_plan()

@@ -39,7 +39,7 @@ def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
     Args:
         kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
             brake build-up).
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
 
@@ -57,7 +57,7 @@ def decision_around(at: Floats, early: float, late: float) -> tuple[float, float
     """Return start and end (s) of the decision step that holds both ``early`` and ``late``.
 
     Returns ``late`` twice if there are no decision steps, or if the times lie in more than one step. ``at`` is one
-    world (columns of ``line.LINE``).
+    world, an array with the columns of ``line.LINE``.
     """
     step = at[LINE.TIME_STEP]
     if step <= 0.0:
@@ -70,15 +70,16 @@ def decision_around(at: Floats, early: float, late: float) -> tuple[float, float
 
 @compiled(apart=True)
 def lacking(kind: int, at: Floats, early: float, late: float, softest: float, hard: float, begin: float) -> float:
-    """Return how far the command in force at a first contact is from the best command after it, at least, in m/s2.
+    """Return a lower bound (m/s2) on how far the command during a first contact is from the best command after it.
 
-    Before a gentle contact the vehicle brakes (drives); to soften what follows it drives (brakes) after it. The command
-    is the same in the whole decision step, so it cannot do both.
+    If the front vehicle is met first, the vehicle brakes before a gentle contact, and drives after it to soften the
+    impact from behind. If the rear vehicle is met first, it drives before and brakes after. The command is the same in
+    the whole decision step, so it cannot do both.
 
     Args:
         kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
             brake build-up).
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         softest: least closing speed of the contact, m/s.
@@ -113,7 +114,7 @@ def harm_of(
     Args:
         kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
             brake build-up).
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         soft: least closing speed of the contact, m/s.
@@ -201,14 +202,14 @@ def divide(
 ) -> tuple[int, float]:
     """Replace the first entry of the heap, a range of times and closing speeds of first contacts, by its halves.
 
-    Returns the new number of entries, and the harm (m2/s2) of one contact inside.
+    Returns the new number of entries, and a harm (m2/s2) that some contact in the range does not exceed.
 
     Args:
         kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
             brake build-up).
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         floor: known lower bound on the harm at the other pair, m2/s2.
-        count: number of cells on the heap.
+        count: number of entries on the heap.
         plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
         other: further working memory of the same kind.
         heap: working memory of the search, [CELLS, NEAR].
@@ -247,12 +248,13 @@ def least_harm(
     Args:
         kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
             brake build-up).
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         first: earliest time of the contact, s after the controlled vehicle may act.
         last: latest time of the contact, s.
         floor: known lower bound on the harm at the other pair, m2/s2.
-        best: harm that is possible in any case, m2/s2.
-        enough: if some contact does no more harm than this (m2/s2), 0 is returned, because this is proven elsewhere.
+        best: result if no contact does less harm, m2/s2.
+        enough: if some contact does no more harm than this (m2/s2), 0 is returned, because a bound of ``enough`` is
+            proven elsewhere.
         plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
         other: further working memory of the same kind.
         heap: working memory of the search, [CELLS, NEAR].
@@ -287,7 +289,7 @@ def next_split(kind: int, at: Floats, time: float, last: float) -> float:
     """Return the next time (s) at which a decision is due or the front vehicle comes to rest, at most ``last``.
 
     With brake build-up it is at most ``_PART_S`` later than ``time``. ``kind`` is the kind of contact (``FRONT_FIRST``,
-    ...), ``at`` one world (columns of ``line.LINE``).
+    ...), ``at`` one world, an array with the columns of ``line.LINE``.
     """
     until = last if kind < RAMPED_FRONT else min(last, time + _PART_S)
     if at[LINE.TIME_STEP] > 0.0:

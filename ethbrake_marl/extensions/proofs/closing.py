@@ -23,7 +23,7 @@ FOLLOWER_V, FOLLOWER_ONSET, FOLLOWER_A, PAIR_WIDTH = range(7, 11)
 
 @compiled(apart=True)
 def least_on_piece(constant: float, pressing: float, since: float, until: float) -> float:
-    """Return the least value of ``constant / t + pressing t / 2`` for ``t`` from ``since`` to ``until``."""
+    """Return the least value of ``(constant / t) + (pressing * t / 2)`` for ``t`` from ``since`` to ``until``."""
     least = constant / until + 0.5 * pressing * until
     if since > 0.0:
         least = min(least, constant / since + 0.5 * pressing * since)
@@ -40,8 +40,8 @@ def least_on_piece(constant: float, pressing: float, since: float, until: float)
 def least_before(at: Floats, met: float, squared: float) -> float:
     """Return the least closing speed (m/s) of a pair's first contact until ``met``, for a leader that follows a script.
 
-    At time t the closing speed is at least ``c(t) + g(t) / t``: the closing speed of the extreme motions, and what must
-    be added to it to use up their gap by then.
+    At time t the closing speed is at least ``c(t) + (g(t) / t)``. Here c and g are closing speed and gap of the extreme
+    motions, and ``g(t) / t`` is the speed that must be added to close the gap by then.
 
     Args:
         at: [PAIR_WIDTH] one pair, columns ``PAIR_GAP`` to ``FOLLOWER_A``.

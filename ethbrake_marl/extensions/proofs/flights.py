@@ -19,7 +19,7 @@ def flight_lead(share: float, press: float, reach: float, opening: float, flight
 
     A *flight* is a time in which the two vehicles are apart. For length L and opening speed o the lead over the common
     speed is ``share (press L - o) - G``. G is the least loss of command, at most ``reach`` per second, that keeps the
-    two apart for L: ``G L - G^2 / 2 reach >= press L^2 / 2 - o L``. Returns -inf if nothing keeps them apart.
+    two apart for L: ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o L``. Returns -inf if nothing keeps them apart.
 
     Args:
         share: partner's share of both masses, 0 to 1.
@@ -127,11 +127,14 @@ def largest_lead(
     share: float, press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float,
     since: float, until: float,
 ) -> float:  # fmt: skip
-    """Return by how much (m/s), at most, the controlled vehicle is faster than the common speed of both vehicles
-    (without loss).
+    """Return an upper bound (m/s) on how much faster the controlled vehicle is than the speed of both vehicles' centre
+    of mass.
 
-    The last time apart before the meeting with the rear vehicle began with the first impact, within the window from
-    ``late`` to ``end``, or after it.
+    Both vehicles have met already. The centre of mass is the one that the best command alone would lead to. In the
+    *window* an earlier command still acts instead, which costs the speed ``lost``.
+
+    The bound covers three cases: the last time apart before the meeting with the other neighbour began with the first
+    impact, within the window, or after it.
 
     Args:
         share: partner's share of both masses, 0 to 1.
@@ -142,7 +145,7 @@ def largest_lead(
         lost: speed that is lost in the window, m/s.
         late: start of the window, s.
         end: end of the window, s.
-        since: earliest time of the meeting with the rear vehicle, s.
+        since: earliest time of the meeting with the other neighbour, s.
         until: latest time of that meeting, s.
 
     """

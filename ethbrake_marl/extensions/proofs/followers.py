@@ -48,16 +48,16 @@ def least_closing(
     start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, share: float,
     press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float, until: float,
 ) -> float:  # fmt: skip
-    """Return the least closing speed (m/s) between the controlled vehicle and its other neighbour, after one it met
+    """Return the least closing speed (m/s) at which the controlled vehicle meets its second neighbour, after it met the
     first.
 
-    The *common speed* is the speed of the centre of mass of the two vehicles that met first. From the closing speed at
-    the common speed, the largest possible lead of the controlled vehicle over it is subtracted. Time is divided at one
-    of a few moments, because a loss of speed in the window counts only after it. Times count from the first contact, in
-    s.
+    The *common speed* is the speed of the centre of mass of the two vehicles that met first. The result is the closing
+    speed that the second neighbour has to this centre, less the largest lead of the controlled vehicle over it
+    (``largest_lead``). The *window* is the time in which an earlier command still acts, which costs the speed ``lost``.
+    Times count from the first contact, in s.
 
     Args:
-        start: closing speed at the common speed, at the first contact, m/s.
+        start: closing speed of the second neighbour to the centre of mass, at the first contact, m/s.
         slope: its rate of change, m/s2.
         turn: first time at which the rate changes, s.
         bend: change of the rate at ``turn``, m/s2.
@@ -94,12 +94,11 @@ def pushed_by_leader(
 ) -> float:
     """Return the least closing speed (m/s) at the rear pair after a first contact with the front vehicle (leader).
 
-    The bound follows from the centre of mass of leader and controlled vehicle. Returns 0 if nothing is proven. A
-    standing leader stays in place, so a later first contact with it differs only in time; the window with the loss is
-    then not used.
+    The bound follows from the centre of mass of leader and controlled vehicle. Returns 0 if nothing is proven. If the
+    leader stands, a later first contact differs only in its time, so ``late``, ``end`` and ``lack`` are not used.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         closing: largest closing speed of the contact, m/s.
@@ -145,7 +144,7 @@ def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: 
     The controlled vehicle then stays near the leader (front vehicle). Returns 0 if nothing is proven.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         closing: largest closing speed of the contact, m/s.
@@ -193,11 +192,11 @@ def after_front(
 ) -> float:
     """Return the least squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
 
-    The arguments from the centre of mass do not hold if an obstacle may throw both vehicles back; they are then left
-    out.
+    It is the largest of several bounds. Those that rest on the centre of mass of both vehicles do not hold if an
+    obstacle may throw them back, and are then left out.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         closing: largest closing speed of the contact, m/s.
@@ -230,13 +229,13 @@ def after_front(
 
 @compiled
 def obstacle_harm(at: Floats, late: float, closing: float) -> float:
-    """Return the least squared speed (m2/s2) at which the front vehicle hits the obstacle after the controlled one
+    """Return the least squared speed (m2/s2) at which the front vehicle hits the obstacle after the controlled vehicle
     pushed it.
 
     Only its own brakes slow it. Returns 0 if it already stands at the obstacle, because all three are then one cluster.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         late: latest time of the first contact, s.
         closing: least closing speed of the push, m/s.
 
@@ -288,10 +287,11 @@ def pushed_by_rear(
 ) -> float:  # fmt: skip
     """Return the least closing speed (m/s) at the front pair after the rear vehicle hit the controlled one.
 
-    The bound follows from the centre of mass of these two vehicles. Needs ``a_f >= a_r``.
+    The bound follows from the centre of mass of these two vehicles. The controlled vehicle must have brakes at least as
+    strong as the rear one.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         closing: largest closing speed of the contact, m/s.
@@ -326,11 +326,11 @@ def pushed_by_rear(
 def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: Floats, other: Floats) -> float:
     """Return the least closing speed (m/s) at the front pair after the rear vehicle hit the controlled one.
 
-    The bound follows because the controlled vehicle stays ahead of the rear one. Needs ``a_f >= a_r``. Returns 0 if the
-    closing speed may rise.
+    The bound follows because the controlled vehicle stays ahead of the rear one. The controlled vehicle must have
+    brakes at least as strong as the rear one. Returns 0 if the closing speed may rise.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         closing: largest closing speed of the contact, m/s.
         gap: gap to the front vehicle at ``early``, m.

@@ -62,7 +62,7 @@ def behind_full_braking(at: Floats, early: float, late: float) -> float:
     """Return the least gap (m) to the rear vehicle if the controlled vehicle brakes until ``early``, the rear one until
     ``late``.
 
-    ``at`` is one world (columns of ``line.LINE``); the times are in s.
+    ``at`` is one world, an array with the columns of ``line.LINE``; the times are in s.
     """
     return float(
         at[LINE.GAP_R] + solo_motion(at[LINE.V_F], -at[LINE.A_F], 0.0, math.inf, early)[1] - follower(at, late)[1]
@@ -72,10 +72,10 @@ def behind_full_braking(at: Floats, early: float, late: float) -> float:
 @compiled
 def soft_behind(at: Floats, early: float, late: float, near: float, far: float, since: float, power: float) -> float:
     """Return the least closing speed (m/s) of the first contacts with the rear vehicle in a range of times and
-    distances.
+    distances (``near`` to ``far``).
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         near: least distance by which the rear vehicle has come further than by full braking, m.
@@ -102,7 +102,7 @@ def after_behind(
     these contacts.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         near: least distance by which the rear vehicle has come further than by full braking, m.
@@ -146,14 +146,15 @@ def put_behind(
     Returns the new number of entries on the heap.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         near: least distance by which the rear vehicle has come further than by full braking, m.
         far: largest such distance, m.
         soft: least closing speed, m/s.
         hard: largest closing speed, m/s.
-        search: [SEARCH] columns ``SINCE``, ``POWER``, ``FLOOR`` and ``BEST`` (least harm so far).
+        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
+            m2/s2) and ``BEST`` (least harm known so far, m2/s2).
         count: number of entries on the heap.
         moved: working memory for a second world, [LINE.WIDTH].
         plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
@@ -187,11 +188,12 @@ def try_behind(
     less.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         time: time of the contact, s.
         near: distance by which the rear vehicle has come further than by full braking, m; raised if too small.
         far: largest such distance, m.
-        search: [SEARCH] columns ``SINCE``, ``POWER``, ``FLOOR`` and ``BEST``; the last one changes.
+        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
+            m2/s2) and ``BEST`` (least harm known so far, m2/s2); only ``BEST`` changes.
         moved: working memory for a second world, [LINE.WIDTH].
         plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
         other: further working memory of the same kind.
@@ -215,8 +217,9 @@ def divide_behind(
     An entry is a range of times, distances and closing speeds of first contacts with the rear vehicle.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
-        search: [SEARCH] columns ``SINCE``, ``POWER``, ``FLOOR`` and ``BEST``; the last one may fall.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
+            m2/s2) and ``BEST`` (least harm known so far, m2/s2); only ``BEST`` changes.
         count: number of entries on the heap.
         moved: working memory for a second world, [LINE.WIDTH].
         plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
@@ -256,9 +259,10 @@ def meetings_behind(
     The result is at most ``search[BEST]``, the least harm that is known before.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         last: latest time of the contact, s after the controlled vehicle may act.
-        search: [SEARCH] columns ``SINCE``, ``POWER``, ``FLOOR`` and ``BEST``; the last one may fall.
+        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
+            m2/s2) and ``BEST`` (least harm known so far, m2/s2); only ``BEST`` changes.
         moved: working memory for a second world, [LINE.WIDTH].
         plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
         other: further working memory of the same kind.

@@ -35,12 +35,13 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(apart=True)
 def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Floats, other: Floats) -> float:
-    """Return the least harm (m2/s2) if front and rear vehicle meet with the controlled one between them; else infinity.
+    """Return the least harm (m2/s2) of a contact of all three vehicles at the same time; infinity if there can be none.
 
-    The closing speed of the front pair is at least the least of its first contacts; the rear pair has the rest.
+    Front and rear vehicle then close with at least some speed W, which the two pairs share. The front pair's part of W
+    is at least its least closing speed of any first contact.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         first: earliest first contact with the front vehicle, s.
         last: latest first contact with the front vehicle, s.
         pair: working memory for a pair, [PAIR_WIDTH].
@@ -70,7 +71,7 @@ def late_meetings(at: Floats, first: float, stand: float, plan: Floats, other: F
     is proven.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         first: earliest first contact with the front vehicle, s; infinite: none.
         stand: time at which the rear vehicle stands by full braking, s.
         plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
@@ -102,7 +103,7 @@ def combined_bound_of_team(
     Returns 0 if the harm may come after ``until``.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         until: horizon, s; harm after it does not count.
         front: bound on the harm of the front pair alone, m2/s2.
         rear: bound on the harm of the rear pair alone, m2/s2.
@@ -148,7 +149,7 @@ def bound_threes(states: Floats, until: Floats, pairs: Floats, since: Floats, po
     """Compute the combined bound of the first three vehicles for each of ``n`` worlds with unavoidable contact.
 
     Args:
-        states: [n, LINE.WIDTH] the worlds, as the columns of ``line.LINE``.
+        states: [n, LINE.WIDTH] the worlds, one row each, with the columns of ``line.LINE``.
         until: [n] horizon, s.
         pairs: [n, 2] bounds of the two pairs alone, m2/s2.
         since: [n] time from which on the rear vehicle may hold back its brakes, s.

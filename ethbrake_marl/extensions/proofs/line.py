@@ -62,7 +62,7 @@ AHEAD_M = 1e-9  # tolerance: a smaller overlap is no meeting with the other vehi
 def leader(at: Floats, time: float) -> tuple[float, float]:
     """Return speed (m/s) and distance (m) of the front vehicle at ``time`` (s) if nobody touches it.
 
-    ``at`` is one world (columns of ``LINE``).
+    ``at`` is one world, an array with the columns of ``LINE``.
     """
     speed, way, _ = solo_motion(at[LINE.V_L], -at[LINE.A_L], 0.0, math.inf, time)
     return speed, way
@@ -72,7 +72,7 @@ def leader(at: Floats, time: float) -> tuple[float, float]:
 def follower(at: Floats, time: float) -> tuple[float, float]:
     """Return speed (m/s) and distance (m) of the rear vehicle at ``time`` (s) if nobody touches it.
 
-    ``at`` is one world (columns of ``LINE``).
+    ``at`` is one world, an array with the columns of ``LINE``.
     """
     speed, way, _ = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, time)
     return speed, way

@@ -63,10 +63,10 @@ _PARTS = 8  # number of parts into which the times of soft meetings are divided
 def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
     """Return the least squared closing speed (m2/s2) at the rear pair's first contact, and its latest time (s).
 
-    Both belong to full drive of the controlled vehicle.
+    The controlled vehicle reaches both by full drive.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
         other: further working memory of the same kind.
 
@@ -86,7 +86,7 @@ def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) ->
     Args:
         kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
             brake build-up).
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         time: time of the contact, s after the controlled vehicle may act.
         plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
         other: further working memory of the same kind.
@@ -102,12 +102,14 @@ def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, o
     """Return the latest time (s) of a first contact with one neighbour at which the other neighbour has not arrived
     yet.
 
-    The later the contact, the shorter the drive (the braking) before it, and the less room behind (ahead).
+    It is found by halving the time, because a later contact leaves less room. A later contact with the front vehicle
+    needs a shorter drive before it, so the rear vehicle comes nearer. A later contact with the rear vehicle needs
+    shorter braking, so the front vehicle comes nearer.
 
     Args:
         kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
             brake build-up).
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         first: time of a first contact at which there is room, s.
         last: latest time of a first contact with this neighbour, s; the result is at most this.
         plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
@@ -133,7 +135,7 @@ def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple
     The third result says whether the front vehicle may be met first arbitrarily late and softly.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         first: earliest contact with the front vehicle, s.
         plan: working memory, from ``empty_plan``.
         other: further working memory of the same kind.
@@ -159,7 +161,7 @@ def front_first(
     closing speed at that time. This case counts only if the front vehicle can be met that late.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         floor: known lower bound on the harm at the other pair, m2/s2.
         best: least harm of a first contact that is known so far, m2/s2.
         enough: if some contact does no more harm than this (m2/s2), 0 is returned at once.
@@ -206,7 +208,7 @@ def soft_harm(
     Args:
         kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
             brake build-up).
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         floor: known lower bound on the harm at the other pair, m2/s2.
@@ -233,7 +235,7 @@ def rear_first(
     """Return the least harm (m2/s2), if below ``best``, where the rear vehicle is met first.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         floor: known lower bound on the harm at the other pair, m2/s2.
         best: least harm of a first contact that is known so far, m2/s2.
         enough: if some contact does no more harm than this (m2/s2), 0 is returned at once.
@@ -277,7 +279,7 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
     controlled vehicle by b, it was faster by ``b t`` at time t before the contact, from its onset on.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         rest: time at which the controlled and the rear vehicle stand by full braking, s.
         plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
         other: further working memory of the same kind.
@@ -299,10 +301,10 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def last_rest(at: Floats) -> tuple[float, float]:
-    """Return the time (s) by which all harm has happened if all brake, and the time (s) at which the rear vehicle
-    stands.
+    """Return the time (s) by which all harm has happened if all vehicles brake, and the time (s) at which the rear
+    vehicle stands.
 
-    ``at`` is one world (columns of ``line.LINE``).
+    ``at`` is one world, an array with the columns of ``line.LINE``.
     """
     stand = at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
     way = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, stand)[1]
@@ -320,7 +322,7 @@ def combined_bound(
     Returns 0 if the harm may come after ``until``.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         until: horizon, s; harm after it does not count.
         front: bound on the harm of the front pair alone, m2/s2.
         rear: bound on the harm of the rear pair alone, m2/s2.
@@ -349,7 +351,7 @@ def bound_worlds(
     """Compute lower bounds on the harm of ``n`` worlds: of each pair alone, and of both together.
 
     Args:
-        states: [n, LINE.WIDTH] the worlds, as the columns of ``line.LINE``.
+        states: [n, LINE.WIDTH] the worlds, one row each, with the columns of ``line.LINE``.
         until: [n] horizon, s.
         has_front: [n] True if the front pair exists and its next impact counts.
         has_rear: [n] True if the rear pair exists and its next impact counts.
@@ -392,8 +394,9 @@ def lower_bound(
 ) -> LowerBound:
     """Return a proven lower bound on the harm of every world, over all commands of one vehicle.
 
-    ``harm = early + max(front_pair + rear_pair, combined)``, each part rounded outward (``rounding``). The combined
-    bound is 0 where contact can be avoided. Harm that may come only after the horizon counts as 0.
+    ``harm = early + max((front_pair + rear_pair), combined)``, each part lowered by the largest possible rounding error
+    (``rounding``). The combined bound is 0 where contact can be avoided. Harm that may come only after the horizon
+    counts as 0.
 
     With brake build-up the bound holds for any command at any time and is looser. It has no verdict on contact:
     ``contact`` is None if brakes build up in any of the worlds.

@@ -29,7 +29,8 @@ def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
     """Return the least closing speed (m/s) of a contact with the front vehicle at ``time``, and how long to drive first
     (s).
 
-    The slowest way to be there at that time is to drive, then to brake. ``at`` is one world (columns of ``line.LINE``).
+    The slowest way to be there at that time is to drive, then to brake. ``at`` is one world, an array with the columns
+    of ``line.LINE``.
     """
     v_l, way = leader(at, time)
     place, v, u, a = at[LINE.GAP_L] + way, at[LINE.V_F], at[LINE.U_F], at[LINE.A_F]
@@ -53,7 +54,7 @@ def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, fl
     """Return distance (m) and speed (m/s) of the controlled vehicle at ``time`` if it brakes for ``brake`` s, then
     drives.
 
-    It brakes at most to rest. ``at`` is one world (columns of ``line.LINE``).
+    It brakes at most to rest. ``at`` is one world, an array with the columns of ``line.LINE``.
     """
     v, u, a = at[LINE.V_F], at[LINE.U_F], at[LINE.A_F]
     braking = min(brake, v / a)
@@ -72,7 +73,7 @@ def braking_to_rear(at: Floats, time: float, further: float) -> float:
     ``time``.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         time: time of the contact, s after the controlled vehicle may act.
         further: by how much the rear vehicle has come further than by full braking, m.
 
@@ -94,7 +95,7 @@ def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
     (s).
 
     The fastest way to be there at that time is to brake, then to drive. The braking is infinite if the vehicle is then
-    at its speed limit. ``at`` is one world (columns of ``line.LINE``).
+    at its speed limit. ``at`` is one world, an array with the columns of ``line.LINE``.
     """
     brake = braking_to_rear(at, time, 0.0)
     speed = braked_then_driven(at, brake, time)[1]
@@ -110,7 +111,7 @@ def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
     Args:
         kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
             brake build-up).
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         time: time of the contact, s after the controlled vehicle may act.
 
     """
@@ -127,7 +128,7 @@ def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
     Infinite if they never meet.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         drive: duration of the drive, s; infinite: drive all the time.
         plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
         other: further working memory of the same kind.
@@ -146,7 +147,7 @@ def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
     Infinite if they never meet.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         brake: duration of the braking, s.
         plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
         other: further working memory of the same kind.
@@ -165,7 +166,7 @@ def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Flo
     brakes.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         drive: duration of the drive, s.
         until: end of the comparison, s.
         plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
@@ -183,7 +184,7 @@ def stays_behind(at: Floats, brake: float, until: float, plan: Floats, other: Fl
     drives.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         brake: duration of the braking, s.
         until: end of the comparison, s.
         plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).

@@ -41,7 +41,7 @@ def all_three(at: Floats) -> tuple[float, float, float, float]:
     (m/s2).
 
     Masses are in units of the controlled vehicle's mass. The fourth result is the part of that deceleration that comes
-    from the rear vehicle (m/s2). ``at`` is one world (columns of ``line.LINE``).
+    from the rear vehicle (m/s2). ``at`` is one world, an array with the columns of ``line.LINE``.
     """
     front, rear = at[LINE.FRONT_SHARE] / (1.0 - at[LINE.FRONT_SHARE]), at[LINE.REAR_SHARE] / (1.0 - at[LINE.REAR_SHARE])
     whole = front + 1.0 + rear
@@ -50,13 +50,13 @@ def all_three(at: Floats) -> tuple[float, float, float, float]:
 
 @compiled
 def leader_pushed(at: Floats, early: float, beyond: float) -> tuple[float, float]:
-    """Return speed (m/s) and time (s) for a front vehicle that, pushed at ``early``, hits the obstacle with
-    ``sqrt(beyond)``.
+    """Return the speed (m/s) to which a push at ``early`` must bring the front vehicle, and the time (s) of its impact
+    with the obstacle.
 
-    The speed is its speed after the push, the time that of the impact with the obstacle.
+    It then hits the obstacle with the speed ``sqrt(beyond)``.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: time of the push, s.
         beyond: squared speed at the obstacle, m2/s2.
 
@@ -75,11 +75,11 @@ def least_beyond(
     vehicle.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: time of the push, s.
         late: time for which ``place`` and ``speed`` hold, s.
         place: least position of the centre of mass of all three at ``late``, m.
-        speed: its speed at ``late``, m/s.
+        speed: speed of that centre of mass at ``late``, m/s.
         least: bound that is known before, m2/s2; the result is at least this.
         plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
         other: further working memory of the same kind.
@@ -107,7 +107,7 @@ def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float
     behind.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         faster: speed by which it left the contact faster than the front vehicle, m/s.
@@ -122,7 +122,8 @@ def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float
 
 @compiled
 def last_drive(room: float, speed: float, brakes: float, drive: float, time: float) -> float:
-    """Return for how long (s) a vehicle must drive at the end of ``time``, after braking, to be ``room`` further then.
+    """Return for how long (s) a vehicle must drive at the end of ``time``, after braking, to have travelled ``room`` m
+    by then.
 
     Infinite if it cannot.
 
@@ -154,7 +155,7 @@ def stopped_there(
     and the largest time it spends there (s).
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         hard: largest closing speed of the contact, m/s.
@@ -195,18 +196,18 @@ def behind_leader(
 ) -> float:  # fmt: skip
     """Return the least squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
 
-    Nobody passes the front vehicle, which hits the obstacle with at most ``sqrt(beyond)``. Returns LARGE if such a
-    course is impossible.
+    It assumes that the front vehicle hits the obstacle with at most ``sqrt(beyond)`` m/s, and that no vehicle passes
+    it. Returns LARGE (a huge number) if that is impossible.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         soft: least closing speed of the contact, m/s.
         hard: largest closing speed of the contact, m/s.
         beyond: largest squared speed with which the front vehicle hits the obstacle, m2/s2.
         place: least position of the centre of mass of all three at ``late``, m.
-        speed: its speed at ``late``, m/s.
+        speed: speed of that centre of mass at ``late``, m/s.
         plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
         other: further working memory of the same kind.
 
@@ -281,7 +282,7 @@ def after_at_obstacle(
     """Return the least harm (m2/s2) at rear pair and obstacle together after a first contact with the front vehicle.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         soft: least closing speed of the contact, m/s.
@@ -323,7 +324,7 @@ def beyond_rear(
     """Return the least squared speed (m2/s2) of the front vehicle at the obstacle after the rear vehicle was met first.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         closing: largest closing speed of the contact, m/s.
@@ -349,7 +350,7 @@ def after_rear(
     """Return the least harm (m2/s2) at front pair and obstacle after a first contact with the rear vehicle.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         closing: largest closing speed of the contact, m/s.
@@ -392,7 +393,7 @@ def after(
     Args:
         kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
             brake build-up).
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         closing: largest closing speed of the contact, m/s.

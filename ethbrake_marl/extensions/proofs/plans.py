@@ -22,7 +22,9 @@ PIECES = 4
 
 @compiled
 def empty_plan() -> Floats:
-    """Return an uninitialised plan [2, PIECES] (a profile of piecewise constant acceleration) to fill in."""
+    """Return an uninitialised plan [2, PIECES] to fill in: row 0 the ends of its pieces (s), row 1 their accelerations
+    (m/s2).
+    """
     return np.empty((2, PIECES))
 
 
@@ -33,7 +35,7 @@ def fill_plan(
     """Write a plan: acceleration ``u_0`` until ``end_0``, then ``u_1`` until ``end_1``, ``u_2`` until ``end_2``, then
     ``u_3``.
 
-    ``plan`` [2, PIECES] is changed in place. Times are in s, accelerations in m/s2.
+    ``plan`` [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
     """
     plan[ENDS, 0], plan[ENDS, 1], plan[ENDS, 2], plan[ENDS, 3] = end_0, end_1, end_2, math.inf
     plan[ACCELERATIONS, 0], plan[ACCELERATIONS, 1] = u_0, u_1
@@ -44,7 +46,7 @@ def fill_plan(
 def fill_braking(plan: Floats, onset: float, braking: float) -> None:
     """Write a plan: coast until ``onset`` (s), then brake to rest with ``braking`` (m/s2, positive).
 
-    ``plan`` [2, PIECES] is changed in place.
+    ``plan`` [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
     """
     fill_plan(plan, onset, 0.0, onset, 0.0, onset, 0.0, -braking)
 
@@ -53,7 +55,7 @@ def fill_braking(plan: Floats, onset: float, braking: float) -> None:
 def fill_window(plan: Floats, u: float, late: float, end: float, change: float, turn: float, step: float) -> None:
     """Write a plan: acceleration ``u``, plus ``step`` from ``turn`` on, plus ``change`` from ``late`` to ``end``.
 
-    ``plan`` [2, PIECES] is changed in place. Times are in s, accelerations in m/s2.
+    ``plan`` [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
     """
     first, second, third = min(turn, late), min(max(turn, late), end), max(turn, end)
     u_1 = u + step if turn < late else u + change
@@ -75,7 +77,7 @@ def fill_drive_then_brake(plan: Floats, v: float, u: float, limit: float, drive:
     """Write a plan: drive for ``drive`` s (at most to the speed limit), then brake to rest.
 
     Args:
-        plan: [2, PIECES] changed in place.
+        plan: [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
         v: speed now, m/s.
         u: driving acceleration, m/s2.
         limit: speed limit, m/s.
@@ -92,7 +94,7 @@ def fill_brake_then_drive(plan: Floats, v: float, u: float, limit: float, brake:
     """Write a plan: brake for ``brake`` s (at most to rest), then drive to the speed limit and stay there.
 
     Args:
-        plan: [2, PIECES] changed in place.
+        plan: [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
         v: speed now, m/s.
         u: driving acceleration, m/s2.
         limit: speed limit, m/s.
@@ -109,7 +111,8 @@ def piece_at(plan: Floats, now: float, v: float) -> tuple[float, float, bool]:
     """Return the acceleration in force at ``now`` (m/s2), the time at which it ends (s), and whether the vehicle then
     stops.
 
-    ``plan`` [2, PIECES] is the vehicle's acceleration profile, ``v`` its speed at ``now`` (m/s).
+    ``plan`` [2, PIECES] holds the ends (s) and accelerations (m/s2) of the pieces of its motion, ``v`` its speed at
+    ``now`` (m/s).
     """
     k = 0
     while now >= plan[ENDS, k]:
@@ -138,9 +141,9 @@ def walk(
     Args:
         gap: gap now, m.
         v_front: speed of the front vehicle, m/s.
-        front: [2, PIECES] plan of the front vehicle.
+        front: [2, PIECES] ends (s) and accelerations (m/s2) of the pieces of its motion.
         v_rear: speed of the rear vehicle, m/s.
-        rear: [2, PIECES] plan of the rear vehicle.
+        rear: [2, PIECES] the same for the rear vehicle.
         until: end of the motion, s.
 
     """

@@ -41,7 +41,7 @@ def combined_ramped(
     Returns 0 if nothing is proven.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         until: horizon, s; harm after it does not count.
         front: bound on the harm of the front pair alone, m2/s2.
         rear: bound on the harm of the rear pair alone, m2/s2.
@@ -85,7 +85,7 @@ def bound_ramped(states: Floats, has_front: Bools, has_rear: Bools, both: Bools,
     """Compute lower bounds on the harm of ``n`` worlds with brake build-up: of each pair alone, and of both together.
 
     Args:
-        states: [n, LINE.WIDTH] the worlds, as the columns of ``line.LINE``.
+        states: [n, LINE.WIDTH] the worlds, one row each, with the columns of ``line.LINE``.
         has_front: [n] True if the front pair exists and its next impact counts.
         has_rear: [n] True if the rear pair exists and its next impact counts.
         both: [n] True for worlds in which the combined bound is computed.

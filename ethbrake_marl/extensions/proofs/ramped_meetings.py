@@ -35,7 +35,8 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 def fill_leader(at: Floats, plan: Floats) -> None:
     """Write the plan of the front vehicle, if nobody touches it, to ``plan`` [3, LEGS].
 
-    A *plan* is a profile of piecewise linear acceleration. ``at`` is one world (columns of ``line.LINE``).
+    A *plan* is a profile of piecewise linear acceleration. ``at`` is one world, an array with the columns of
+    ``line.LINE``.
     """
     fill_build_up(plan, 0.0, at[LINE.FORCE_L], -at[LINE.A_L], at[LINE.FALL_L])
 
@@ -44,18 +45,20 @@ def fill_leader(at: Floats, plan: Floats) -> None:
 def fill_follower(at: Floats, plan: Floats) -> None:
     """Write the plan of the rear vehicle, if nobody touches it, to ``plan`` [3, LEGS].
 
-    A *plan* is a profile of piecewise linear acceleration. ``at`` is one world (columns of ``line.LINE``).
+    A *plan* is a profile of piecewise linear acceleration. ``at`` is one world, an array with the columns of
+    ``line.LINE``.
     """
     fill_build_up(plan, at[LINE.ONSET_R], at[LINE.FORCE_R], -at[LINE.A_R], at[LINE.FALL_R])
 
 
 @compiled
 def range_of(sign: float, at: Floats) -> tuple[float, float, float, float]:
-    """Return the range of the controlled vehicle's force times ``sign``: largest force, its rate, least force, its
-    rate.
+    """Return the range of ``sign`` times the controlled vehicle's force: largest force, rate up, size of the least
+    force, rate down.
 
-    A *force* is an acceleration in m/s2; the least one is returned as a positive size. Rates are in m/s3. With ``sign``
-    1 the largest force is full drive, with -1 it is full braking. ``at`` is one world (columns of ``line.LINE``).
+    A *force* is an acceleration in m/s2; the least one is returned with its sign dropped. Rates are in m/s3. With
+    ``sign`` 1 the largest force is full drive, with -1 it is full braking. ``at`` is one world, an array with the
+    columns of ``line.LINE``.
     """
     if sign > 0.0:
         return at[LINE.U_F], at[LINE.RISE_F], at[LINE.A_F], at[LINE.FALL_F]
@@ -70,7 +73,7 @@ def fill_controlled(at: Floats, sign: float, switch: float, time: float, final: 
     A *force* is an acceleration in m/s2.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         sign: 1 if the front vehicle is met, -1 for the rear vehicle.
         switch: time at which the force begins to fall, s.
         time: time of the contact, s.
@@ -92,7 +95,7 @@ def switch_for(
     result is the speed (m/s) at ``time`` after the earlier switch.
 
     Args:
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         sign: 1 if the front vehicle is met, -1 for the rear vehicle.
         time: time of the contact, s after the controlled vehicle may act.
         place: position times ``sign`` at ``time``, m.
@@ -121,7 +124,7 @@ def met_at(kind: int, at: Floats, time: float, plan: Floats) -> tuple[float, flo
 
     Args:
         kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         time: time of the contact, s after the controlled vehicle may act.
         plan: [3, LEGS] working memory.
 
@@ -141,7 +144,7 @@ def gentlest_ramped(kind: int, at: Floats, time: float) -> float:
 
     Args:
         kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         time: time of the contact, s after the controlled vehicle may act.
 
     """
@@ -154,14 +157,14 @@ def gentlest_ramped(kind: int, at: Floats, time: float) -> float:
 def slack_of(
     kind: int, at: Floats, early: float, late: float, v: float, hard: float, plan: Floats
 ) -> tuple[float, float]:
-    """Return how far from the neighbour (m), and by which speed (m/s), the controlled vehicle may be at ``early`` at
-    most.
+    """Return the largest distance (m) to the neighbour at ``early``, and by how much (m/s) the closing speed may then
+    exceed ``hard``.
 
-    It meets the neighbour between ``early`` and ``late``.
+    The controlled vehicle meets the neighbour between ``early`` and ``late``.
 
     Args:
         kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         v: speed of the neighbour at ``early``, m/s.
@@ -182,7 +185,7 @@ def gentlest_ramped_between(kind: int, at: Floats, early: float, late: float) ->
 
     Args:
         kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
 
@@ -201,13 +204,15 @@ def gentlest_ramped_between(kind: int, at: Floats, early: float, late: float) ->
 
 @compiled(apart=True)
 def force_of_meeting(kind: int, at: Floats, early: float, late: float, hard: float) -> float:
-    """Return the largest acceleration (m/s2) of the controlled vehicle at which a contact can be as soft as ``hard``.
+    """Return the largest acceleration (m/s2) of the controlled vehicle with which it can meet a neighbour at no more
+    than ``hard``.
 
-    The result is times the sign: 1 for contacts with the front vehicle, -1 for the rear one.
+    For a contact with the rear vehicle, accelerations count with the opposite sign, so the largest one is the hardest
+    braking.
 
     Args:
         kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         hard: largest closing speed of the contact, m/s.
@@ -240,7 +245,7 @@ def after_ramped(
 
     Args:
         kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         hard: largest closing speed of the contact, m/s.
@@ -292,7 +297,7 @@ def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Flo
 
     Args:
         kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         time: time of the contact, s after the controlled vehicle may act.
         plan: [3, LEGS] working memory.
         other: [3, LEGS] working memory.
@@ -324,7 +329,7 @@ def meet_ramped(kind: int, at: Floats, sign: float, plan: Floats, other: Floats)
 
     Args:
         kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
-        at: one world, as the columns of ``line.LINE``.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
         sign: 1: the controlled vehicle drives fully; -1: it brakes fully.
         plan: [3, LEGS] working memory.
         other: [3, LEGS] working memory.
@@ -377,7 +382,8 @@ class LowerBound:
 def at_onset_of(
     where: str, worlds: Worlds, vehicles: Ints, harm_count: HarmCount, horizon_s: float
 ) -> tuple[Worlds, Floats, Floats, Bools]:
-    """Return the worlds when the first of ``vehicles`` may act, that time, the harm until then, and a mask of pairs.
+    """Simulate worlds until the first of ``vehicles`` may act. Return these worlds, that time, the harm so far, and a
+    mask of pairs.
 
     The time is [n] s, the harm [n] m2/s2. The mask [n, P] is True for pairs whose next impact counts and whose vehicles
     move forward.
@@ -461,7 +467,8 @@ def onset_states(worlds: Worlds, i: int, time_step_s: float | Floats | None) -> 
     Args:
         worlds: the worlds, [n], at the moment when vehicle ``i`` may act.
         i: index of the controlled vehicle.
-        time_step_s: time between two decisions, a number or [n], s; None: commands may change at any time (column 0).
+        time_step_s: time between two decisions, a number or [n], s; None: commands may change at any time; the column
+            is then 0.
 
     """
     v = worlds.vehicles

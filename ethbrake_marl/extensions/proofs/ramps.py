@@ -26,7 +26,9 @@ _MEETING_HALVINGS = 30
 
 @compiled
 def empty_legs() -> Floats:
-    """Return an uninitialised plan [3, LEGS] (a profile of piecewise linear acceleration) to fill in."""
+    """Return an uninitialised plan [3, LEGS] to fill in: the end (s), initial acceleration (m/s2) and jerk (m/s3) of
+    each leg.
+    """
     return np.empty((3, LEGS))
 
 
@@ -101,7 +103,7 @@ def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, flo
     That speed is NaN if the interval ends otherwise than at rest or at the speed limit.
 
     Args:
-        plan: [3, LEGS] plan of the vehicle.
+        plan: [3, LEGS] end (s), initial acceleration (m/s2) and jerk (m/s3) of each leg of the motion.
         now: present time, s.
         v: present speed, m/s.
         limit: speed limit, m/s.
@@ -147,7 +149,8 @@ def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, f
     """Return speed (m/s) and distance (m) at ``until`` (s) of a vehicle that starts with speed ``v`` and follows
     ``plan``.
 
-    ``plan`` is [3, LEGS]; ``limit`` is the speed limit, m/s.
+    ``plan`` [3, LEGS] holds end (s), initial acceleration (m/s2) and jerk (m/s3) of each leg; ``limit`` is the speed
+    limit, m/s.
     """
     now, way = 0.0, 0.0
     while now < until:
@@ -170,9 +173,9 @@ def force_of(plan: Floats, now: float) -> float:
 
 @compiled(apart=True)
 def least_on_cubic(constant: float, pressing: float, jerk: float, since: float, until: float) -> float:
-    """Return the least ``constant / t + pressing t / 2 + jerk t^2 / 3`` for t from ``since`` to ``until``.
+    """Return the least ``(constant / t) + (pressing * t / 2) + (jerk * t^2 / 3)`` for t from ``since`` to ``until``.
 
-    -inf if the function falls without bound towards t = 0.
+    The result is -inf if the function falls without bound towards t = 0.
     """
     if since <= 0.0 and constant <= 0.0:
         return -math.inf

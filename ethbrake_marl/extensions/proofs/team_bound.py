@@ -103,7 +103,7 @@ def _combined_bound_of_line(
 class TeamBound:
     """Proven bounds on the harm of each world, [n] m2/s2 each."""
 
-    harm: Floats  # lower bound on the total harm: no joint command does less
+    harm: Floats  # lower bound on the total harm, whatever the controlled vehicles do
     early: Floats  # harm before any controlled vehicle may act
     obstacle: Floats  # bound of Vehicle 1 and the obstacle ahead, from that moment on
     pairs: Floats  # [n, P] bound of each pair alone, from that moment on
@@ -111,8 +111,8 @@ class TeamBound:
 
     @property
     def impact_proven(self) -> Bools:
-        """True for worlds in which every joint command certainly has an impact, [n]. False means that none is
-        proven.
+        """True for worlds in which an impact is certain whatever the controlled vehicles do, [n]. False means that none
+        is proven.
         """
         return np.asarray(self.harm > 0.0, np.bool_)
 
@@ -126,11 +126,12 @@ def team_bound(
     scripts: Mapping[int, str] | None = None,
     time_step_s: float | None = None,
 ) -> TeamBound:
-    """Return a proven lower bound on the harm of every world, over all joint commands of several vehicles.
+    """Return a proven lower bound on the harm of every world, whatever several controlled vehicles do together.
 
-    ``harm = early + obstacle + max(pairs[:, 0] + pairs[:, 1], combined) + pairs[:, 2:]``, each part rounded outward. If
-    Vehicle 1 is controlled, ``combined`` covers the obstacle and Vehicles 1 and 2: ``early + max(obstacle + pairs[:,
-    0], combined) + pairs[:, 1:]``. Harm that may come only after the horizon counts as 0.
+    ``harm = early + obstacle + max((pairs[:, 0] + pairs[:, 1]), combined) + pairs[:, 2:].sum(axis=1)``, each part
+    lowered by the largest possible rounding error. If Vehicle 1 is controlled, ``combined`` covers the obstacle and
+    Vehicles 1 and 2: ``early + max((obstacle + pairs[:, 0]), combined) + pairs[:, 1:].sum(axis=1)``. Harm that may come
+    only after the horizon counts as 0.
 
     All other vehicles brake with their whole capacity from their latencies on. A single controlled vehicle is allowed;
     ``lower_bound`` is sharper where it covers the line.

@@ -106,8 +106,9 @@ def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> De
 def regimes_of(worlds: Worlds, pair: int, deceleration_mps2: Floats) -> NDArray[np.str_]:
     """Return how one pair, alone, first meets in each world, [n], if both vehicles brake constantly from t = 0 on.
 
-    Values: ``A``, ``A'``, ``B`` or ``C`` as in docs/proofs/constant-deceleration.md; ``early``: before the front
-    vehicle of the pair brakes; ``none``.
+    Values: ``early`` (before the front vehicle of the pair brakes), ``A`` (the rear vehicle still coasts), ``A'`` (it
+    coasts and the front one stands), ``B`` (both brake), ``C`` (the rear one brakes and the front one stands), ``none``
+    (they never meet). docs/proofs/constant-deceleration.md has the formulas.
 
     Args:
         worlds: the worlds, [n].

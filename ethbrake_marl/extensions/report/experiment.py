@@ -44,7 +44,7 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
 
     Args:
         experiment: the finished run: its folder, policy and evaluation.
-        tell: called with the progress.
+        tell: called with a ``Progress`` object at each stage.
 
     """
     evaluation, folder = experiment.evaluation, experiment.run.path
@@ -106,12 +106,13 @@ def write_figures(
     agents: Mapping[str, Agent],
     harm_count: HarmCount = "first",
 ) -> list[Part]:
-    """Draw the three figures, write them as PNG files into ``folder``, and return them as parts of the report.
+    """Draw the three figures, write them as PNG files into ``folder``, and return them as parts (pieces of HTML) of the
+    report.
 
     Args:
         folder: folder of the run.
         evaluation: evaluation of the trained policy and the baselines.
-        rows: summary of that evaluation; baselines are drawn as level lines.
+        rows: summary of that evaluation, one ``SummaryRow`` for each agent; baselines are drawn as level lines.
         course: evaluations during the training; each has ``steps``, both harms and ``collision_rate``.
         course_caption: caption of the learning curve.
         agents: the evaluated agents, by name.
@@ -149,10 +150,12 @@ def write_figures(
 
 
 def telling_world(evaluation: Evaluation, harm_count: HarmCount = "first") -> int:
-    """Return the row of the world to draw: the median by the policy's reduction of harm, of worlds where full braking
-    does harm.
+    """Return the index of a typical world to draw: the one with the median reduction of harm by the policy.
 
-    Returns 0 if full braking does no harm in any world. ``harm_count`` is ``first`` or ``total``.
+    The reduction is the harm of full braking minus the policy's harm. Only worlds in which full braking does harm
+    count.
+
+    Returns 0 if there are none. ``harm_count`` is ``first`` or ``total``.
     """
     before = evaluation.outcome(BESIDE[0]).world_harm(harm_count)
     rows = np.flatnonzero(before > 0.0)

@@ -35,10 +35,10 @@ def harm_by_agent(
     """Draw the mean harm of each agent with its 95 % interval, a line at the best known harm, and marks for other
     tests.
 
-    The figure is as narrow as a phone. Raises ``InvalidInput`` without rows.
+    The figure is narrow enough for the screen of a phone. Raises ``InvalidInput`` without rows.
 
     Args:
-        rows: summary of each agent.
+        rows: summary of each agent, one ``SummaryRow`` each.
         harm_count: harm to draw, ``first`` or ``total``.
         elsewhere: summaries of the agents on other tests, by the title of the test; None: no marks.
 
@@ -103,8 +103,8 @@ def regret_distribution(evaluation: Evaluation) -> Figure:
 
 
 def harm_in_parts(evaluation: Evaluation) -> Figure:
-    """Draw each agent's mean harm in three parts: best known harm, and regret where contact is unavoidable and
-    avoidable.
+    """Draw each agent's mean harm in three parts: best known harm, regret in worlds with unavoidable contact, and
+    regret in worlds with avoidable contact.
 
     *Regret* is harm minus best known harm. Raises ``InvalidInput`` if nothing is proven about the worlds.
     """

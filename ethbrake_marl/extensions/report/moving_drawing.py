@@ -65,7 +65,7 @@ def animate_films(films: Mapping[str, Sequence[Scene]], *, fps: int) -> str:
 
 
 class _Strip:
-    """One agent's film, drawn on its own road.
+    """Drawing of one agent's film on its own road, as a strip of the SVG picture.
 
     ``left_m`` and ``right_m`` are the positions at the edges of the picture, ``fps`` the scenes per second.
     """
@@ -147,7 +147,7 @@ class _Strip:
     def _events(self) -> list[tuple[int, int, Struck]]:
         """Return the impacts to show: first scene, scene after the last, and the impact.
 
-        An impact is left out while a harder one is shown.
+        One impact is shown at a time, for a short while; a weaker one is left out while a harder one is shown.
         """
         known: set[tuple[int, float]] = set()
         found: list[tuple[int, int, Struck]] = []

@@ -34,7 +34,10 @@ _STAY = "\u00a0"  # no-break space
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A piece of a page: its HTML, and the style sheets and scripts that it needs."""
+    """A piece of a page: its HTML, and the style sheets and scripts that it needs.
+
+    Class methods make the usual parts, for instance ``Part.paragraph("Text")``.
+    """
 
     html: Markup  # markup of the piece
     styles: tuple[str, ...] = ()  # names of style sheets in this folder
@@ -42,7 +45,7 @@ class Part:
 
     @classmethod
     def paragraph(cls, text: str, kind: str = "") -> Part:
-        """Return ``text`` as a paragraph.
+        """Return a part with ``text`` as a paragraph.
 
         ``kind`` is its style: ``quiet`` (conditions), ``note`` (important remark), ``alarm``, or empty.
         """
@@ -50,34 +53,34 @@ class Part:
 
     @classmethod
     def heading(cls, text: str) -> Part:
-        """Return ``text`` as a heading inside a section."""
+        """Return a part with ``text`` as a heading inside a section."""
         return cls(Markup("<h3>{}</h3>\n").format(shown(text)))
 
     @classmethod
     def facts(cls, found: Mapping[str, object]) -> Part:
-        """Return names and their values as a list, one below the other; ``found`` maps names to values."""
+        """Return a part that lists names with their values, one below the other; ``found`` maps names to values."""
         lines = [Markup("<dt>{}</dt><dd>{}</dd>").format(shown(name), _text(value)) for name, value in found.items()]
         return cls(Markup("<dl>\n{}\n</dl>\n").format(Markup("\n").join(lines)))
 
     @classmethod
     def remarks(cls, texts: Sequence[str]) -> Part:
-        """Return ``texts`` as a list of important remarks, one line each; an empty part if there are none."""
+        """Return a part with ``texts`` as a list of important remarks, one line each; an empty part if none."""
         lines = [Markup("<li>{}</li>").format(shown(text)) for text in texts]
         return cls(Markup('<ul class="remarks">\n{}\n</ul>\n').format(Markup("\n").join(lines)) if lines else Markup())
 
     @classmethod
     def box(cls, title: str, meanings: Mapping[str, str]) -> Part:
-        """Return a box with a title, and words with their meanings."""
+        """Return a part that explains words in a box; ``meanings`` maps each word to its meaning."""
         return cls(Markup('<aside class="box"><strong>{}</strong>{}</aside>\n').format(title, cls.facts(meanings).html))
 
     @classmethod
     def beside(cls, parts: Sequence[Part]) -> Part:
-        """Return parts of equal width side by side; on a narrow screen, one below the other."""
+        """Return one part that shows ``parts`` side by side in equal widths; below each other on a narrow screen."""
         return cls._around('<div class="beside">{}</div>\n', parts)
 
     @classmethod
     def opened(cls, title: str, parts: Sequence[Part]) -> Part:
-        """Return ``parts`` under a title; they are hidden until the reader clicks on the title."""
+        """Return one part with ``parts`` under a title; they are hidden until the reader clicks on the title."""
         return cls._around("<details><summary>{}</summary>\n{}</details>\n", parts, shown(title))
 
     @classmethod
@@ -88,7 +91,7 @@ class Part:
 
     @classmethod
     def data(cls, name: str, content: object, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = ()) -> Part:
-        """Return ``content`` as JSON inside a script element, for a script of the page to read.
+        """Return a part that holds ``content`` as JSON inside a script element, for a script of the page to read.
 
         The text can neither end its element nor begin another one.
 
@@ -107,7 +110,8 @@ class Part:
 
     @classmethod
     def template(cls, file: str, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = (), **values: object) -> Part:
-        """Return the template ``file`` of this folder, filled with ``values``; text is escaped, Markup is not.
+        """Return a part: the template ``file`` of this folder, filled with ``values``. Text is escaped, ``Markup`` is
+        not.
 
         ``styles`` and ``scripts`` are names of files in this folder that it needs.
         """
@@ -115,8 +119,9 @@ class Part:
 
     @classmethod
     def table(cls, sheet: Sheet) -> Part:
-        """Return ``sheet`` as a table that scrolls if it is wider than the page. A cell may be a ``Shown`` of
-        Markup.
+        """Return a part that shows ``sheet`` as a table, which scrolls if it is wider than the page.
+
+        A cell may be a ``Shown`` whose value is ``Markup``, for instance a button; other texts are escaped.
         """
         return cls(Markup(sheet.html() + "\n"))
 
@@ -131,7 +136,7 @@ class Part:
         known: str = "",
         where: object = "",
     ) -> Part:
-        """Return a figure, or the SVG of one of our figures, with a title and a description.
+        """Return a part that shows a figure, or the SVG of a figure of this package, with a title and a description.
 
         The caption is removed from the SVG and becomes text of the page below it, which a phone can show.
 
@@ -140,7 +145,7 @@ class Part:
             title: title above it.
             description: what it shows, in words.
             alone: keep the colours, as a map needs them, on a white background.
-            known: text of the caption that the page has already; it is left out.
+            known: part of the caption that stands elsewhere on the page; it is left out here.
             where: file that the SVG was read from, for the error message about a foreign SVG.
 
         """
@@ -170,15 +175,15 @@ class Part:
         shown_first: Sequence[int] = (),
         folded: bool = False,
     ) -> Part:
-        """Return the player of episodes, in which a reader watches the same worlds under different agents.
+        """Return a part with the player of episodes, in which a reader watches the same worlds under different agents.
 
         Args:
             worlds: at least one world, with its episode under each agent.
             driven: indices (0 = front) of the controlled vehicles; a mapping by agent if agents control different
                 vehicles.
             focus: name of an agent that is shown at first, besides the first and the last ones.
-            shown_first: numbers of the agents that are shown at first instead; empty: the first, the focus and the
-                last.
+            shown_first: positions (from 0) of the agents that are shown at first instead; empty: the first, the focus
+                and the last.
             folded: hide the traces until their title is clicked.
 
         """

@@ -33,7 +33,8 @@ class Played:
 
     @staticmethod
     def drive(played: Sequence[Played], worlds: Worlds, name: str, agent: Driver, scenario: Scenario) -> None:
-        """Let one agent control the worlds of ``played``, and store each motion there under the agent's name.
+        """Let one agent control the worlds of ``played``, and store the motion in the ``motions`` of each entry, under
+        the agent's name.
 
         Args:
             played: one entry for each world.
@@ -72,10 +73,13 @@ class Played:
 
 
 def _impacts(motion: EpisodeMotion) -> list[list[float]]:
-    """Return each impact as a list: time, pair, closing speed, 1 if first, number, first-impact and total harm so far.
+    """Return the impacts of an episode as lists, in order of time.
 
-    Of several impacts of a pair within ``_BIN_S`` only the last is kept. The harm after the last impact equals the
-    ledger exactly.
+    Entries of a list: time (s), index of the pair, closing speed (m/s), 1 for the first impact of the pair (else 0),
+    number of the impact in the episode from 1, first-impact harm so far, total harm so far (m2/s2).
+
+    Of several impacts of a pair within ``_BIN_S`` only the last is kept. The harm after the last impact is exactly the
+    recorded harm of the episode.
     """
     rows = motion.impacts
     order = np.argsort(rows.time_s, kind="stable")

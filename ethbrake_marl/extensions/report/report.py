@@ -113,7 +113,8 @@ _SPLIT: tuple[Column | str, ...] = (
 
 
 def shield_section(rows: ShieldModes, conditions: str) -> Section:
-    """Return the section that compares the shield's modes and rates each intervention of step mode.
+    """Return the section that compares the shield's modes, and counts how many interventions of step mode were needed,
+    harmless or costly.
 
     ``rows`` are the results by agent and mode, ``conditions`` a line on the worlds. The section is empty without rows.
     """
@@ -139,7 +140,10 @@ _OTHERS = {"Knows", "sampled_harm", "vehicle_1_shoved_m", "vehicle_1_shoved_far_
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Content of the HTML report of an evaluation."""
+    """Content of the HTML report of an evaluation.
+
+    ``html`` is the page, ``write`` writes it to a file, and ``driven`` adds episodes to watch.
+    """
 
     title: str  # title of the page
     rows: Sequence[SummaryRow]  # summary of each agent
@@ -360,7 +364,8 @@ def _remarks(rows: SummaryTable) -> list[str]:
 
 
 def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
-    """Return the conditions of these rows and, folded, all measures with the paper's rows.
+    """Return parts with the conditions of these rows and, hidden until clicked, a table of all measures with the
+    paper's rows.
 
     ``because`` is a sentence with the reason for empty columns.
     """
@@ -389,7 +394,8 @@ def _empty(rows: SummaryTable) -> list[str]:
 
 
 def _table(sheet: Sheet, caption: str, names: set[str]) -> Part:
-    """Return part of ``sheet`` as a table: its first column (the agent) and the columns in ``names`` that have a value.
+    """Return a table of some columns of ``sheet``: its first column (the agent) and the columns in ``names`` that have
+    a value.
 
     ``caption`` is the title of the table.
     """

@@ -90,7 +90,8 @@ def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
 def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
     """Return the quantities of ``worlds`` to draw in pairs: label -> values [n].
 
-    One vehicle (or pair) of each quantity that varies comes first, the nearest to vehicle ``focus``; then further ones.
+    Only quantities that vary between the worlds are drawn. Of each, the value of the vehicle (or pair) nearest to
+    vehicle ``focus`` is chosen first, then values of others while there is room.
     """
     found: list[tuple[int, str, Floats]] = []
     for rule in QUANTITY.of(worlds).values():

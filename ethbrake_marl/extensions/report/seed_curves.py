@@ -49,8 +49,8 @@ def seed_curves(
 
     Args:
         panels: label of a quantity -> name of a recipe -> its curve.
-        logarithmic: labels of panels with a logarithmic axis, if all values are positive: harm falls to a tenth and the
-            last tenth matters most.
+        logarithmic: labels of panels with a logarithmic axis, on which small harm late in the training is still
+            visible. The axis stays linear if a value is not positive.
         caption: text below the figure.
         x_label: label of the x axis.
         known: best known value by label, marked by a dashed line; None: no line.

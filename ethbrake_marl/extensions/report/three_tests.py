@@ -30,7 +30,9 @@ def is_as_shipped(scenario: Scenario) -> bool:
 
 
 def other_tests(scenario: Scenario) -> tuple[Scenario, ...]:
-    """Return the other two of the three tests if ``scenario`` is one of them, as shipped; else nothing."""
+    """Return the other two of the three tests (``TESTS``) if ``scenario`` is one of them, as shipped; else an empty
+    tuple.
+    """
     if scenario.name not in TESTS or not is_as_shipped(scenario):
         return ()
     return tuple(load_scenario(name) for name in TESTS if name != scenario.name)
@@ -40,7 +42,8 @@ _KEPT = ("collision_rate", "first_impact_harm", "total_harm")  # columns of the 
 
 
 def brief(table: SummaryTable, beside: Mapping[str, SummaryTable]) -> Sheet:
-    """Return a table for one screen: each agent's collisions and both harms, and its harm in other tests, with notes.
+    """Return a table for one screen: each agent's collisions and both harms, and its harm in other tests, and notes
+    below.
 
     Rows of other sources and other measures are left out.
 

@@ -55,10 +55,11 @@ def best_harm(
 ) -> BestHarmTable:
     """Search every world for the command profiles of least harm, once per harm count; return them as a table.
 
-    With both counts, each may take the other's result. The result is never worse than the best constant deceleration of
-    a controlled vehicle (with the other controlled ones braking fully), than the same search with one of them alone, or
-    than ``known``. It does not depend on ``threads`` or on the other worlds. Raises ``InvalidInput`` for no vehicle, a
-    script whose command is not fixed at the alert, no count, or a budget below 1.
+    With both counts, the profile found for one also replaces the other's if it does less harm there. The result is
+    never worse than the best constant deceleration of one controlled vehicle while the others brake fully, than the
+    same search for one controlled vehicle alone, or than ``known``. It does not depend on ``threads`` or on the other
+    worlds. Raises ``InvalidInput`` for no vehicle, a script whose command is not fixed at the alert, no count, or a
+    budget below 1.
 
     Args:
         scenario: the scenario of the worlds.
@@ -236,7 +237,7 @@ def kept_chunk(file: Path, identity: UInt64s, question: Mapping[str, object]) ->
     Args:
         file: the chunk file.
         identity: hash of each world of the chunk.
-        question: options of the search (counts, budget, seed) that its header must show.
+        question: options of the search (counts, budget, seed), which must equal those in the header of the file.
 
     """
     if not file.is_file():
@@ -310,8 +311,9 @@ def _searched(
 
 
 def _startable(profiles: Profiles) -> Profiles:
-    """Return profiles that a search can start with: a profile with too many phases becomes its first command, held to
-    the end.
+    """Return profiles that a search can start with.
+
+    A profile with too many phases (times of constant command) is replaced by its first command, held to the end.
     """
     ends, commands = Profiles.padded([profiles], MOST_PHASES)[0]
     last = ends[:, -1:]
@@ -332,7 +334,8 @@ def _joined(parts: list[Profiles], n: int) -> Profiles:
 
 
 def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) -> Profiles:
-    """Return the commands that ``agent`` gives in its episodes as profiles; equal neighbouring steps become one phase.
+    """Return the commands that ``agent`` gives in its episodes as profiles [n]; neighbouring steps with equal commands
+    become one phase (time of constant command).
 
     Args:
         agent: agent of the task's vehicle.
@@ -354,7 +357,8 @@ def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) 
 def fold_episodes(
     table: BestHarmTable, scenario: Scenario, worlds: Worlds, name: str, agents: Mapping[HarmCount, Agent]
 ) -> BestHarmTable:
-    """Return the table with the harm of agents' episodes in all worlds where it is below the table's value.
+    """Return the table, lowered to the harm of agents' episodes in all worlds where an agent does less harm than the
+    table says.
 
     The header counts these worlds. The harm is that of the recorded commands when played again. Where an agent cannot
     control a world to its end, the table stays unchanged. Raises ``InvalidInput`` unless the scenario has exactly one
@@ -365,7 +369,8 @@ def fold_episodes(
         scenario: the scenario of the worlds.
         worlds: the worlds at t = 0; worlds with known harm 0 are skipped.
         name: name of the agent, for the header.
-        agents: for each harm count, the agent made to minimise it; each count may take either episode.
+        agents: for each harm count, the agent made to minimise it. Every episode is compared with the table under both
+            counts.
 
     """
     learners = [scenario.vehicle_names[i] for i in scenario.learners]

@@ -43,12 +43,12 @@ def extreme_profiles(problem: ProfileProblem, states: Floats, has_front: Bools, 
     """Return the ``KEPT`` best extreme profiles of the one controlled vehicle, [n * KEPT], all of world 0 first, and so
     on.
 
-    An *extreme* profile changes between full drive and full braking. ``states`` only serves to find when two vehicles
-    would meet, so a neighbour that does not brake fully makes the profiles less good, not wrong.
+    An *extreme* profile changes between full drive and full braking. ``states`` is used only to find when two vehicles
+    would meet, as if neighbours braked fully. If they do not, the profiles are worse but still valid.
 
     Args:
         problem: the worlds, with the commands of the other vehicles and the harm to minimise.
-        states: [n, WIDTH] each world at the first decision, as the columns of ``proofs.line.LINE``.
+        states: [n, WIDTH] one row for each world at the first decision, with the columns of ``proofs.line.LINE``.
         has_front: [n] True if a vehicle is ahead.
         has_rear: [n] True if a vehicle is behind.
 
@@ -68,7 +68,7 @@ def _fill_extremes(
 
     Args:
         problem: the worlds, with the commands of the other vehicles and the harm to minimise.
-        states: [n, WIDTH] each world at the first decision, as the columns of ``proofs.line.LINE``.
+        states: [n, WIDTH] one row for each world at the first decision, with the columns of ``proofs.line.LINE``.
         has_front: [n] True if a vehicle is ahead.
         has_rear: [n] True if a vehicle is behind.
         ends: [n, KEPT, K] receives the steps at which the phases end.
@@ -99,8 +99,8 @@ def try_changes(
     Args:
         world: the world, with its commands, bounds and random stream.
         kind: ``FRONT_FIRST`` or ``REAR_FIRST``: the neighbour to meet.
-        at: the world at the first decision, as the columns of ``proofs.line.LINE``.
-        start: [S] the same state for the simulation.
+        at: the world at the first decision, an array with the columns of ``proofs.line.LINE``.
+        start: [S] state of the simulation at the first decision.
         low: earliest first change, s.
         high: latest first change, s.
         ends: [KEPT, K] ends of the best profiles so far, in steps; changed in place.
@@ -138,7 +138,8 @@ def fill_extreme(
 ) -> None:
     """Write one profile: a first command, the opposite one from ``change`` to ``meeting``, then the first one again.
 
-    In the step of the first change, the command leads to the speed that the change in mid-step would.
+    Commands can change only between steps. If ``change`` lies within a step, that step gets the mean command, so that
+    the speed after it is the same.
 
     Args:
         world: the world, with its commands, bounds and random stream.

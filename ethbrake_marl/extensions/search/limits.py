@@ -84,7 +84,8 @@ class Limits:
 
 
 def known_limits(worlds: Worlds, task: Task) -> Limits | Unproven:
-    """Return proofs and best known harm of worlds at the alert; ``Unproven`` if the proofs do not cover the task.
+    """Return the proven facts and the best known harm of worlds at the alert; ``Unproven`` if the proofs do not cover
+    the task.
 
     ``task`` names the scenario and the controlled vehicles.
     """

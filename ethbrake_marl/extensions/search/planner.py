@@ -26,7 +26,7 @@ MOST_CANDIDATES = 1_000_000  # most candidates per world and decision
 
 
 class Outlook(NamedTuple):
-    """Settings of an agent that looks ahead."""
+    """Settings of an agent that looks ahead, and the methods with which it decides when to plan and what to command."""
 
     harm_count: HarmCount  # harm to minimise: ``first`` or ``total``
     horizon_s: float  # time up to which it looks ahead, s
@@ -142,7 +142,7 @@ class Planner:
         return {"plan": plan, "planned_s": start_s, "others_mps2": others, "predicted_harm": harm}
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the first command of each world's plan, [n] m/s2, and the new memory. Plans are renewed where a
+        """Return the first command of each world's plan, [n] m/s2, and the new memory. A new plan is searched where a
         decision is due.
 
         Args:

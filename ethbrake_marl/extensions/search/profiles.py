@@ -114,8 +114,8 @@ def apply_change(change: Floats, bounds: Floats, ends: Ints, commands: Floats) -
 
 @compiled
 def compact(ends: Ints, commands: Floats, phases: int) -> int:
-    """Remove empty phases of a profile and join neighbouring ones with equal commands, in place; return how many are
-    left.
+    """Remove empty phases (times of constant command) of a profile and join neighbouring ones with equal commands, in
+    place; return how many are left.
 
     Args:
         ends: [K] steps at which the phases end.
@@ -225,7 +225,9 @@ def search_world(
 
 @compiled
 def copy_profile(ends: Ints, commands: Floats, to_ends: Ints, to_commands: Floats) -> None:
-    """Copy one profile (``ends``, ``commands``) over the first phases of another one (``to_ends``, ``to_commands``)."""
+    """Copy one profile (``ends``, ``commands``) over the first phases (times of constant command) of another one
+    (``to_ends``, ``to_commands``).
+    """
     for k in range(ends.shape[0]):
         to_ends[k] = ends[k]
     copy_rows(commands, to_commands, commands.shape[0])
@@ -375,9 +377,10 @@ def largest(values: Floats) -> int:
 
 @compiled(apart=True)
 def divide(world: SearchWorld, field: Population) -> None:
-    """Divide phases of the best profile of the field, in place, until it has the largest number of phases.
+    """Divide phases (times of constant command) of the best profile of the field, in place, until it has the largest
+    number of phases.
 
-    The longest phase is halved first; only the first ``ATTENTION_STEPS`` steps count.
+    The longest phase is halved first. Only the first ``ATTENTION_STEPS`` steps of the episode count towards its length.
 
     Args:
         world: the world, with its commands, bounds and random stream.
@@ -414,8 +417,8 @@ def select_stepwise(
     """Switch to stepwise simulation, and put the best of the field and the starting profiles in the first place of the
     field.
 
-    Stepwise (decision by decision) gives the engine's rounding, which may decide on which side of a jump a profile
-    lands.
+    Stepwise simulation (decision by decision) rounds as the engine does. Where harm jumps, rounding may decide how much
+    harm a profile does.
 
     Args:
         world: the world, with its commands, bounds and random stream.

@@ -35,10 +35,10 @@ class BestHarm:
     """Agent that plays the command profile of least known harm.
 
     A world without a stored profile is searched at the alert. If the ``scenario`` has no other learner, a second search
-    with as many candidates starts from the better of that result and the episode of ``universal``, so the harm is never
-    above that policy's. ``predicted_harm`` [n] (m2/s2) equals the engine's harm exactly if the engine has the same time
-    step. Raises ``InvalidInput`` for a budget below 1 or an unknown count and, when an episode begins, for another
-    vehicle's script whose command is not fixed at the alert.
+    with as many candidates starts from the better of that result and the episode of ``universal`` (a trained policy in
+    the package), so the harm is never above that policy's. ``predicted_harm`` [n] (m2/s2) equals the engine's harm
+    exactly if the engine has the same time step. Raises ``InvalidInput`` for a budget below 1 or an unknown count and,
+    when an episode begins, for another vehicle's script whose command is not fixed at the alert.
 
     Args:
         recall: returns the stored profile of each world of a problem, and a mask of the worlds that have one.

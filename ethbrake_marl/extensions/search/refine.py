@@ -190,7 +190,7 @@ def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[
 def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int, budget: int) -> tuple[float, int]:
     """Improve ``plan`` in place by random changes; return its harm (m2/s2) and its number of steps.
 
-    A successful addition is repeated with twice the amount.
+    If adding an amount to the commands of some steps lowers the harm, twice the amount is tried next.
 
     Args:
         world: the world, with its commands, bounds and random stream.
@@ -272,8 +272,8 @@ def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, num
 
 @compiled
 def steps_in(world: Episode, duration_s: float) -> int:
-    """Return the number of decision steps in ``duration_s``, rounded, at least 1. ``world`` holds the length of a
-    step.
+    """Return the number of decision steps in ``duration_s``, rounded to a whole number of at least 1. ``world`` holds
+    the length of a step.
     """
     return max(int(duration_s / world.clock[CLOCK.TIME_STEP] + 0.5), 1)
 
