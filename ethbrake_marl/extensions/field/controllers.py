@@ -82,9 +82,10 @@ class Seen(NamedTuple):
         return np.where(self.speed_mps > 0.0, self.gap_m / np.where(self.speed_mps > 0.0, self.speed_mps, 1.0), np.inf)
 
     def built_up(self, wanted_mps2: Floats, rate_mps3: float) -> Floats:
-        """Return the next command on the way to ``wanted_mps2``, [n] m/s2.
+        """Return the command [n] (m/s2) for the next time step, if braking can only build up gradually.
 
-        Braking grows by at most ``rate_mps3`` per second, starting from the own braking now.
+        It is ``wanted_mps2`` [n], but the deceleration exceeds the vehicle's present one by at most ``rate_mps3`` times
+        the time step.
         """
         return np.maximum(wanted_mps2, np.minimum(self.own_mps2, 0.0) - rate_mps3 * self.step_s)
 
@@ -186,7 +187,7 @@ class Law:
     source: str  # publication
     parameters: Mapping[str, float]  # default value of each parameter, in SI units
     command: Callable[[Seen, Parameters], Floats]  # formula that returns the acceleration, [n] m/s2
-    # Formula that returns where the law sees a danger, [n] bool; None: it acts from the first decision on.
+    # Formula that returns for each world whether the law sees a danger, [n] bool; None: it acts from the start.
     notices: Callable[[Seen, Parameters], Bools] | None = None
     stays: bool = False  # whether the reaction continues after the danger is over
     # Names of parameters that may be 0; all others must be above 0.

@@ -240,8 +240,8 @@ FIRST_IMPACTS = stated("harm", "each pair's first impact", "sec:result, Experime
 def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
     """Return the quantities of a scenario as parameters, each with its origin.
 
-    ``places`` maps keys of the scenario to the place where the paper states them, if that is not the usual one; an
-    empty text marks our default.
+    The origin is the place in the paper that states the quantity (``_QUANTITIES``). ``places`` replaces it: key of the
+    scenario -> other place; an empty text marks our default.
     """
     content = scenario.model_dump(mode="json", exclude_none=True)
     found = [

@@ -153,10 +153,10 @@ class LearningCurves(NamedTuple):
         return self.folder / f"{recipe.name}-seed{seed}"
 
     def curves(self) -> dict[str, dict[str, SeedCurve]]:
-        """Return the results of the trainings, by metric and by name of the recipe; a metric without values is left
-        out.
+        """Return the learning curves: metric -> name of the recipe -> curve over all its seeds.
 
-        Against processor time, a step is placed at the mean over seeds, interpolated between evaluations.
+        Metrics are the counts of harm that the recipes' rewards use, and the return; a metric without values is left
+        out. If ``against`` is ``cpu``, the x value of a step is the processor time that seeds took to it, on average.
         """
         counts = {recipe.reward.harm_count for recipe, _ in self.plan}
         metrics = [RunDirectory.HARM[count] for count in HARM_COUNTS if count in counts]

@@ -94,7 +94,8 @@ def compare_number(
 def _off(printed: float, ours: Estimate) -> str:
     """Return a text on how far ``ours`` is from the printed number, such as "+3.1 %"; empty if the two agree.
 
-    They agree within ``TOLERANCE``, or within chance if chance is at most ``WIDE``.
+    They agree if they differ by at most 2 % of the printed number (``TOLERANCE``), or by no more than chance (see
+    ``_chance``). Chance does not count if it is above 15 % of the larger number (``WIDE``).
     """
     chance = _chance(ours)
     told = chance if chance <= WIDE * max(abs(printed), abs(ours.value)) else 0.0
@@ -104,8 +105,9 @@ def _off(printed: float, ours: Estimate) -> str:
 
 
 def _chance(estimate: Estimate) -> float:
-    """Return how far apart two such estimates from two lists of worlds may lie: sqrt 2 times the interval's
-    half-width.
+    """Return by how much this estimate and that of another list of as many worlds may differ by chance.
+
+    It is sqrt(2) times the half-width of the interval.
     """
     low, high = estimate.ends
     return math.sqrt(2.0) * 0.5 * (high - low)

@@ -61,7 +61,10 @@ class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
         )
 
     def suggest(self, trial_id: str) -> dict[str, Any] | None:
-        """Return the configuration of the next trial, and store a new proposal; ``trial_id`` is Ray's name of it."""
+        """Return the configuration of the next trial: ``{"trial": number, "values": proposal}``.
+
+        A proposal that is not in the file yet is stored there. ``trial_id`` is Ray's name of the trial.
+        """
         values, number = super().suggest(trial_id), self._asked
         if number == len(self.known):
             self.known.append(values)
