@@ -165,8 +165,9 @@ class Goal(NamedTuple):
     def of(cls, training: Training, reached: Harms, full_brake: Harms) -> Goal:
         """Return the quantity that ``training`` minimises, with its means.
 
-        It is the harm of the whole line, or, if the scenario gives the learners objectives of their own, the mean of
-        these. ``reached`` and ``full_brake`` are the harms by the trained policies and by full braking of all vehicles.
+        It is the harm of the whole line, or, if recipe or scenario give the learners objectives of their own, the mean
+        of these. ``reached`` and ``full_brake`` are the harms by the trained policies and by full braking of all
+        vehicles.
         """
         reward, scenario = training.recipe.reward, training.scenario
         objectives = reward.settled(scenario.objective, scenario.vehicles)[1]

@@ -66,9 +66,7 @@ class Recording:
     positions_m: Floats  # [T + 1, n, N] positions of the front bumpers; Vehicle 1 is at 0 at the alert
     speeds_mps: Floats  # [T + 1, n, N] speeds
     ledger: Ledger  # harm of all impacts of each episode
-    off_by: (
-        float  # largest change of a world's harm because the agent's commands were rounded to float32 actions (m2/s2)
-    )
+    off_by: float  # largest change of a world's harm because commands were rounded to float32 actions (m2/s2)
 
     @property
     def learners(self) -> tuple[int, ...]:

@@ -249,7 +249,7 @@ class Controller:
 
     """
 
-    knows = Source.MESSAGES
+    knows = Source.MESSAGES  # it decides from the messages that have reached it
 
     def __init__(self, name: str, law: Law, parameters: Mapping[str, float], step_s: float) -> None:
         self.name, self.law, self.parameters, self.time_step_s = name, law, Parameters(**parameters), step_s

@@ -37,7 +37,7 @@ class ModesModel(CounterfactualModel):
     """Model that trains a mixture of experts: several networks that drive, and a gate that chooses one of them.
 
     It trains the first expert alone, further experts in worlds of their own, the gate, then all together. The key
-    ``modes`` of the recipe configures it.
+    ``modes`` of the recipe configures it. The arguments are the environment of the training, and the recipe.
     """
 
     policy: ModesPolicy  # type: ignore[assignment]
@@ -130,7 +130,8 @@ class ModesModel(CounterfactualModel):
     def _compare(self, seen: Float32s, moments: State) -> tuple[Float32s, Floats, Float32s]:
         """Let each of the K experts play to the end from B of the visited decisions, and return what it costs.
 
-        The cost is minus the return. The B decisions are drawn; those at which all experts take the same action are
+        The cost is minus the return, plus ``tie_break`` times the harm under the count that the reward does not use.
+        The B decisions are drawn; those at which all experts take the same action are
         left out, because the choice has no effect there.
 
         Args:

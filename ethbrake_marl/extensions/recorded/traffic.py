@@ -57,8 +57,8 @@ class _Format(NamedTuple):
 
     title: str  # name of the data set, for users
     files: str  # pattern of the names of its files
-    # Names of the columns to read, in the order of the fields of ``_State``. A name ending in 1 stands for one column per
-    # vehicle: ``Speed1``, ``Speed2``, ...
+    # Names of the columns to read, in the order of the fields of ``_State``. A name ending in 1 stands for one column
+    # per vehicle: ``Speed1``, ``Speed2``, ...
     columns: tuple[str, ...]
     units: str  # units of lengths and speeds, for messages
     licence: str  # sentence about its licence, for the scenario's ``source``
