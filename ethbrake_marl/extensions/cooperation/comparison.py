@@ -133,7 +133,8 @@ def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: 
 def _change(before: Measured, after: Measured, algorithm: str) -> Json:
     """Return the change of harm from level ``before`` to level ``after`` on the same worlds; positive: more harm.
 
-    ``algorithm`` is the name of the algorithm, which is recorded.
+    The result has the form ``{"from": name, "to": name, "algorithm": name, "first": changes, "total": changes}``, with
+    the changes of the whole line and of each vehicle under each count of harm. ``algorithm`` is only recorded in it.
     """
     found: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
     for harm_count in HARM_COUNTS:

@@ -235,11 +235,13 @@ LAWS: dict[str, Law] = {
 class Controller:
     """Agent that follows a ``Law``, a controller's formula from the literature.
 
-    Its memory is the time at which it noticed the danger, [n] s; infinite: no danger yet.
+    Its memory is the time at which it noticed the danger, [n] s; infinite: no danger yet; NaN: before its first
+    decision.
 
     The reaction time runs from the decision at which the controller notices the danger. A danger that exists at the
-    first decision counts as noticed at the alert, so reaction time and latency overlap. The human model continues a
-    reaction once it has begun. The fuzzy model starts over when the danger is gone.
+    first decision counts as noticed at the alert, so reaction time and latency overlap. If
+    ``law.stays``, a reaction that has begun goes on after the danger is over (law ``r157_human``); else the controller
+    waits for the next danger (law ``r157_fsm``).
 
     Args:
         name: spec of the agent.

@@ -56,7 +56,7 @@ class ChoosingActor(Deterministic):
         action_space: Gymnasium space of an action.
         rate: learning rate as a function of the remaining share of the training, from 1 to 0.
         recipe: the recipe.
-        among: weights of trained policies, each by name, which the actor can choose instead of an action.
+        among: for each trained policy that the actor can choose instead of an action, its weights by name.
         members: number of scenarios in the training's mixture; 1 without a mixture.
 
     """

@@ -34,7 +34,7 @@ class OptionsModel(CounterfactualModel):
     Args:
         environment: environment of the training.
         recipe: the recipe.
-        among: weights of the trained policies that the actor may choose, each by name.
+        among: for each trained policy that the actor can choose instead of an action, its weights by name.
 
     """
 
@@ -143,7 +143,7 @@ class OptionsModel(CounterfactualModel):
         return observed[rows], tried, costs
 
     def _usual(self, rows: Ints, least: Floats) -> Floats:
-        """Update the running mean cost of each scenario of a mixture; return for B decisions that of their scenario.
+        """Update the running mean cost of each scenario of a mixture; return the mean that belongs to each decision.
 
         Args:
             rows: [B] indices of the decisions' worlds among all visited worlds.

@@ -128,7 +128,7 @@ class Course:
 
     @property
     def still_rising(self) -> float:
-        """Share of the rise that falls into the last quarter of the training, mean over seeds."""
+        """Rise of the return in the last quarter of the training, as a share of ``rise``; mean over seeds."""
         before = self.returns_at(np.array([0.75]))[:, 0]
         return float((self.returns.values[:, -1] - before).mean()) / abs(self.rise)
 

@@ -57,9 +57,9 @@ class Reproduction:
             check_target(self.docs, force=True)
 
     def seeds_of(self, wanted: Collection[str]) -> list[tuple[Group, str, list[Path]]]:
-        """Return the trainings of some groups: for each recipe its group, its name, and the folder of each seed.
+        """Return the trainings of the groups named in ``wanted``, as (group, name of the recipe, folder of each seed).
 
-        ``wanted`` are names of groups. The list is empty in mode ``quick``.
+        There is one entry for each recipe of each group. The list is empty in mode ``quick``.
         """
         return [
             (

@@ -104,9 +104,11 @@ class LearningCurves(NamedTuple):
     def write(self) -> dict[str, Any]:
         """Draw the finished trainings, write figure, table and summary to the folder, and return the summary.
 
-        For each recipe the summary has: the harm of the policy that each training kept, and of its last policy, as
-        interquartile mean over seeds with a stratified bootstrap interval; hashes of the recipe's fixed list and of the
-        kept policies. Raises ``InvalidInput`` if the trainings have no common evaluation step.
+        For each recipe the summary has the harm of the policies that the trainings kept, and of their last policies:
+        each is an interquartile mean over seeds, with a stratified bootstrap interval. It also has the hashes of the
+        recipe's fixed list and of the kept policies.
+
+        Raises ``InvalidInput`` if the trainings have no common evaluation step.
         """
         scenario, curves, lists = self.scenario, self.curves(), set()
         summary: dict[str, Any] = {

@@ -127,9 +127,9 @@ def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdi
 
 
 def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
-    """Return a verdict on whether a printed decrease of harm follows from the printed harms, to the printed digits.
+    """Return a verdict: does the decrease of harm printed in ``row`` follow from the harms printed in both rows?
 
-    ``baseline`` is the row against which the decrease counts.
+    ``baseline`` is the row to which the decrease refers. All printed numbers may be rounded to their last digit.
     """
     follows = 1.0 - row.average_harm / baseline.average_harm
     printed = row.harm_decrease or 0.0

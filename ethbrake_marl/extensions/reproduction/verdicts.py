@@ -115,9 +115,12 @@ def _chance(estimate: Estimate) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Less:
-    """One comparison of a statement that one quantity is smaller than another."""
+    """Difference of two quantities, as evidence for or against a statement that the first is smaller than the second.
 
-    where: str  # description of the comparison
+    A statement can need several of them, for example one for each group of worlds.
+    """
+
+    where: str  # worlds or strategies that are compared, in words
     difference: Estimate  # smaller quantity minus larger one; below 0 if the statement is right
     neither: bool = False  # True if both are 0 in every world, so that nothing is left to compare
     # proven lower bound minus the larger quantity; above 0, no strategy can make the statement right. None: no bound
@@ -127,7 +130,7 @@ class Less:
     def of_lists(cls, where: str, smaller: Floats, larger: Floats) -> Less:
         """Compare two samples from different worlds: is ``smaller`` [n] below ``larger`` [m] on average?
 
-        ``where`` describes the comparison.
+        ``where`` says in words what is compared.
         """
         return cls(where, unpaired_difference(mean(smaller), len(smaller), mean(larger), len(larger)))
 

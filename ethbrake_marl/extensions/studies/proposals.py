@@ -34,10 +34,10 @@ class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
 
     Args:
         file: JSON file of the proposals; created with the first one.
-        known: proposals in that file, which are proposed again first.
+        known: proposals that the file holds already; they are proposed again, before new ones.
         space: key -> Optuna's distribution of its values.
         sampler: function from the number of a trial to its Optuna sampler.
-        first: the first proposal if ``known`` is empty; None: a sampled one.
+        first: proposal of the very first trial, used if ``known`` is empty; None: it is sampled like the others.
 
     """
 

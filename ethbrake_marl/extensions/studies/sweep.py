@@ -193,7 +193,7 @@ class Row:
     asked: Request  # the job as the file requests it
     identity: str  # SHA-256 of everything that affects its training (``Training.identity``)
     name: str  # name of the job and of its folder
-    first: Training  # loaded training that differs at most in the seed; shared by all jobs of the same settings
+    first: Training  # training with the settings of the job, but perhaps another seed; jobs of equal settings share it
 
     @property
     def settings(self) -> dict[str, str]:
