@@ -122,7 +122,10 @@ class CounterfactualRecipe(TrainingRecipe):
         return None
 
     def begins(self, scenario: Scenario) -> str:
-        """Return a phrase about the initial weights: the spec of a policy, or ``random weights`` with the reason."""
+        """Return a phrase about the initial weights, for messages.
+
+        It is the spec of a policy, such as ``ppo@shipped/ppo``, or ``random weights`` with the reason.
+        """
         why = "" if self.start is None else f", as {self.start} has none for scenario {scenario.name!r}"
         return self.policy_to_start_from(scenario) or f"random weights{why}"
 

@@ -129,7 +129,7 @@ def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdi
 def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
     """Return a verdict: does the decrease of harm printed in ``row`` follow from the harms printed in both rows?
 
-    ``baseline`` is the row to which the decrease refers. All printed numbers may be rounded to their last digit.
+    ``baseline`` is the row to which the decrease refers. The two must agree within 0.01 percentage points.
     """
     follows = 1.0 - row.average_harm / baseline.average_harm
     printed = row.harm_decrease or 0.0

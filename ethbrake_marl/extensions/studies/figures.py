@@ -47,7 +47,7 @@ def is_done(job: TrainingJob) -> bool:
 
 
 def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
-    """Bring the training of ``job`` to its end, from where it stopped. Return False if it was stopped before.
+    """Bring the training of ``job`` to its end, from where it stopped. Return False if it was stopped early.
 
     ``stop_at`` takes each evaluation and returns a reason to stop, or None. Raises the exceptions of a training,
     ``InvalidInput`` if the folder holds another training, and ``BlockingIOError`` if another worker has just begun it.

@@ -74,7 +74,7 @@ class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
 
 
 class _SamplerOfTrial(BaseSampler):
-    """Optuna sampler that samples each trial with a new sampler, ``of(number of the trial)``."""
+    """Optuna sampler that makes a new sampler for each trial; ``of`` returns it for the number of the trial."""
 
     def __init__(self, of: Callable[[int], BaseSampler]) -> None:
         self._of = of
