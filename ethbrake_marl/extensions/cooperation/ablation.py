@@ -43,10 +43,12 @@ def run_ablation(
 def ablation_cost(plan: Plan) -> str:
     """Return a text for users that estimates the remaining work of an ablation in time of one core.
 
-    It has a further line for each damaged part of a search for the joint optimum. A short training of each level and
-    recipe, an evaluation and a search are timed by the wall clock, so other work on the machine makes the estimate
-    larger. Raises the exceptions of ``TrainingJob.steps_left``, and those of ``load_team`` for a finished training
-    whose policies cannot be loaded.
+    To estimate it, a short training of each level and recipe, an evaluation and a search are timed by the wall clock,
+    so other work on the machine makes the estimate larger. If results of earlier searches for the joint optimum are
+    damaged, the text has a line for each of them.
+
+    Raises the exceptions of ``TrainingJob.steps_left``, and those of ``load_team`` for a finished training whose
+    policies cannot be loaded.
     """
     left = [(level, algorithm, training, training.steps_left()) for level, algorithm, training in plan.trainings()]
     decisions: Counter[tuple[str, str]] = Counter()

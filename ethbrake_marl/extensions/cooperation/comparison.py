@@ -24,9 +24,10 @@ from ethbrake_marl.shield.episodes import Shielded
 def compare(measured: Sequence[Measured], searched: int) -> Json:
     """Return the comparison of all levels as plain data for JSON; docs/ablate-cooperation.md describes it.
 
-    Keys: ``levels``, ``steps`` of the ladder (each level against the one before), ``channels`` (levels that differ only
-    in ``v2x``), and ``undertrained``: a sentence for each level whose trained policies do worse than full braking. Each
-    algorithm has its own ladder; levels without learners belong to all ladders.
+    Keys: ``levels`` (results of each level), ``steps`` (each level against the one before), ``channels`` (each level
+    with a worse V2X channel against the level that it varies), and ``undertrained`` (a sentence for each level whose
+    trained policies do worse than full braking). Steps are compared for one algorithm at a time; a level without
+    learners counts in the comparison of every algorithm.
 
     Args:
         measured: results of ``measure``.
@@ -101,13 +102,13 @@ def _level(one: Measured, searched: int) -> Json:
 
 
 def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: int) -> Json:
-    """Return the results of the same teams in the same worlds behind a shield.
+    """Return the results of a level's teams behind a shield as plain data, compared with those without a shield.
 
     Args:
         one: results of the level without a shield.
-        shielded: results behind the shield that bounds the harm of this count.
-        harm_count: count of harm.
-        searched: number of worlds, from the first on, for the part ``searched``.
+        shielded: results of the same teams in the same worlds, behind a shield that bounds the harm ``harm_count``.
+        harm_count: impacts that harm counts: each pair's first one (``first``) or all (``total``).
+        searched: number of worlds, from the first on, over which the part ``searched`` of the result averages.
 
     """
     before, after = one.reached.vehicle[harm_count], shielded.vehicle_harm
@@ -132,7 +133,8 @@ def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: 
 def _change(before: Measured, after: Measured, algorithm: str) -> Json:
     """Return the change of harm from level ``before`` to level ``after`` on the same worlds; positive: more harm.
 
-    ``algorithm`` is the name of the algorithm, which is recorded.
+    The result has the form ``{"from": name, "to": name, "algorithm": name, "first": changes, "total": changes}``, with
+    the changes of the whole line and of each vehicle under each count of harm. ``algorithm`` is only recorded in it.
     """
     found: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
     for harm_count in HARM_COUNTS:

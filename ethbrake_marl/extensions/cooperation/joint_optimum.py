@@ -43,9 +43,11 @@ class LevelOptimum:
 
 
 def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample, list[Level]]]:
-    """Return the distinct search problems, each as (first level with it, worlds to search, all levels with it).
+    """Return the searches for a joint optimum that are needed, one for all levels with the same optimum.
 
-    ``samples`` are the worlds of each level of ``plan``, in the same order. Levels without learners have no problem.
+    Levels have the same optimum if worlds and learners are alike for the search. Each item is: the first such level,
+    the worlds to search, and all such levels. Levels without learners need no search. ``samples`` holds the worlds of
+    each level of ``plan``, in the same order.
     """
     found: dict[bytes, tuple[Level, Sample, list[Level]]] = {}
     rows = np.arange(plan.search_episodes)
@@ -91,9 +93,9 @@ def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmC
     """Return the least known harm [n] in each world of a level, under each count of harm (m2/s2).
 
     Args:
-        own: search and teams of the level.
-        answers: searches and teams of all levels, including ``own``. A result of another level counts in the worlds in
-            which the learners of ``own`` can do the same.
+        own: the level, with the result of its search and its trained teams.
+        answers: the same for all levels, including ``own``. A result of another level counts only in worlds in which
+            the learners of ``own`` can brake in the same way.
 
     """
     best = {harm_count: np.full(own.worlds.n, np.inf) for harm_count in HARM_COUNTS}
@@ -109,9 +111,9 @@ def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmC
 def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
     """Return in which worlds, [n] bool, the learners of ``own`` can do whatever the learners of ``other`` do.
 
-    This needs: the same learners or more, the same scripts for all others, equal latencies, and decisions of ``other``
-    that fall on decisions of ``own``. ``other`` may lack an obstacle, because its result is driven again with the
-    obstacle.
+    Conditions: ``own`` has the same learners or more, the other vehicles have the same scripts, latencies are equal,
+    and at every decision time of ``other`` the learners of ``own`` decide too. ``other`` may lack an obstacle, because
+    its result is driven again with the obstacle.
     """
     mine, theirs = own.level.scenario, other.level.scenario
     same_scripts = all(theirs.scripts.get(i) == script for i, script in mine.scripts.items())
@@ -161,9 +163,11 @@ class Goal(NamedTuple):
 
     @classmethod
     def of(cls, training: Training, reached: Harms, full_brake: Harms) -> Goal:
-        """Return the goal of a training: the harm of the line, or the learners' objectives if it has other ones.
+        """Return the quantity that ``training`` minimises, with its means.
 
-        ``reached`` and ``full_brake`` are the harms by the trained policies and by full braking of all vehicles.
+        It is the harm of the whole line, or, if recipe or scenario give the learners objectives of their own, the mean
+        of these. ``reached`` and ``full_brake`` are the harms by the trained policies and by full braking of all
+        vehicles.
         """
         reward, scenario = training.recipe.reward, training.scenario
         objectives = reward.settled(scenario.objective, scenario.vehicles)[1]

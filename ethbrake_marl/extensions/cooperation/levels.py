@@ -58,7 +58,7 @@ class Level:
     """One level of cooperation in an ablation: a scenario, compared with others on the same lines of vehicles."""
 
     scenario: Scenario  # who learns, who has which information, and whose harm counts
-    # Name of the level of which this one is a variant with another V2X channel; None: a level of its own.
+    # Name of an earlier level from which this one differs only in its V2X channel (``v2x``); None: there is none.
     clear: str | None = None
 
     @property
@@ -70,8 +70,8 @@ class Level:
 def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list[Level]:
     """Load the levels of an ablation, in this order.
 
-    A level that differs from an earlier one only in ``v2x`` counts as that level over another channel. The other levels
-    form the ladder; each is compared with the one before.
+    A level that differs from an earlier one only in ``v2x`` is compared with that level (``Level.clear``). Each of the
+    other levels is compared with the one before; they form the *ladder*.
 
     Args:
         names: names or paths of scenarios.
@@ -131,7 +131,10 @@ def _check_same(one: Level, first: Sample, other: Level, sample: Sample, names: 
 
 
 def _values(name: str, level: Level, sample: Sample) -> Floats:
-    """Return the quantity ``name`` of the worlds, one row per world, or a number of the scenario as one row."""
+    """Return the quantity called ``name`` of a level, such as ``gaps_m``, as an array with one row per world.
+
+    A number of the whole scenario, such as ``time_step_s``, gives a single row.
+    """
     if name in _LINE:
         return np.array([getattr(level.scenario, name)], np.float64)
     values: Floats = getattr(sample.worlds if name in _WORLD else sample.worlds.vehicles, name)

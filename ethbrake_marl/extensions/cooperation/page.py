@@ -238,10 +238,10 @@ _Columns = list[tuple[Column | str, str]]
 
 
 def _sheet(rows: Sequence[Json], columns: _Columns) -> Sheet:
-    """Return a table of ``rows``, nested objects.
+    """Return a table with one line for each of ``rows`` (nested objects from ``ablation.json``).
 
-    A column is a pair: heading, and path (keys separated by blanks) to its value in a row. The algorithm's column is
-    left out if there is only one algorithm.
+    A column is a pair of its heading, and the path to its value in a row: ``first harm`` leads to
+    ``row["first"]["harm"]``. The algorithm's column is left out if there is only one algorithm.
     """
     if len({row["algorithm"] for row in rows} - {None}) == 1:
         columns = [(column, path) for column, path in columns if column != _ALGORITHM]

@@ -193,7 +193,8 @@ class DatasetSummary:
     format: DatasetFormat  # ``parquet`` or ``minari``
     episodes: Mapping[str, int]  # agent's name -> number of recorded episodes
     decisions: int  # number of decisions in all episodes of all agents
-    # Agent's name -> largest change of a world's harm because commands were rounded to float32 actions (m2/s2).
+    # Agent's name -> largest difference (m2/s2) in a world between the harm of the recorded episode, whose actions are
+    # rounded to float32, and the harm with the agent's exact commands.
     off_by: Mapping[str, float]
     left_out: tuple[LeftOut, ...]  # worlds that were not recorded, because the physics could not advance them
 
@@ -213,7 +214,8 @@ def write_dataset(
 ) -> DatasetSummary:
     """Record agents in the same worlds of an evaluation list, as a Parquet file or a Minari dataset.
 
-    The recorded actions replay bit for bit. docs/datasets.md describes the content.
+    An environment that takes the recorded actions repeats the episodes bit for bit. docs/datasets.md describes the
+    content.
 
     Args:
         path: the file (``.parquet``) or the folder (``NAME-v0``) to write.

@@ -66,7 +66,7 @@ class Recording:
     positions_m: Floats  # [T + 1, n, N] positions of the front bumpers; Vehicle 1 is at 0 at the alert
     speeds_mps: Floats  # [T + 1, n, N] speeds
     ledger: Ledger  # harm of all impacts of each episode
-    off_by: float  # largest change of a world's harm because commands were rounded to actions (m2/s2)
+    off_by: float  # largest change of a world's harm because commands were rounded to float32 actions (m2/s2)
 
     @property
     def learners(self) -> tuple[int, ...]:
@@ -98,7 +98,9 @@ class Recording:
 
 
 def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Recording:
-    """Let an agent control the scenario's learners in these worlds, and record the episodes of its rounded actions.
+    """Let an agent control the scenario's learners in these worlds, and record the episodes.
+
+    The agent's commands are rounded to float32 actions; the recorded episodes are those with the rounded actions.
 
     Args:
         sample: the worlds at the alert.

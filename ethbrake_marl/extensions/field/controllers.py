@@ -82,9 +82,10 @@ class Seen(NamedTuple):
         return np.where(self.speed_mps > 0.0, self.gap_m / np.where(self.speed_mps > 0.0, self.speed_mps, 1.0), np.inf)
 
     def built_up(self, wanted_mps2: Floats, rate_mps3: float) -> Floats:
-        """Return the next command on the way to ``wanted_mps2``, [n] m/s2.
+        """Return the command [n] (m/s2) for the next time step, if braking can only build up gradually.
 
-        Braking grows by at most ``rate_mps3`` per second, starting from the own braking now.
+        It is ``wanted_mps2`` [n], but the deceleration exceeds the vehicle's present one by at most ``rate_mps3`` times
+        the time step.
         """
         return np.maximum(wanted_mps2, np.minimum(self.own_mps2, 0.0) - rate_mps3 * self.step_s)
 
@@ -186,7 +187,7 @@ class Law:
     source: str  # publication
     parameters: Mapping[str, float]  # default value of each parameter, in SI units
     command: Callable[[Seen, Parameters], Floats]  # formula that returns the acceleration, [n] m/s2
-    # Formula that returns where the law sees a danger, [n] bool; None: it acts from the first decision on.
+    # Formula that returns for each world whether the law sees a danger, [n] bool; None: it acts from the start.
     notices: Callable[[Seen, Parameters], Bools] | None = None
     stays: bool = False  # whether the reaction continues after the danger is over
     # Names of parameters that may be 0; all others must be above 0.
@@ -234,11 +235,13 @@ LAWS: dict[str, Law] = {
 class Controller:
     """Agent that follows a ``Law``, a controller's formula from the literature.
 
-    Its memory is the time at which it noticed the danger, [n] s; infinite: no danger yet.
+    Its memory is the time at which it noticed the danger, [n] s; infinite: no danger yet; NaN: before its first
+    decision.
 
     The reaction time runs from the decision at which the controller notices the danger. A danger that exists at the
-    first decision counts as noticed at the alert, so reaction time and latency overlap. The human model continues a
-    reaction once it has begun. The fuzzy model starts over when the danger is gone.
+    first decision counts as noticed at the alert, so reaction time and latency overlap. If
+    ``law.stays``, a reaction that has begun goes on after the danger is over (law ``r157_human``); else the controller
+    waits for the next danger (law ``r157_fsm``).
 
     Args:
         name: spec of the agent.
@@ -248,7 +251,7 @@ class Controller:
 
     """
 
-    knows = Source.MESSAGES
+    knows = Source.MESSAGES  # it decides from the messages that have reached it
 
     def __init__(self, name: str, law: Law, parameters: Mapping[str, float], step_s: float) -> None:
         self.name, self.law, self.parameters, self.time_step_s = name, law, Parameters(**parameters), step_s

@@ -96,7 +96,9 @@ class HostCommand(NamedTuple):
 
 
 class Host(Protocol):
-    """Interface of a simulator that moves ``n`` lines of vehicles. It starts at the alert.
+    """Interface of a host, a simulator that moves ``n`` lines of vehicles, one line per world, from the alert on.
+
+    A host needs the attribute ``dt`` and the methods ``state`` and ``apply``; it need not inherit from this class.
 
     ``dt`` is the length of every step (s). With ``math.inf`` each world moves to its own ``command.until_s``, the time
     of its next decision; a world that is already there does not move.

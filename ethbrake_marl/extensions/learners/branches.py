@@ -28,15 +28,20 @@ Decide = Callable[[Observations, Ints, int], Floats]  # (observations [m, L, F],
 
 
 class Offsets(NamedTuple):
-    """Changes of actions in n branches: in each one, an offset is added to one learner's actions for some steps."""
+    """Changed actions in n branches (copies of a running episode).
 
-    learner: Ints  # [n] number of that learner among the learners (0 = foremost)
-    size: Floats  # [n] offset that is added to its action; the sum is clipped to [-1, 1]
-    steps: Ints  # [n] number of steps with the offset
+    In each branch, an offset is added to the actions of one learner during its first steps. For example, with
+    ``learner = [0, 0]``, ``size = [0.1, -0.1]``, ``steps = [3, 3]``, the foremost learner brakes less for three steps
+    in the first branch, and more in the second.
+    """
+
+    learner: Ints  # [n] for each branch: index of the changed learner among the learners (0 = foremost)
+    size: Floats  # [n] for each branch: offset added to its actions; the sum is clipped to [-1, 1]
+    steps: Ints  # [n] for each branch: number of steps with the offset, from the first step on
 
 
 def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) -> tuple[Floats, Floats]:
-    """Play every branch to the end of its episode, with offsets added to one learner's actions.
+    """Play every branch (copy of a running episode) to its end, with an offset added to one learner's actions.
 
     Args:
         engine: engine whose n rows are the branches to play; it is changed.
@@ -44,9 +49,9 @@ def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) ->
         offsets: for each row the learner whose actions are changed, by how much, and for how many steps.
         gamma: discount of one time step.
 
-    Returns the discounted return [n] of that learner from now on (NaN for a row that could not be advanced), and by how
-    much its actions changed in all, [n], after clipping to [-1, 1]. If the reward is harm alone, a row ends as soon as
-    nothing can change any more.
+    Returns two arrays [n]: the changed learner's discounted return from now on (NaN for a row that could not be
+    advanced), and the sum over the steps of the changes of its actions, after clipping to [-1, 1]. If the reward is
+    harm alone, a row ends as soon as nothing can change any more.
 
     """
     moved, most = np.zeros(engine.n), int(offsets.steps.max(initial=0))
@@ -99,9 +104,10 @@ def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) 
 
 
 def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
-    """Play every row of an engine to the end of its episode with the policy ``act``.
+    """Play every row of an engine to the end of its episode, and return what the policy met on the way.
 
-    Returns the observations at each of the m decisions of all rows, [m, L, F], and the states at these decisions.
+    ``act`` is the policy of all learners. The result covers the m decisions of all rows, in the order of time: the
+    observations [m, L, F], and the states of the worlds.
     """
     seen_then, moments = [], []
 
@@ -115,10 +121,12 @@ def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
 
 
 def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
-    """Return for each of ``rows`` [m] whether everything stands, as one step ``before``, and will keep standing.
+    """Return for each of ``rows`` [m] whether all vehicles stand and will keep standing, [m] bool.
 
-    A policy with the same observation acts the same. So a row counts only if no latency or message can change the
-    observation.
+    ``before`` [m, columns] is the packed state of these rows one step earlier; it must show the same standstill.
+
+    A policy with the same observation acts the same. So the answer is True only if no latency or message can change
+    the observation later.
     """
     if engine.packed.has_messages or engine.in_pieces:
         return np.zeros(len(rows), np.bool_)  # messages under way may change the observation; a profile, the braking
@@ -157,14 +165,14 @@ def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, sta
 
 
 def other_count(count: HarmCount) -> HarmCount:
-    """Return ``total`` for the harm count ``first``, and ``first`` for ``total``."""
+    """Return the other count of harm: ``total`` (all impacts) for ``first`` (first impacts), and the reverse."""
     return "total" if count == "first" else "first"
 
 
 def moving_rows(moments: State) -> Bools:
-    """Return whether some vehicle moves in each of the states ``moments``, [n] bool.
+    """Return for each of the n states ``moments`` whether at least one vehicle moves, [n] bool.
 
-    A decision in which everything stands teaches nothing.
+    Decisions at which all vehicles stand are left out of training, because actions make no difference there.
     """
     column = moments.packed.column
     moving: Bools = (moments.motion[:, column.speed : column.command] != 0.0).any(axis=1)

@@ -19,15 +19,16 @@ from ethbrake_marl.training.networks import ACTIVATIONS
 
 
 class AveragedGate(nn.Module):
-    """Gating network that learns (``learning``), and the running ``average`` of its weights, which decides.
+    """Gating network, which chooses one of K experts (networks that drive) from an observation of F features.
 
-    A memory holds the last decisions at which the experts (networks that drive) were compared: the observation, and the
-    extra cost of each expert over the best one. M is the size of the memory, K the number of experts, F the number of
-    features of an observation.
+    It has two copies: ``learning`` is in training, and ``average``, with the running average of its weights, chooses.
+
+    A memory of M places holds the last decisions at which the experts were compared: the observation, and the extra
+    cost of each expert over the best one.
 
     Args:
         inputs: number of features of an observation.
-        rate: learning rate as a function of the remaining share of the training.
+        rate: learning rate as a function of the remaining share of the training, from 1 to 0.
         recipe: recipe with the key ``modes``.
 
     """

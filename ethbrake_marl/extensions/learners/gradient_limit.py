@@ -17,7 +17,11 @@ NARROWEST = 4.0  # least ratio of the largest to the smallest offset, which take
 
 
 def limit_that_cuts(sizes: Floats, share: float) -> float:
-    """Return the limit for gradient sizes [n] such that cutting larger ones to it removes ``share`` of their sum."""
+    """Return the limit to which large gradients are reduced, so that the sum of all sizes falls by ``share``.
+
+    ``sizes`` [n] are absolute gradients. For example, reducing ``[1, 1, 4]`` to at most 2 lowers the sum 6 to 4, so 2
+    is the limit for the share 1/3.
+    """
     rising = np.sort(sizes)
     kept = (
         np.cumsum(rising) + np.arange(len(rising) - 1, -1, -1) * rising
@@ -26,16 +30,16 @@ def limit_that_cuts(sizes: Floats, share: float) -> float:
 
 
 def smallest_offset(measured: Floats, least: float, most: float) -> float:
-    """Return the smallest offset of an action to draw when gradients are measured.
+    """Return the smallest offset (change of an action) with which gradients should be measured.
 
-    It is ``least``, or more if the spread of gradients falls steeply with the offset.
-
-    Where harm jumps, the spread falls with the square root of the offset; where harm is smooth, it is constant. The
-    slope is measured between the smaller and the larger half of the offsets.
+    Where harm jumps, gradients scatter more the smaller the offset; where harm is smooth, they do not. So the result is
+    the offset at which their root mean square is expected to be ``SPREAD`` times as large as at ``most``. It is limited
+    to ``most / NARROWEST``, and is never below ``least``. If gradients do not scatter more at small offsets, it is
+    ``least``.
 
     Args:
-        measured: [n, 2] sizes of measured gradients, and the offsets with which they were measured (0: no measurement
-            yet).
+        measured: [n, 2] absolute value of each measured gradient, and the offset with which it was measured (0: no
+            measurement yet). The smaller half of the offsets is compared with the larger half.
         least: lower end of the range of offsets.
         most: upper end of the range of offsets.
 

@@ -37,7 +37,7 @@ class ModesModel(CounterfactualModel):
     """Model that trains a mixture of experts: several networks that drive, and a gate that chooses one of them.
 
     It trains the first expert alone, further experts in worlds of their own, the gate, then all together. The key
-    ``modes`` of the recipe configures it.
+    ``modes`` of the recipe configures it. The arguments are the environment of the training, and the recipe.
     """
 
     policy: ModesPolicy  # type: ignore[assignment]
@@ -128,15 +128,17 @@ class ModesModel(CounterfactualModel):
         follow(pupil.average, pupil.learning, 0.0)
 
     def _compare(self, seen: Float32s, moments: State) -> tuple[Float32s, Floats, Float32s]:
-        """Let every expert continue from some of the visited decisions, and return what each costs.
+        """Let each of the K experts play to the end from B of the visited decisions, and return what it costs.
 
-        Decisions at which all experts take the same action are left out, because the choice has no effect there.
+        The cost is minus the return, plus ``tie_break`` times the harm under the count that the reward does not use.
+        The B decisions are drawn; those at which all experts take the same action are
+        left out, because the choice has no effect there.
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
             moments: states of the worlds at these decisions.
 
-        Returns observations [B, F], costs [B, K], and the importance of each decision [B].
+        Returns observations [B, F], costs [B, K], and the importance (weight in the loss) of each decision [B].
 
         """
         engine, members = self.engine, [actor.act for actor in self.policy.actors]

@@ -23,8 +23,12 @@ from ethbrake_marl.training.networks import tensors_of_layers
 class ModesPolicy(Deterministic):
     """Mixture of experts: at each decision a gating network chooses which of several actors (experts) acts.
 
-    The arguments are the spaces of Stable-Baselines3, the learning rate as a function of the remaining share of the
-    training, and a recipe with the key ``modes``.
+    Args:
+        observation_space: Gymnasium space of an observation.
+        action_space: Gymnasium space of an action.
+        rate: learning rate as a function of the remaining share of the training, from 1 to 0.
+        recipe: recipe with the key ``modes``.
+
     """
 
     def __init__(
@@ -38,7 +42,10 @@ class ModesPolicy(Deterministic):
         self.gate = AveragedGate(flatdim(observation_space), rate, recipe)
 
     def _chosen(self, observation: Float32s, ask: Callable[[AveragedActor, Float32s], NDArray[Any]]) -> Floats:
-        """Return for each observation the value that ``ask`` returns for the actor that the gate chooses, [rows]."""
+        """Return for each observation [rows, F] one value, [rows], from the actor that the gate chooses for it.
+
+        ``ask`` is a method of the actors from observations to values, such as ``AveragedActor.means``.
+        """
         chosen, found = self.gate.choose(observation), np.empty(len(observation))
         for number, actor in enumerate(self.actors):
             rows = np.flatnonzero(chosen == number)
@@ -60,6 +67,6 @@ class ModesPolicy(Deterministic):
         return found
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return the actions [rows, 1] of the averaged weights for observations [rows, F]."""
+        """Return the actions [rows, 1] of the averaged networks for observations [rows, F]."""
         chosen = self.gate.average(observation).argmax(dim=1, keepdim=True)
         return torch.cat([actor(observation) for actor in self.actors], dim=1).gather(1, chosen)

@@ -130,7 +130,8 @@ def own_worlds(engine: Engine, plan: ModesPlan, found: Explored, act: Act, gamma
     """Return the starting states of the worlds in which a new expert is to be trained.
 
     These are the worlds in which its return is at most ``plan.margin`` below the best of the earlier experts. Worlds in
-    which it makes no difference, or in which earlier experts do no harm, teach nothing and are left out.
+    which it has the same return as the best one, or in which an earlier expert does no harm, are left out: it could
+    learn nothing there.
 
     Args:
         engine: engine of the training; it is not changed.

@@ -12,7 +12,7 @@ from ethbrake_marl.training.recipe import Rate
 
 
 class OffsetRange(FileModel):
-    """Range of distances between two actions, from which one is drawn with a uniform logarithm.
+    """Range from which a distance between two actions is drawn, uniformly in its logarithm.
 
     Actions are numbers from -1 (full braking) to 1.
     """

@@ -31,6 +31,6 @@ class Options(Algorithm):
         return OptionsModel(environment, recipe, among)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of the averaged weights of ``actor``, by their names in a policy bundle with this network."""
+        """Return copies of the averaged weights of ``actor``, by the names in the bundle that ``network`` describes."""
         found: dict[str, Float32s] = actor.tensors(network)
         return found

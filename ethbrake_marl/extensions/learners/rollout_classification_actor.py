@@ -43,27 +43,29 @@ class _TorchActor(Actor):
 
 
 class ChoosingActor(Deterministic):
-    """Actor whose network scores a number of actions; it takes the action with the highest score.
+    """Actor whose network scores a number of options; it takes the option with the highest score.
 
-    ``learning`` are the weights that learn; their running ``average`` drives. The memory holds the last decisions at
-    which actions were tried, with the extra cost of each tried action over the best one. M is its size, C the number of
-    actions tried at a decision, F the number of features.
+    The first ``first`` options are policies, which then choose the action; the others are actions, evenly from -1 to 1.
+    The network ``learning`` is in training; ``average``, with the running average of its weights, drives.
+
+    The memory of M places holds the last decisions at which C options were tried, and how much more each cost than the
+    best one. F is the number of features.
 
     Args:
-        observation_space: space of an observation, in Stable-Baselines3.
-        action_space: space of an action.
-        rate: learning rate as a function of the remaining share of the training.
+        observation_space: Gymnasium space of an observation.
+        action_space: Gymnasium space of an action.
+        rate: learning rate as a function of the remaining share of the training, from 1 to 0.
         recipe: the recipe.
-        among: weights of trained policies, each by name, which the actor can choose instead of an action.
+        among: for each trained policy that the actor can choose instead of an action, its weights by name.
         members: number of scenarios in the training's mixture; 1 without a mixture.
 
     """
 
     seen: Tensor  # [M, F] observations in memory
-    tried: Tensor  # [M, C] numbers of the tried actions; the first one was taken
-    more: Tensor  # [M, C] extra cost of each tried action
+    tried: Tensor  # [M, C] numbers of the tried options; the actor itself took the first of the C
+    more: Tensor  # [M, C] extra cost of each tried option over the best one
     known: Tensor  # [1] number of decisions added to the memory so far; new ones replace the oldest
-    usual: Tensor  # [members] mean cost of the best tried action in each scenario of a mixture; 0: not measured yet
+    usual: Tensor  # [members] mean cost of the best tried option in each scenario of a mixture; 0: not measured yet
 
     def __init__(
         self,
@@ -98,9 +100,10 @@ class ChoosingActor(Deterministic):
 
     @torch.no_grad()
     def choose(self, observation: Float32s) -> Ints:
-        """Return the numbers of the actions with the highest scores, [rows], for observations [rows, F].
+        """Return the number of the option with the highest score, [rows], for each of the observations [rows, F].
 
-        Numbers below ``first`` stand for policies, the others for actions, evenly spread from -1 to 1.
+        Numbers below the attribute ``first`` stand for policies. The other numbers stand for actions, evenly spread:
+        ``first`` is the action -1, and the largest number is the action 1.
         """
         chosen: Ints = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen
@@ -110,7 +113,7 @@ class ChoosingActor(Deterministic):
         return found
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return the actions [rows, 1] of the averaged weights for observations [rows, F]."""
+        """Return the actions [rows, 1] of the averaged network for observations [rows, F]."""
         return torch.from_numpy(self.act(observation.numpy()))[:, None]
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
@@ -122,8 +125,8 @@ class ChoosingActor(Deterministic):
 
         Args:
             seen: [m, F] observations.
-            tried: [m, C] numbers of the tried actions; the first one was taken.
-            more: [m, C] extra cost of each tried action over the best one.
+            tried: [m, C] numbers of the tried options, as from ``choose``; the actor itself took the first of the C.
+            more: [m, C] extra cost of each tried option over the best one.
 
         """
         places = torch.arange(int(self.known), int(self.known) + len(seen)) % len(self.seen)
@@ -132,7 +135,9 @@ class ChoosingActor(Deterministic):
         self.known += len(seen)
 
     def draw(self, batches: int, count: int, focus: float) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield decisions of the memory for each gradient step, as (row numbers [count], their importance [count]).
+        """Draw decisions from the memory; yield for each gradient step their rows and importance, both [count].
+
+        The importance is a decision's weight in the loss.
 
         Args:
             batches: number of gradient steps.

@@ -34,7 +34,7 @@ class OptionsModel(CounterfactualModel):
     Args:
         environment: environment of the training.
         recipe: the recipe.
-        among: weights of the trained policies that the actor may choose, each by name.
+        among: for each trained policy that the actor can choose instead of an action, its weights by name.
 
     """
 
@@ -79,14 +79,15 @@ class OptionsModel(CounterfactualModel):
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
 
     def _try_actions(self, seen: Float32s, moments: State) -> tuple[Float32s, Ints, Floats]:
-        """Try several actions at some of the visited decisions, each to the end of its episode.
+        """Try several options (actions, or policies that act) at some visited decisions, each to the episode's end.
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
             moments: states of the worlds at these decisions.
 
-        Returns observations [B, F], numbers of the tried actions [B, C], and their costs [B, C]. The first action is
-        the one that the actor takes. The costs include the recipe's ``caution``.
+        Returns for B decisions and C options at each: observations [B, F], numbers of the options [B, C] as from
+        ``ChoosingActor.choose``, and their costs [B, C]. The first option is the one that the actor takes. A cost is
+        minus the return, changed by the recipe's keys ``tie_break``, ``caution`` and ``relative``.
 
         """
         recipe, actor, learners = self.recipe, self.policy, len(self.engine.learners)
@@ -142,11 +143,13 @@ class OptionsModel(CounterfactualModel):
         return observed[rows], tried, costs
 
     def _usual(self, rows: Ints, least: Floats) -> Floats:
-        """Update the running mean of costs in each scenario of a mixture, and return it for each decision, [B].
+        """Update the running mean cost of each scenario of a mixture; return the mean that belongs to each decision.
 
         Args:
-            rows: [B] row numbers of the decisions among the visited ones.
-            least: [B] cost of the best tried action at each of them.
+            rows: [B] indices of the decisions' worlds among all visited worlds.
+            least: [B] cost of the best tried option at each decision.
+
+        The result [B] has a lower limit, so that costs can be divided by it.
 
         """
         numbers = self._numbers[rows]

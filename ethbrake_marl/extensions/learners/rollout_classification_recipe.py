@@ -51,24 +51,30 @@ class OptionsRecipe(TrainingRecipe):
     most_decisions = 2**22
 
     algorithm: Literal["options"]
+    # Trained policies, each of which can act at a decision. One that chooses among policies is replaced by those.
     among: Annotated[tuple[PolicyName, ...], Field(strict=False, max_length=16, exclude_if=not_)] = Field(
         (), description="policies of which one can act at each decision; one that chooses among others stands for them"
     )
+    # Number of consecutive decisions in each world between two updates.
     n_steps: int = Field(ge=1, description="decisions of each world between two updates")
     tried: int = Field(ge=1, description="how many of the decisions of a round are tried with other actions")
+    # Ranges of distances; from each, one is drawn, and the actions this far below and above the taken one are tried.
     near: Annotated[tuple[OffsetRange, ...], Field(strict=False, max_length=8)] = Field(
         description="ranges of distances to the action taken, each tried below and above it; the logarithm drawn is"
         " uniform"
     )
+    # Actions that are tried at every such decision; each is rounded to the nearest of the ``choices`` of the network.
     fixed: Annotated[tuple[Annotated[float, Field(ge=-1.0, le=1.0)], ...], Field(strict=False, max_length=16)] = Field(
         description="actions tried at each of these decisions, from -1 (full braking) to 1; the nearest of the choices"
         " is"
     )
+    # Number of random options that are tried: policies of ``among``, or if it is empty actions.
     drawn: int = Field(
         ge=0,
         le=16,
         description="how many more are tried there: of the policies among, or where there are none of the choices",
     )
+    # Numbers of steps, one of which is drawn at each decision; a tried action is held for so long.
     holds: Holds = Field(description="for how many steps an action is tried, one of these")
     # Upper limit of an action's extra cost over the best tried action, so that rare large costs do not dominate.
     largest_cost: Positive = Field(
@@ -102,6 +108,7 @@ class OptionsRecipe(TrainingRecipe):
     guide: NonNegative = Field(
         description="weight of the convex part of the loss, without which learning can stand still at the beginning"
     )
+    # Number of decisions in memory, from which the network learns: the latest with a difference between the costs.
     memory: int = Field(
         ge=1,
         le=500_000,

@@ -26,10 +26,15 @@ from ethbrake_marl.policies.network_spec import Float32s
 
 
 class CounterfactualModel(BaseAlgorithm):
-    """Model that visits decisions with a deterministic actor, tries some of them in two ways, and learns from that.
+    """Model that visits decisions with a deterministic actor, tries two actions at some of them, and learns from that.
 
-    The two ways are a higher and a lower action; the difference of the returns measures the gradient. The arguments are
-    the environment of the training, and the recipe.
+    One of the two actions is higher than the actor's, the other is lower. The difference of the returns measures the
+    gradient of the return with respect to the action.
+
+    Args:
+        environment: environment of the training.
+        recipe: the recipe.
+
     """
 
     policy: AveragedActor
@@ -74,9 +79,9 @@ class CounterfactualModel(BaseAlgorithm):
         return self
 
     def _update(self, told: BaseCallback, total: int) -> None:
-        """Collect decisions and learn from them, once.
+        """Do one update of the training: collect decisions, and learn from them.
 
-        ``told`` is the callback of the training, ``total`` the number of decisions at its end.
+        ``told`` is the training's callback, ``total`` the number of decisions in the whole training.
         """
         actor = self.policy
         seen, moments = self._visit(told, actor.act)

@@ -38,7 +38,7 @@ class ActorShape(Shape):
 class CounterfactualRecipe(TrainingRecipe):
     """Recipe of vine: some decisions are tried with a higher and a lower action, each to the end of its episode.
 
-    These are ``counterfactuals`` of the ``n_envs x n_steps`` decisions of a round. The policy learns from the
+    A round has ``n_envs x n_steps`` decisions; ``counterfactuals`` of them are tried. The policy learns from the
     differences of the returns. ``start`` names a trained policy to continue from; without it the weights are random.
     ``ppo@shipped`` is the policy that ships for the scenario; if none ships, the weights are random.
     """
@@ -122,7 +122,10 @@ class CounterfactualRecipe(TrainingRecipe):
         return None
 
     def begins(self, scenario: Scenario) -> str:
-        """Return a phrase about the initial weights: the spec of a policy, or ``random weights`` with the reason."""
+        """Return a phrase about the initial weights, for messages.
+
+        It is the spec of a policy, such as ``ppo@shipped/ppo``, or ``random weights`` with the reason.
+        """
         why = "" if self.start is None else f", as {self.start} has none for scenario {scenario.name!r}"
         return self.policy_to_start_from(scenario) or f"random weights{why}"
 

@@ -57,14 +57,17 @@ class _Format(NamedTuple):
 
     title: str  # name of the data set, for users
     files: str  # pattern of the names of its files
-    columns: tuple[str, ...]  # columns for the first fields of ``_State``; a name ending in 1 is followed by 2, 3, ...
+    # Names of the columns to read, in the order of the fields of ``_State``. A name ending in 1 stands for one column
+    # per vehicle: ``Speed1``, ``Speed2``, ...
+    columns: tuple[str, ...]
     units: str  # units of lengths and speeds, for messages
     licence: str  # sentence about its licence, for the scenario's ``source``
     metres: float = 1.0  # number of metres in a unit of length of the files
-    ticks: float = 1.0  # number of ticks (intervals between recorded moments) in a unit of the first column
+    ticks: float = 1.0  # number of ticks (intervals between recorded moments) per unit of time of the files
     hertz: float = 10.0  # number of ticks in a second
-    impossible: float = 0.0  # largest share of vehicles with a fault (overlap, missing leader); they are left out
-    elsewhere: tuple[str, ...] = ()  # places whose lines are left out: streets with crossings
+    # Largest accepted share of vehicles with a fault (overlap, missing leader). Faulty vehicles are left out.
+    impossible: float = 0.0
+    elsewhere: tuple[str, ...] = ()  # lines of a file that contain one of these texts (names of streets) are left out
     blanks: bool = False  # True if empty cells mean that nothing was measured
 
 

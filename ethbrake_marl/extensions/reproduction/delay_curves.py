@@ -105,7 +105,7 @@ class Course:
 
     @property
     def decisions_to_converge(self) -> Floats:
-        """Number of decisions until ``_DONE`` of the fall of the harm is reached, [seeds]."""
+        """Number of decisions until 90 % of the whole fall of the harm is reached, [seeds] (``_DONE``)."""
         first, least = self.harm.values[:, :1], self.harm.values.min(axis=1, keepdims=True)
         there = self.harm.values <= first - _DONE * (first - least)
         return np.asarray(self.harm.steps[np.argmax(there, axis=1)])
@@ -119,17 +119,16 @@ class Course:
         return np.array([np.interp(steps, self.returns.steps, own) for own in self.returns.values])
 
     def unrest(self, points: int) -> Floats:
-        """Return how much each seed's return fluctuates in the second half of the training, [seeds], as a share of the
-        rise.
+        """Return how much the return of each seed fluctuates in the second half of the training, [seeds].
 
-        It is the standard deviation of the changes between ``points`` at equal distances, so that trainings of
-        different lengths can be compared.
+        The return is taken at ``points`` equally distant times. The result is the standard deviation of the changes
+        from one time to the next, divided by ``rise``, so that trainings of different lengths can be compared.
         """
         return np.asarray(np.diff(self.returns_at(np.linspace(0.5, 1.0, points)), axis=1).std(axis=1) / abs(self.rise))
 
     @property
     def still_rising(self) -> float:
-        """Share of the rise that falls into the last quarter of the training, mean over seeds."""
+        """Rise of the return in the last quarter of the training, as a share of ``rise``; mean over seeds."""
         before = self.returns_at(np.array([0.75]))[:, 0]
         return float((self.returns.values[:, -1] - before).mean()) / abs(self.rise)
 

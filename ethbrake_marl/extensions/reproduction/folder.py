@@ -57,9 +57,9 @@ class Reproduction:
             check_target(self.docs, force=True)
 
     def seeds_of(self, wanted: Collection[str]) -> list[tuple[Group, str, list[Path]]]:
-        """Return the trainings of some groups: for each recipe its group, its name, and the folder of each seed.
+        """Return the trainings of the groups named in ``wanted``, as (group, name of the recipe, folder of each seed).
 
-        ``wanted`` are names of groups. The list is empty in mode ``quick``.
+        There is one entry for each recipe of each group. The list is empty in mode ``quick``.
         """
         return [
             (
@@ -240,8 +240,8 @@ FIRST_IMPACTS = stated("harm", "each pair's first impact", "sec:result, Experime
 def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
     """Return the quantities of a scenario as parameters, each with its origin.
 
-    ``places`` maps keys of the scenario to the place where the paper states them, if that is not the usual one; an
-    empty text marks our default.
+    The origin is the place in the paper that states the quantity (``_QUANTITIES``). ``places`` replaces it: key of the
+    scenario -> other place; an empty text marks our default.
     """
     content = scenario.model_dump(mode="json", exclude_none=True)
     found = [

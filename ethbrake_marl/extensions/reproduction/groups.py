@@ -54,7 +54,8 @@ _ENDS_M = (10.0, 12.0, 14.0, 16.0, 18.0, 20.0)  # limits of the groups of d_1 + 
 def by_distance(evaluation: Evaluation) -> tuple[list[float], Groups]:
     """Group worlds by the sum of both gaps. Return the mean sum of each group (m), and the harm by group and strategy.
 
-    Groups are named like "10-12 m"; empty groups are left out.
+    The second result has the form ``{"10-12 m": {"PPO": harm, ...}, ...}`` with the harm of each world in the group.
+    Empty groups are left out.
     """
     total, found = evaluation.worlds.gaps_m.sum(axis=1), harms(evaluation)
     inner, at, groups = np.digitize(total, _ENDS_M[1:-1]), [], {}

@@ -104,9 +104,11 @@ class LearningCurves(NamedTuple):
     def write(self) -> dict[str, Any]:
         """Draw the finished trainings, write figure, table and summary to the folder, and return the summary.
 
-        For each recipe the summary has: the harm of the policy that each training kept, and of its last policy, as
-        interquartile mean over seeds with a stratified bootstrap interval; hashes of the recipe's fixed list and of the
-        kept policies. Raises ``InvalidInput`` if the trainings have no common evaluation step.
+        For each recipe the summary has the harm of the policies that the trainings kept, and of their last policies:
+        each is an interquartile mean over seeds, with a stratified bootstrap interval. It also has the hashes of the
+        recipe's fixed list and of the kept policies.
+
+        Raises ``InvalidInput`` if the trainings have no common evaluation step.
         """
         scenario, curves, lists = self.scenario, self.curves(), set()
         summary: dict[str, Any] = {
@@ -153,10 +155,10 @@ class LearningCurves(NamedTuple):
         return self.folder / f"{recipe.name}-seed{seed}"
 
     def curves(self) -> dict[str, dict[str, SeedCurve]]:
-        """Return the results of the trainings, by metric and by name of the recipe; a metric without values is left
-        out.
+        """Return the learning curves: metric -> name of the recipe -> curve over all its seeds.
 
-        Against processor time, a step is placed at the mean over seeds, interpolated between evaluations.
+        Metrics are the counts of harm that the recipes' rewards use, and the return; a metric without values is left
+        out. If ``against`` is ``cpu``, the x value of a step is the processor time that seeds took to it, on average.
         """
         counts = {recipe.reward.harm_count for recipe, _ in self.plan}
         metrics = [RunDirectory.HARM[count] for count in HARM_COUNTS if count in counts]

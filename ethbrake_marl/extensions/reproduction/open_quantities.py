@@ -48,8 +48,11 @@ class Alternative:
     value: str  # the value in words
     changes: Mapping[str, Any] = field(default_factory=dict)  # keys of the scenario with their new values
     seed: int | None = None  # seed of the list of worlds; None: the usual one
-    harm: Literal["first", "total", "sampled", "predicted"] = "first"  # harm that is counted
-    # H* (harm expected of E-V2X-BM) in the hybrid that replaces PPO: simulated or predicted; None: PPO itself
+    # Harm that is counted: first impacts, all impacts (``total``), harm of the sampled aftermath, or the harm that
+    # E-V2X-BM predicts.
+    harm: Literal["first", "total", "sampled", "predicted"] = "first"
+    # None: PPO drives. Else the paper's hybrid of PPO and E-V2X-BM drives in its place, and this says how the hybrid
+    # finds H*, the harm expected of E-V2X-BM: ``coupled`` simulates it, ``pairwise`` predicts it by a closed form.
     bound: Literal["coupled", "pairwise"] | None = None
 
 
@@ -236,10 +239,10 @@ def reproduce_gaps(settings: Reproduction) -> Made:
 
 
 def _measure(scenario: Scenario, alternative: Alternative, episodes: int) -> Headline:
-    """Evaluate the strategies on the random test with one alternative; return their harm and collisions in each world.
+    """Evaluate the strategies on the random test under one alternative; return harm and collisions in each world.
 
-    If the alternative counts predicted harm, strategies without a prediction count with their first-impact harm.
-    ``episodes`` is the number of worlds.
+    ``scenario`` is the random test, before the alternative's changes; ``episodes`` is the number of worlds. If the
+    alternative counts predicted harm, strategies without a prediction count with their first-impact harm.
     """
     own = scenario.replace(**alternative.changes) if alternative.changes else scenario
     agents: dict[str, Agent] = lineup(own, *_SPECS)

@@ -42,7 +42,10 @@ class Beside:
 
     @cached_property
     def numbers(self) -> dict[str, dict[str, Estimate]]:
-        """Our results, by strategy and by quantity (such as "collision rate"). ``NOBODY`` has the proven minimum."""
+        """Our results: strategy -> quantity (such as "collision rate") -> estimate.
+
+        The key "least possible (proven)" (``NOBODY``), if present, holds the proven minimum over all strategies.
+        """
         found, braking = {}, self.evaluation.outcomes.get(NAMES[FULL_BRAKE])
         for name, outcome in self.evaluation.outcomes.items():
             harm, predicted = outcome.first_impact_harm, outcome.predicted_harm
@@ -60,7 +63,9 @@ class Beside:
         return found
 
     def candidates(self, row: str, quantity: str) -> Iterator[tuple[str, Estimate]]:
-        """Yield our results to which one number of the paper may correspond: name and estimate, the compared one first.
+        """Yield all results of ours that a number in the paper may mean, each as (name, estimate).
+
+        The first one is compared with the paper's number; the others are named if it differs.
 
         Args:
             row: name of the strategy in the paper.
@@ -122,9 +127,9 @@ def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdi
 
 
 def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
-    """Return a verdict on whether a printed decrease of harm follows from the printed harms, to the printed digits.
+    """Return a verdict: does the decrease of harm printed in ``row`` follow from the harms printed in both rows?
 
-    ``baseline`` is the row against which the decrease counts.
+    ``baseline`` is the row to which the decrease refers. The two must agree within 0.01 percentage points.
     """
     follows = 1.0 - row.average_harm / baseline.average_harm
     printed = row.harm_decrease or 0.0

@@ -94,7 +94,8 @@ def compare_number(
 def _off(printed: float, ours: Estimate) -> str:
     """Return a text on how far ``ours`` is from the printed number, such as "+3.1 %"; empty if the two agree.
 
-    They agree within ``TOLERANCE``, or within chance if chance is at most ``WIDE``.
+    They agree if they differ by at most 2 % of the printed number (``TOLERANCE``), or by no more than chance (see
+    ``_chance``). Chance does not count if it is above 15 % of the larger number (``WIDE``).
     """
     chance = _chance(ours)
     told = chance if chance <= WIDE * max(abs(printed), abs(ours.value)) else 0.0
@@ -104,8 +105,9 @@ def _off(printed: float, ours: Estimate) -> str:
 
 
 def _chance(estimate: Estimate) -> float:
-    """Return how far apart two such estimates from two lists of worlds may lie: sqrt 2 times the interval's
-    half-width.
+    """Return by how much this estimate and that of another list of as many worlds may differ by chance.
+
+    It is sqrt(2) times the half-width of the interval.
     """
     low, high = estimate.ends
     return math.sqrt(2.0) * 0.5 * (high - low)
@@ -113,9 +115,12 @@ def _chance(estimate: Estimate) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Less:
-    """One comparison of a statement that one quantity is smaller than another."""
+    """Difference of two quantities, as evidence for or against a statement that the first is smaller than the second.
 
-    where: str  # description of the comparison
+    A statement can need several of them, for example one for each group of worlds.
+    """
+
+    where: str  # worlds or strategies that are compared, in words
     difference: Estimate  # smaller quantity minus larger one; below 0 if the statement is right
     neither: bool = False  # True if both are 0 in every world, so that nothing is left to compare
     # proven lower bound minus the larger quantity; above 0, no strategy can make the statement right. None: no bound
@@ -125,7 +130,7 @@ class Less:
     def of_lists(cls, where: str, smaller: Floats, larger: Floats) -> Less:
         """Compare two samples from different worlds: is ``smaller`` [n] below ``larger`` [m] on average?
 
-        ``where`` describes the comparison.
+        ``where`` says in words what is compared.
         """
         return cls(where, unpaired_difference(mean(smaller), len(smaller), mean(larger), len(larger)))
 

@@ -15,7 +15,9 @@ _SILENT = ("ray.tune.tune", "ray.tune.analysis.experiment_analysis")  # they adv
 
 @contextmanager
 def connected(address: str, cores: int | None) -> Iterator[None]:
-    """Context manager that connects to Ray while the block runs. SIGTERM acts like Ctrl-C in the block.
+    """Context manager that connects to Ray while its block runs, and disconnects afterwards, also after an error.
+
+    Inside the block the signal SIGTERM acts like Ctrl-C.
 
     Args:
         address: address of a running cluster, or ``local`` for a Ray on this machine.

@@ -77,9 +77,9 @@ def search(
 
 
 def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
-    """Yield scrambled Sobol points one by one, evenly spread over the unit cube, each [d].
+    """Yield points that are evenly spread over the unit cube (scrambled Sobol points), one by one, each [d].
 
-    They are drawn in whole rounds, because their balance needs powers of two.
+    ``dimensions`` is d. The sequence has no end, and the same seed gives the same points.
     """
     from scipy.stats import qmc  # imported here, because it takes a second to load
 

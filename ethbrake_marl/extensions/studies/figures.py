@@ -47,7 +47,7 @@ def is_done(job: TrainingJob) -> bool:
 
 
 def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
-    """Bring the training of ``job`` to its end, from where it stopped. Return False if it was stopped before.
+    """Bring the training of ``job`` to its end, from where it stopped. Return False if it was stopped early.
 
     ``stop_at`` takes each evaluation and returns a reason to stop, or None. Raises the exceptions of a training,
     ``InvalidInput`` if the folder holds another training, and ``BlockingIOError`` if another worker has just begun it.
@@ -84,9 +84,10 @@ def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
 
 
 def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, Any]:
-    """Return the entries of ``job`` for a table, after these evaluations: ``harm`` and ``FIGURES`` by name.
+    """Return the figures of the training ``job`` for a table, given its evaluations so far, by name.
 
-    ``harm`` is the quantity by which the best policy is chosen. The policy's hash is missing.
+    The names are ``harm`` (the quantity by which the best policy is chosen) and those in ``FIGURES``, without
+    ``policy_sha256``; for example ``{"harm": 7.1, "steps": 400000, "total_harm": 9.8, ...}``.
     """
     harm = RunDirectory.chosen_by(evaluations, job.training.recipe.reward.harm_count)
     kept, last = min(evaluations, key=lambda each: each[harm]), evaluations[-1]
@@ -100,7 +101,7 @@ def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, An
 
 
 def final_figures(job: TrainingJob) -> dict[str, Any]:
-    """Return the entries of ``job``, a finished training, for a table: ``harm`` and all of ``FIGURES`` by name.
+    """Return the figures of the finished training ``job`` for a table, by name: ``harm`` and all in ``FIGURES``.
 
     Raises ``InvalidInput`` for a damaged file.
     """

@@ -23,7 +23,7 @@ class StudyFolder:
         kind: what the folder holds, for messages: ``a sweep``.
         question: all settings and versions that the results depend on, as plain data, so that a folder with other ones
             is refused; None if each result stores its own.
-        record: name of the file that stores ``question``.
+        record: name of the file inside the folder that stores ``question``.
         more: further entries of that file, which are not compared.
         advice: what the user can do about a folder with another ``question``, for messages.
         beside: names of files that may exist in a folder without that file; None: any.
@@ -80,9 +80,9 @@ class StudyFolder:
 
     @contextmanager
     def work(self) -> Iterator[None]:
-        """Context manager that creates and locks the folder while the block runs.
+        """Context manager that creates the folder, and locks it against other processes while the block runs.
 
-        It also removes unfinished files of processes that were killed.
+        At the start it also removes unfinished files of processes that were killed.
 
         Raises the exceptions of ``check``, and ``InvalidInput`` if another process works in the folder.
         """

@@ -34,10 +34,10 @@ class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
 
     Args:
         file: JSON file of the proposals; created with the first one.
-        known: proposals in that file, which are proposed again first.
+        known: proposals that the file holds already; they are proposed again, before new ones.
         space: key -> Optuna's distribution of its values.
         sampler: function from the number of a trial to its Optuna sampler.
-        first: the first proposal if ``known`` is empty; None: a sampled one.
+        first: proposal of the very first trial, used if ``known`` is empty; None: it is sampled like the others.
 
     """
 
@@ -61,7 +61,10 @@ class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
         )
 
     def suggest(self, trial_id: str) -> dict[str, Any] | None:
-        """Return the configuration of the next trial, and store a new proposal; ``trial_id`` is Ray's name of it."""
+        """Return the configuration of the next trial: ``{"trial": number, "values": proposal}``.
+
+        A proposal that is not in the file yet is stored there. ``trial_id`` is Ray's name of the trial.
+        """
         values, number = super().suggest(trial_id), self._asked
         if number == len(self.known):
             self.known.append(values)
@@ -71,7 +74,7 @@ class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
 
 
 class _SamplerOfTrial(BaseSampler):
-    """Optuna sampler that samples each trial with a new sampler, ``of(number of the trial)``."""
+    """Optuna sampler that makes a new sampler for each trial; ``of`` returns it for the number of the trial."""
 
     def __init__(self, of: Callable[[int], BaseSampler]) -> None:
         self._of = of

@@ -161,9 +161,10 @@ class SweepFile(StudyFile):
             yield Request(("jobs", k), job.scenario, job.recipe, self._texts(job.settings, ("jobs", k)), job.seed)
 
     def where(self, asked: Request, part: str = "") -> str:
-        """Return file and line of a requested job, for messages.
+        """Return file and line of a requested job, for messages: ``sweep.yaml, line 7``.
 
-        ``part``: instead, the line of its ``recipe``, its ``scenario``, or the setting with this key.
+        ``part`` names a part of the job, whose line is returned instead: ``recipe``, ``scenario``, or the key of a
+        setting. Empty: the line of the job itself.
         """
         path = (*asked.path, "set", part) if part else asked.path
         if part in self.settings:
@@ -192,7 +193,7 @@ class Row:
     asked: Request  # the job as the file requests it
     identity: str  # SHA-256 of everything that affects its training (``Training.identity``)
     name: str  # name of the job and of its folder
-    first: Training  # loaded training that differs at most in the seed; shared by all jobs of the same settings
+    first: Training  # training with the settings of the job, but perhaps another seed; jobs of equal settings share it
 
     @property
     def settings(self) -> dict[str, str]:
@@ -282,7 +283,8 @@ class SweepPlan:
     def results(self, path: Path) -> dict[str, dict[str, Any]]:
         """Return the results of each finished job in the sweep's folder ``path``, by the job's name.
 
-        Results are ``harm`` and the entries of ``figures.FIGURES``, by name.
+        A result holds the figures of the training by name (``figures.FIGURES``, and ``harm`` of the kept policy), as
+        in ``{"ppo-seed0": {"harm": 7.1, "steps": 400000, ...}}``.
         """
         jobs = ((row.name, self.job(row, path)) for row in self.rows)
         return {name: final_figures(job) for name, job in jobs if is_done(job)}

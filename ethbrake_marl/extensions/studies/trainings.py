@@ -85,7 +85,7 @@ class TrainingJob:
         return max(total - (steps if isinstance(steps, int) else 0), 1)
 
     def finish(self, tell: OnProgress | None = None, *, stop_at: StopAt | None = None) -> bool | None:
-        """Bring the training to its end, from where it stopped. Return True, or None if it was stopped before.
+        """Bring the training to its end, from where it stopped. Return True, or None if it was stopped early.
 
         Args:
             tell: called with the progress; None: silent.

@@ -35,8 +35,9 @@ def run_trials(
 ) -> list[dict[str, Any]]:
     """Run trials on Ray Tune, and return the last report of each trial that began, in order.
 
-    A report is a dictionary of what ``work`` reported. It has ``done`` if the trial ended, and ``reason`` if it failed.
-    Ctrl-C ends all trials early. Ray must be connected.
+    A report is the dictionary that ``work`` passed to ``tune.report``, with Ray's own entries. Its entry ``reason``
+    says why a trial failed; ``done`` is true if Ray has ended the trial. Ctrl-C ends all trials early. Ray must be
+    connected (see ``cluster.connected``).
 
     Args:
         work: called as ``work(config, **given)`` in a worker process; reports with ``tune.report``.

@@ -106,10 +106,7 @@ class Range(FileModel):
         return self.low, self.high
 
     def own(self, value: Any) -> int | float | None:
-        """Return a recipe's own value of this setting in the form in which the search tries values.
-
-        None if it is not in the range.
-        """
+        """Return ``value``, a recipe's own value of this setting, as a number of the range; None if it is not in it."""
         if not isinstance(value, int | float) or isinstance(value, bool) or not self.low <= value <= self.high:
             return None
         if not self.whole:
@@ -189,8 +186,11 @@ def _check_recipe_keys(value: dict[str, Any]) -> dict[str, Any]:
 class Measuring(FileModel):
     """How trials are judged: the list of worlds on which their policies are evaluated, and how often in a training."""
 
+    # Number of worlds of the list.
     worlds: int = Field(default=1000, ge=1, le=1_000_000, description="of the list")
+    # Seed from which these worlds are drawn.
     seed: Seed = Field(default=4007, description="of the list")
+    # Number of evaluations in the course of a training.
     times: int = Field(default=10, ge=1, le=1000, description="how often a training is measured")
 
 
@@ -201,7 +201,9 @@ class Pruning(FileModel):
     same evaluation.
     """
 
+    # Least number of other trials that must have reached the same evaluation before a trial may be stopped.
     after_trials: _Count = Field(default=5, description="so many others must have come as far before one is stopped")
+    # Number of evaluations, apart from that before the training, that every trial is allowed to make.
     after_times: _Count = Field(default=3, description="nobody is stopped before it was measured so often")
 
     def rule(self) -> TrialScheduler:
@@ -222,11 +224,13 @@ class Sampling(FileModel):
     """How the values of the next trial are chosen: by Optuna's TPE from the results of earlier trials, or at random."""
 
     name: Literal["tpe", "random"] = Field(default="tpe", description="Optuna's TPE, or chance")
+    # Seed of the proposed values.
     seed: Seed = Field(default=0, description="of what is proposed")
+    # Number of first trials with random values, before TPE chooses.
     random_trials: _Count = Field(default=10, description="trials by chance before TPE begins")
 
     def of_trial(self, number: int) -> BaseSampler:
-        """Return the Optuna sampler of the trial with this number, seeded by ``seed`` and the number."""
+        """Return the Optuna sampler that proposes the values of trial ``number``; its seed depends on the number."""
         from optuna.samplers import RandomSampler, TPESampler
 
         seed = int(np.random.SeedSequence([self.seed, number]).generate_state(1)[0])
