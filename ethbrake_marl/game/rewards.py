@@ -5,12 +5,12 @@ Built-in terms, for vehicle i and one step (the paper's section on the reward, w
 =========  =======================================================================================================
 harm       minus the harm of the whole line in this step, each impact once (``harm_count``: first | total); or minus
            the change in this step of the amount that the vehicle's ``objective`` minimises
-collision  the paper's r_collision: minus ``sum_p k_energy w_p^2`` over every impact of the step risk       the paper's
-r_risk over the vehicle's own pairs: ``-sigma(-TTC / tau) - sigma(k_d (d_target - d))``; an
+collision  the paper's r_collision: minus ``sum_p k_energy w_p^2`` over every impact of the step
+risk       the paper's r_risk over the vehicle's own pairs: ``-sigma(-TTC / tau) - sigma(k_d (d_target - d))``; an
            opening pair has TTC = infinity (first part 0) and ``d - d_safe`` is not negative
-jerk       the paper's r_jerk: minus the squared rate of change of the own command terminal   the paper's r_terminal: 1
-when an episode ends without any collision shaping    for learners: ``discount Phi(after) - Phi(before)``, Phi = minus
-the least harm ahead (``potential``); such a
+jerk       the paper's r_jerk: minus the squared rate of change of the own command
+terminal   the paper's r_terminal: 1 when an episode ends without any collision
+shaping    for learners: ``discount Phi(after) - Phi(before)``, Phi = minus the least harm ahead (``potential``); such a
            difference of potentials leaves the optimal policy as it is (Ng, Harada and Russell 1999) if
            ``shaping_discount`` is the learner's own discount
 =========  =======================================================================================================

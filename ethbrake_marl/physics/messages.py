@@ -269,7 +269,10 @@ def hear_rows(
 
 @compiled
 def _start(state: Floats, params: Floats, column: Columns, wanted: Floats) -> None:
-    """Set the places, and take and receive the first sample, at the alert. Updates the rows ``state`` and ``params``.
+    """Begin the messages of one world at the alert. Updates the rows ``state`` and ``params``.
+
+    Sets the place of each vehicle along the road, stores the first sample of all states, and lets each vehicle measure
+    the vehicles in sight.
 
     Args:
         state: state row of one world, [S].

@@ -184,7 +184,7 @@ def place_rates(table: Floats, brake_rate: Floats, release_rate: Floats, pieces:
 def place_forces(
     table: Floats, force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats
 ) -> None:  # fmt: skip
-    """Write rates, pieces and present forces of one world's vehicles into its table.
+    """Write brake and release rates, sequences of commands and present forces of one world's vehicles into its table.
 
     ``force``: present acceleration by brakes or engine, [N] m/s2. The other arguments are those of ``place_rates``.
     Forces are written only if BUILDS_UP is 1.
