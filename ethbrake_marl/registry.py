@@ -35,9 +35,10 @@ T = TypeVar("T")
 
 
 class Part:
-    """Value of an entry point that needs more than a function or a class.
+    """Value of an entry point: all arguments for a ``register_...`` function but the name, which the entry point has.
 
-    It holds the arguments of the ``register_...`` function of its kind, without the name.
+    An entry point in the group ``ethbrake_marl.measures`` that names the part below has the effect of
+    ``register_measure(name, closing, unit="m/s")``.
 
     >>> import ethbrake_marl as eb
     >>> def closing(episodes):

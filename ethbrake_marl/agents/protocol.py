@@ -166,7 +166,10 @@ def fixed_commands(
 
 
 class ByPolicy:
-    """Base class of agents with an attribute ``policy``: a trained policy, or another agent that the agent wraps."""
+    """Base class of agents with an attribute ``policy``: a trained policy, or another agent that the agent wraps.
+
+    It derives the hash and the manifest from ``policy``, which a subclass sets; nothing has to be overridden.
+    """
 
     policy: Any
 
@@ -191,10 +194,11 @@ def policy_sha256(agent: object) -> str | None:
 
 
 class AgentAround(ByPolicy):
-    """Base class of agents that wrap another agent, called ``policy``; a subclass overrides only what it changes.
+    """Base class of agents that wrap another agent, called ``policy``.
 
-    The class attribute ``adds`` is the knowledge that the subclass has beyond the wrapped agent's; None: no more.
-    ``name`` is the new agent's name; None: that of the wrapped agent.
+    By default everything is passed to the wrapped agent. A subclass overrides ``begin``, ``act`` or both. The class
+    attribute ``adds`` is the knowledge that it has beyond the wrapped agent's, for example ``Source.MODEL``; None: no
+    more. ``name`` is the new agent's name; None: the wrapped agent's name.
     """
 
     adds: ClassVar[Source | None] = None

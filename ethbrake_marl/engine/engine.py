@@ -133,9 +133,10 @@ class Now(NamedTuple):
         return self._replace(state=self.state.copy(), roster=self.roster.apart(), stream=copy.copy(self.stream))
 
     def kept(self, packed: Packed) -> Packed:
-        """Return packed worlds with the columns that all rows here have.
+        """Return ``packed`` with the same columns as the rows of this engine.
 
-        These may include columns for an obstacle and for messages that the worlds themselves do not need.
+        Columns for an obstacle and for messages are added if the engine has them, even if these worlds do not need
+        them.
         """
         return packed.widened(self.obstacle, self.by_link)
 
@@ -383,7 +384,10 @@ class Engine:
         return step
 
     def _ask_scripts(self) -> dict[int, Memory]:
-        """Let those deciders decide that are scripts with a memory; return vehicle index -> new memory."""
+        """Ask the scripts with a memory whose vehicles decide at every step; return vehicle index -> new memory.
+
+        Their commands are written to ``state.wanted``.
+        """
         asked: dict[int, Memory] = {}
         own_grid = self._own_grid.scripts
         if len(self._remembering) > len(own_grid):
@@ -418,9 +422,10 @@ class Engine:
         return Step(reward, outcome, self.reward, {}), some_failed
 
     def _drive_own_grid(self, columns: Floats) -> Way:
-        """Let the scripts that decide within a step do so, and return the part of the step up to their last decision.
+        """Move the worlds to the last decision that a script makes within the step; return this part of the step.
 
-        ``columns`` [n, L] are the learners' actions.
+        Such scripts decide at times of their own, between the decisions of the deciders. ``columns`` [n, L] are the
+        learners' actions.
         """
         way = self._own_grid.drive_step(self.state, self._now.rules, self._in_range(columns))
         self._change(memories=way.memories)
@@ -604,7 +609,8 @@ class Engine:
         Args:
             worlds: n worlds at any time of their episodes.
             ledger: harm so far; None: none.
-            ended: [n] whether the episode has ended, so that no step moves the world; None: at the horizon it has.
+            ended: [n] whether the episode has ended, so that no step moves the world; None: ended if the worlds' time
+                is at or after the horizon.
 
         Raises ``InvalidInput`` for another number of worlds or vehicles, and if the reward needs every single impact.
 

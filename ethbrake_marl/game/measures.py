@@ -5,8 +5,8 @@ A measure is computed either from each step or from all impacts of an episode:
 =======  ==================  ===================================  =========================
 by       computed from       a reward counts in each step         an evaluation shows
 =======  ==================  ===================================  =========================
-step     ``StepOutcome``     its value                            its sum over the episode impacts  ``EpisodeImpacts``
-its change by the step's impacts     its value for all impacts
+step     ``StepOutcome``     its value                            its sum over the episode
+impacts  ``EpisodeImpacts``  its change by the step's impacts     its value for all impacts
 =======  ==================  ===================================  =========================
 
 So the rewards of an episode add up to what evaluations show, minus the value before the first decision.

@@ -32,7 +32,11 @@ Numbers = Annotated[tuple[Number, ...], Field(strict=False, min_length=1)]
 
 
 class _Distribution(FileModel):
-    """Base class of the distributions and of other ways to draw a quantity from a uniform number."""
+    """Base class of the distributions, such as ``Uniform``, that a scenario file may name for a quantity.
+
+    A subclass declares its parameters as fields, and defines two members: the property ``support``, which is the
+    smallest and largest possible value; and ``value(u)``, which turns uniform numbers ``u`` in [0, 1) into values.
+    """
 
 
 class Uniform(_Distribution):
