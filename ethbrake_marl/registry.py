@@ -69,7 +69,10 @@ def giver(point: EntryPoint) -> str:
 
 
 def versions_used() -> dict[str, str]:
-    """Return name -> version of every other distribution with a part that was loaded in this process."""
+    """Return name -> version of every other installed package that has added a part, such as an agent, to this process.
+
+    Parts that are registered by entry points but were not loaded do not count.
+    """
     return dict(sorted(_VERSIONS.items()))
 
 

@@ -291,7 +291,7 @@ class Rules(NamedTuple):
         return status
 
     def unpack(self, packed: Packed) -> Worlds:
-        """Return the packed worlds as ``Worlds`` in arrays of their own, with the braking profiles ``pieces``."""
+        """Return packed worlds as ``Worlds`` in new arrays, whose vehicles follow the braking profiles ``pieces``."""
         worlds = packed.worlds()
         if self.pieces.shape[1] == 0:
             return worlds

@@ -262,9 +262,10 @@ class Engine:
         return new._now
 
     def _begin(self, rows: Ints, start: Start) -> None:
-        """Start episodes in the rows with the indices ``rows``, in the worlds of ``start``, in place.
+        """Start episodes in the rows with the indices ``rows``, in place.
 
-        This makes memories, and delivers messages and makes decisions of scripts before the first step.
+        ``start`` holds their worlds at the alert and at the first decision. Scripts, guard and watchers get their first
+        memory. Messages that arrive before the first step are delivered, and scripts that decide before it do so.
         """
         if not self._nobody_refuses_episodes:
             alert, memories = start.alert, self.memories
@@ -710,7 +711,7 @@ class Engine:
 
     @property
     def seed(self) -> int:
-        """Seed of the training stream."""
+        """Seed of the training stream: the endless list of worlds from which new episodes come."""
         return self._now.stream.seed
 
     @property

@@ -36,7 +36,7 @@ from ethbrake_marl.physics.state import Floats, Worlds
 
 
 class WithoutEffect(UserWarning):
-    """Warning: a setting has no effect here."""
+    """Warning: a setting has no effect, for example an objective in a reward that gives harm the weight 0."""
 
 
 def own_terms() -> list[str]:

@@ -173,7 +173,7 @@ class _Part(NamedTuple):
 
 
 def _advance_part(arrays: tuple[NDArray[Any], ...], at: int, capacity: int, part: slice) -> _Part:
-    """Advance the worlds of the slice ``part`` in place.
+    """Advance the worlds of the slice ``part`` in place; return their impacts and whether the input is valid.
 
     Args:
         arrays: array arguments of ``advance_worlds`` for all worlds, in its order.

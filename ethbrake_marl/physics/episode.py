@@ -68,7 +68,9 @@ class Episode(NamedTuple):
     A phase is the time interval of one of these commands.
     """
 
-    table: Floats  # [rows_for(2 K), N], filled with latencies, masses, limits and other vehicles' commands
+    # [rows_for(2 K), N] table in the layout of ``physics.rows``, for K pieces of braking per vehicle; filled with
+    # latencies, masses, limits and other vehicles' commands
+    table: Floats
     clock: Floats  # [CLOCK.WIDTH] decision times and settings, see ``CLOCK``
     controlled: Ints  # [C] indices of the controlled vehicles
 

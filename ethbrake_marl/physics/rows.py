@@ -136,9 +136,9 @@ LISTED = _Listed()
 
 @compiled(bare=True)
 def builds_up(table: Floats) -> bool:
-    """Return whether brakes of this world build up (finite rate) or follow a fixed sequence of commands.
+    """Return whether some vehicle's brakes build up (finite rate) or follow a fixed sequence of commands.
 
-    ``table``: the world in this layout.
+    ``table``: one world in the layout of ``_Rows``.
     """
     return bool(table.shape[0] > ROW.OF_EPISODE and table[ROW.BUILDS_UP, 0] == 1.0)
 

@@ -46,8 +46,8 @@ class FeatureDefinition(_Strict):
     of: Of  # ``own`` or ``neighbour``
     unit: str  # unit of the value
     scale: float  # the observed number is clip(value / scale, low, high)
-    low: float
-    high: float
+    low: float  # least observed number
+    high: float  # largest observed number
     unknown: float  # value for an unknown neighbour, in ``unit``
     tried: Annotated[tuple[float, ...], Field(max_length=64)]  # its values in a few test worlds
 
@@ -57,7 +57,7 @@ class ObservationSchema(_Strict):
 
     front: Neighbours  # number of observed neighbours ahead
     rear: Neighbours  # number of observed neighbours behind
-    features: Annotated[tuple[str, ...], Field(min_length=1, max_length=4096)]
+    features: Annotated[tuple[str, ...], Field(min_length=1, max_length=4096)]  # full names, in order
     scaling_sha256: Sha256  # hash of names, units, scales and bounds of the features
     registered: Annotated[tuple[FeatureDefinition, ...], Field(max_length=4096, exclude_if=not_)] = ()
 

@@ -92,8 +92,8 @@ class NormalShape(_Distribution):
 
     mean: Number  # before truncation
     sd: Number  # standard deviation before truncation
-    low: Number
-    high: Number
+    low: Number  # smallest possible value
+    high: Number  # largest possible value
 
 
 class Normal(_Distribution):
@@ -138,8 +138,8 @@ class LogNormalShape(_Distribution):
 
     median: Number  # before truncation
     sigma: Number  # standard deviation of the logarithm, before truncation
-    low: Number
-    high: Number
+    low: Number  # smallest possible value
+    high: Number  # largest possible value
 
 
 class LogNormal(_Distribution):

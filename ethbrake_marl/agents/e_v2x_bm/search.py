@@ -178,11 +178,11 @@ def _put_in_order(places: Ints, n: int) -> None:
 
 @compiled(apart=True, bare=True)
 def locate_borders(line: Line, room: Room) -> int:
-    """Step 3: locate borders that may hide less harm, to two samples 1e-9 m/s2 apart, one on each side.
+    """Step 3: locate the decelerations at which the number of impacts changes, if less harm may be found there.
 
-    A border is a deceleration at which the number of impacts changes. Between borders the harm is smooth, so harm that
-    falls towards a border is least there. Leaves all samples in ``room.two``. Returns a status: ``FLAG.DONE``, or the
-    failed check.
+    Between two such borders the harm is smooth, so harm that falls towards a border is least there. Each located border
+    ends up between two samples 1e-9 m/s2 apart. Leaves all samples in ``room.two``. Returns a status: ``FLAG.DONE``, or
+    the code of the check of the physics that failed.
     """
     looked, new, few, places, bounds = room.one, room.new, room.few, room.borders, room.values
     best = least_harm(looked, _LOOKED)
