@@ -93,12 +93,12 @@ class Manifest(_Strict):
     policies. Any other network keeps format 2, which earlier versions can read.
     """
 
-    format: Literal["ethbrake-policy"] = "ethbrake-policy"
-    format_version: Literal[2, 3, 4, 5] = 2
+    format: Literal["ethbrake-policy"] = "ethbrake-policy"  # marks the file as a manifest
+    format_version: Literal[2, 3, 4, 5] = 2  # depends on the network, see above
     algorithm: Annotated[str, Field(pattern=NAME_PATTERN)]  # name of the training algorithm
-    network: NetworkSpec
-    observation: ObservationSchema
-    action: Literal["fraction_of_own_capacity"] = "fraction_of_own_capacity"
+    network: NetworkSpec  # sizes and kind of the networks
+    observation: ObservationSchema  # features that the policy observes
+    action: Literal["fraction_of_own_capacity"] = "fraction_of_own_capacity"  # meaning of an action
     learners: Annotated[tuple[str, ...], Field(min_length=1)]  # vehicles that the policy learned to control
     scenario: dict[str, JsonValue]  # scenario of the training, every value
     reward: dict[str, JsonValue]  # reward of the training, every setting

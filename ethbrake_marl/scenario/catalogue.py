@@ -308,7 +308,7 @@ def _line(key: str, values: Mapping[str, object]) -> str:
 
 
 def _short_member(entry: dict[str, Any]) -> dict[str, Any]:
-    """Return an entry of a mixture's list, with a name instead of the content of a scenario that equals a shipped one."""
+    """Return an entry of a mixture's list with a shorter ``scenario``: only the name, if it equals a shipped one."""
     content, name = entry["scenario"], entry["scenario"]["name"]
     as_shipped = name in _shipped_paths() and member_content(load_scenario(name)) == content
     return {**entry, "scenario": name} if as_shipped else entry

@@ -167,7 +167,7 @@ class LogNormal(_Distribution):
         return self.lognormal.low, self.lognormal.high
 
     def value(self, u: Floats) -> Floats:
-        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape: ``exp`` of a normal number."""
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape: ``exp`` of normal ones."""
         drawn = exp_each(self._of_logarithm.value(u).ravel()).reshape(u.shape)
         return np.clip(drawn, *self.support)
 
