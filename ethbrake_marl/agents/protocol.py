@@ -99,7 +99,7 @@ class Agent(Script, Protocol):
 
     """
 
-    name: str
+    name: str  # name in tables and messages
 
 
 def check_agent(agent: object, where: str, *, alone: bool = True) -> None:
@@ -171,7 +171,7 @@ class ByPolicy:
     It derives the hash and the manifest from ``policy``, which a subclass sets; nothing has to be overridden.
     """
 
-    policy: Any
+    policy: Any  # the trained policy, or the wrapped agent
 
     def policy_sha256(self) -> str | None:
         """Return the SHA-256 of the policy; None without a policy, or if the policy has no hash."""
@@ -237,7 +237,7 @@ class AgentAround(ByPolicy):
 class Shielding(Protocol):
     """Interface of an agent or team behind a shield, before it is known which vehicles it drives."""
 
-    name: str
+    name: str  # name in tables and messages
 
     @property
     def knows(self) -> Knowledge:

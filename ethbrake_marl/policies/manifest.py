@@ -42,8 +42,8 @@ class _Strict(FileModel):
 class FeatureDefinition(_Strict):
     """Definition of a registered feature at the time when the policy was trained."""
 
-    name: Annotated[str, Field(max_length=64)]
-    of: Of  # ``own`` or ``neighbour``
+    name: Annotated[str, Field(max_length=64)]  # name under which it was registered
+    of: Of  # ``own``: of the vehicle itself; ``neighbour``: of a neighbour
     unit: str  # unit of the value
     scale: float  # the observed number is clip(value / scale, low, high)
     low: float  # least observed number

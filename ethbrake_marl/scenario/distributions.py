@@ -99,7 +99,7 @@ class NormalShape(_Distribution):
 class Normal(_Distribution):
     """``{normal: {mean, sd, low, high}}``: a normal distribution truncated to [low, high]."""
 
-    normal: NormalShape
+    normal: NormalShape  # its parameters
 
     @model_validator(mode="after")
     def _possible(self) -> Normal:
@@ -145,7 +145,7 @@ class LogNormalShape(_Distribution):
 class LogNormal(_Distribution):
     """``{lognormal: {median, sigma, low, high}}``: the logarithm is normal; truncated to [low, high]."""
 
-    lognormal: LogNormalShape
+    lognormal: LogNormalShape  # its parameters
     _of_logarithm: Normal = PrivateAttr()  # distribution of the logarithm
 
     @model_validator(mode="after")
