@@ -52,7 +52,9 @@ class Part:
 
 @cache
 def points(group: str) -> dict[str, list[EntryPoint]]:
-    """Return name -> entry points of a group, this package's own first; several distributions may use one name.
+    """Return name -> entry points with this name in a group; a list, because several packages may use one name.
+
+    This package's own names come first.
 
     ``group``: its name without the prefix ``ethbrake_marl.``, for example ``agents``.
     """

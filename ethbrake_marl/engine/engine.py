@@ -594,9 +594,9 @@ class Engine:
         self._now = self._now._replace(state=state, stream=stream, roster=roster, rules=self._rules_for(state))
 
     def _rules_for(self, state: State) -> Rules:
-        """Return the settings of the steps (``Rules``) for other rows, ``state``.
+        """Return the settings with which steps must advance the worlds of ``state``, instead of this engine's worlds.
 
-        They differ if brakes take time to build up in these rows but not in the present ones.
+        They differ from the present ones if only the worlds of ``state`` have brakes that take time to build up.
         """
         builds_up = self.scenario.builds_up or state.packed.builds_up or self.in_pieces
         return self._now.rules._replace(builds_up=builds_up)

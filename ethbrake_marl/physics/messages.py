@@ -398,7 +398,7 @@ def _receive(time: float, told: Floats, N: int) -> None:
 def _take(told: Floats, link: int, sender: int, sent_s: float, N: int) -> None:
     """Receive one message: copy the sender's newest sample from the ring buffer to the link.
 
-    A sample counts if it was taken at ``sent_s`` or earlier; an older one than the receiver already has is ignored.
+    It is the newest sample taken at ``sent_s`` or earlier. Nothing changes if the receiver already has a newer one.
 
     Args:
         told: columns of messages of one world; updated.

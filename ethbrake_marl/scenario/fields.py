@@ -42,7 +42,7 @@ class QuantityRule:
 
     name: str  # key in a scenario, field of Worlds or Vehicles
     unit: str  # key of UNITS, or "" for a plain number
-    per: Literal["vehicle", "pair", "world"]  # what has a value of its own
+    per: Literal["vehicle", "pair", "world"]  # what has one value each
     high: float  # largest allowed value
     positive: bool  # whether 0 is refused
     slot: int  # column of its uniform number inside the block of BLOCK numbers that each vehicle has

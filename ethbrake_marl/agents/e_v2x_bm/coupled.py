@@ -103,7 +103,7 @@ def _minimise(
 
     Args:
         worlds: n worlds.
-        told: the same worlds with the braking capacities that the closed form assumes.
+        told: the same worlds for the closed form, with the capacities of other vehicles set to their braking commands.
         command: commands of all vehicles, [n, N] m/s2; the controlled vehicle's is ignored.
         vehicle: index of the controlled vehicle, from 0.
         rows: [m] indices of the worlds to search.

@@ -194,7 +194,7 @@ def optimise_pairwise(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
 
 
 def closed_form(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
-    """Return the optimum of ``vehicle`` as ``optimise_pairwise`` does, as if brakes never needed time to build up."""
+    """Version of ``optimise_pairwise`` that also accepts brakes that build up, and treats them as acting at once."""
     onset, capacity = onset_s(worlds, vehicle), worlds.vehicles.braking_capacity_mps2
     at, out = np.empty((worlds.n, CANDIDATES)), np.empty((4, worlds.n))
     optimise_worlds(worlds.gaps_m, worlds.speeds_mps, capacity, onset, vehicle, at, out)
