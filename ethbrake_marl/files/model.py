@@ -41,7 +41,10 @@ NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
 
 
 class FileModel(BaseModel):
-    """Base class of the content of a file: immutable; unknown keys and wrong types are errors."""
+    """Base class of pydantic models of a file's content: immutable; unknown keys and wrong types are errors.
+
+    A subclass declares a field for each key.
+    """
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 

@@ -156,7 +156,7 @@ Preset = Annotated[str, AfterValidator(_known_preset), _PresetSchema]
 
 
 class V2X(FileModel):
-    """A preset and the settings that differ from it; see ``docs/v2x.md``.
+    """The V2X channel of a scenario: a preset and the settings that differ from it; see ``docs/v2x.md``.
 
     In YAML it is written as the preset's name alone, or as a mapping.
     """

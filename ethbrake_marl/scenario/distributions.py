@@ -167,7 +167,10 @@ class LogNormal(_Distribution):
         return self.lognormal.low, self.lognormal.high
 
     def value(self, u: Floats) -> Floats:
-        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape: ``exp`` of normal ones."""
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+
+        A value is ``exp(x)``; x has the truncated normal distribution of the logarithm.
+        """
         drawn = exp_each(self._of_logarithm.value(u).ravel()).reshape(u.shape)
         return np.clip(drawn, *self.support)
 
