@@ -223,7 +223,10 @@ class Unfamiliar(UserWarning):
 
 @contextmanager
 def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
-    """Context manager: name failed worlds by row of a larger batch; ``rows[k]`` is the row of world k there."""
+    """Context manager: a ``PhysicsError`` or ``AgentFailed`` raised in the block is raised again with other rows.
+
+    For a block that works on part of a batch: world k of the part is row ``rows[k]`` of the whole batch.
+    """
     try:
         yield
     except (PhysicsError, AgentFailed) as error:

@@ -35,9 +35,10 @@ T = TypeVar("T")
 
 
 class Part:
-    """Value of an entry point that needs more than a function or a class.
+    """Value of an entry point: all arguments for a ``register_...`` function but the name, which the entry point has.
 
-    It holds the arguments of the ``register_...`` function of its kind, without the name.
+    An entry point in the group ``ethbrake_marl.measures`` that names the part below has the effect of
+    ``register_measure(name, closing, unit="m/s")``.
 
     >>> import ethbrake_marl as eb
     >>> def closing(episodes):
@@ -51,7 +52,9 @@ class Part:
 
 @cache
 def points(group: str) -> dict[str, list[EntryPoint]]:
-    """Return name -> entry points of a group, this package's own first; several distributions may use one name.
+    """Return name -> entry points with this name in a group; a list, because several packages may use one name.
+
+    This package's own names come first.
 
     ``group``: its name without the prefix ``ethbrake_marl.``, for example ``agents``.
     """
@@ -68,7 +71,10 @@ def giver(point: EntryPoint) -> str:
 
 
 def versions_used() -> dict[str, str]:
-    """Return name -> version of every other distribution with a part that was loaded in this process."""
+    """Return name -> version of every other installed package that has added a part, such as an agent, to this process.
+
+    Parts that are registered by entry points but were not loaded do not count.
+    """
     return dict(sorted(_VERSIONS.items()))
 
 

@@ -39,7 +39,7 @@ class Episodes:
 
         Args:
             engine: an engine made by ``episode_engine``, not stepped yet.
-            worlds: its worlds at the alert, as the first ``before`` of the observers.
+            worlds: the engine's worlds at the alert; observers get them as ``before`` of the first step.
             watched_by: observers that are called after every step.
             summed: names of reward terms to sum over the episodes.
 

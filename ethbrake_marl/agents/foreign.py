@@ -276,10 +276,10 @@ def policy_agent(
 
 
 def _appending(appended: Appended, scenario: Scenario) -> Callable[[Worlds, int], Observations]:
-    """Return a function ``(worlds, vehicle) -> [n, K]`` that computes what is appended to a vehicle's own observation.
+    """Return a function ``(worlds, vehicle)`` that computes the K features appended to a vehicle's observation, [n, K].
 
-    ``appended`` is ``number`` (the vehicle's number among the scenario's learners) or ``state`` (the state of the
-    line).
+    ``appended`` is ``number`` (the vehicle's number among the scenario's learners) or ``state`` (the true state of the
+    whole line).
     """
 
     def number(worlds: Worlds, vehicle: int) -> Observations:

@@ -132,14 +132,14 @@ def _layers(env: Any) -> Iterator[Any]:
 
 
 def _look(layer: Any, name: str) -> tuple[str | None, list[Any]]:
-    """Return what one layer changes, and this package's environments in it.
+    """Return which class of a layer may change observations or actions, and this package's environments in it.
 
     Args:
         layer: one wrapper or environment, from ``_layers``.
         name: name of the agent in error messages.
 
-    The first result is the name of the class that may change observations or actions, or None. The environments are the
-    layer itself or, if it runs environments in other processes, those.
+    The first result is the name of that class; None if the layer changes nothing. The environments are the layer itself
+    or, if it runs environments in other processes, those.
 
     """
     if changes(type(layer)):

@@ -99,7 +99,7 @@ class Agent(Script, Protocol):
 
     """
 
-    name: str
+    name: str  # name in tables and messages
 
 
 def check_agent(agent: object, where: str, *, alone: bool = True) -> None:
@@ -166,9 +166,12 @@ def fixed_commands(
 
 
 class ByPolicy:
-    """Base class of agents with an attribute ``policy``: a trained policy, or another agent that the agent wraps."""
+    """Base class of agents with an attribute ``policy``: a trained policy, or another agent that the agent wraps.
 
-    policy: Any
+    It derives the hash and the manifest from ``policy``, which a subclass sets; nothing has to be overridden.
+    """
+
+    policy: Any  # the trained policy, or the wrapped agent
 
     def policy_sha256(self) -> str | None:
         """Return the SHA-256 of the policy; None without a policy, or if the policy has no hash."""
@@ -191,10 +194,11 @@ def policy_sha256(agent: object) -> str | None:
 
 
 class AgentAround(ByPolicy):
-    """Base class of agents that wrap another agent, called ``policy``; a subclass overrides only what it changes.
+    """Base class of agents that wrap another agent, called ``policy``.
 
-    The class attribute ``adds`` is the knowledge that the subclass has beyond the wrapped agent's; None: no more.
-    ``name`` is the new agent's name; None: that of the wrapped agent.
+    By default everything is passed to the wrapped agent. A subclass overrides ``begin``, ``act`` or both. The class
+    attribute ``adds`` is the knowledge that it has beyond the wrapped agent's, for example ``Source.MODEL``; None: no
+    more. ``name`` is the new agent's name; None: the wrapped agent's name.
     """
 
     adds: ClassVar[Source | None] = None
@@ -233,7 +237,7 @@ class AgentAround(ByPolicy):
 class Shielding(Protocol):
     """Interface of an agent or team behind a shield, before it is known which vehicles it drives."""
 
-    name: str
+    name: str  # name in tables and messages
 
     @property
     def knows(self) -> Knowledge:

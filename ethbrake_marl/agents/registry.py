@@ -20,7 +20,10 @@ from ethbrake_marl.scenario.roles import ScriptSpec
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Entry of the registry: an agent, or a wrapper, which is a shield or a search that goes around an agent."""
+    """Entry of the registry: an agent, or a wrapper, which is a shield or a search that goes around an agent.
+
+    A wrapper is written after a ``+``: ``ppo+step`` is the agent ``ppo`` inside the shield ``step``.
+    """
 
     name: str  # plain name, without argument
     form: str  # how it is written, as "name[:ARGUMENT][@POLICY]"; without ":" no argument, without "@" no policy
@@ -40,12 +43,18 @@ class Entry:
 
     @property
     def whole_form(self) -> str:
-        """``form`` followed by the variants, for example ``e_v2x_bm[:pairwise][:mine]``."""
+        """``form`` followed by each registered variant in brackets, for example ``e_v2x_bm[:pairwise][:believed]``.
+
+        A variant is a last word that selects another function to make the agent or wrapper.
+        """
         return self.form + "".join(f"[:{variant}]" for variant in variants_of(self.name))
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Every text that may follow the ``+`` for a wrapper with fixed arguments, as ``("step", "step:mine")``."""
+        """Every way to write a wrapper after the ``+`` of a specification, for example ``("step", "step:believed")``.
+
+        Only for a wrapper whose ``form`` lists all arguments that it takes.
+        """
         name, *options = re.findall(r"[^\[\]+]+", self.whole_form)
         found = [name]
         for option in options:
@@ -61,7 +70,8 @@ class Entry:
         """Make the agent or wrapper.
 
         Args:
-            argument: text after the colon, which may end in ``:variant``; None: no argument.
+            argument: text after the first colon, such as ``pairwise``; if its last word is a registered variant
+                (``pairwise:believed``), the variant's function is called. None: no argument.
             settings: passed on to the function that makes it.
             inside: for a wrapper, the one agent or team that it goes around.
 
@@ -75,7 +85,10 @@ class Entry:
 
 
 def around_entry(each: str) -> Entry:
-    """Return the entry of a shield or search, given as it is written after a ``+``, such as ``episode:pairwise``."""
+    """Return the entry of a shield or search; ``each`` is its text in a specification, such as ``episode:pairwise``.
+
+    In ``ppo+episode:pairwise`` this is the text after the ``+``.
+    """
     return SHIELDS[each.partition(":")[0]]
 
 
@@ -94,7 +107,11 @@ def agent_entries() -> tuple[Entry, ...]:
 
 
 def _with_variants(entry: Entry) -> Entry:
-    """Return the entry with the words and descriptions of its loadable variants added to ``form`` and ``about``."""
+    """Return ``entry`` with its variants added to ``form`` and ``about``, as far as they can be loaded.
+
+    A variant is a last word that selects another function: ``e_v2x_bm`` becomes ``e_v2x_bm[:believed]``, with the
+    variant's description.
+    """
     usable = VARIANTS.usable()
     for word in variants_of(entry.name):
         if variant := usable.get(f"{entry.name}.{word}"):
@@ -103,18 +120,27 @@ def _with_variants(entry: Entry) -> Entry:
 
 
 def agents_refused() -> list[str]:
-    """Return one sentence for each installed agent, shield or variant that cannot be loaded, with the reason."""
+    """Return one sentence for each registered agent, shield or variant of one that cannot be loaded, with the reason.
+
+    The list is empty if everything can be loaded.
+    """
     found = [each.why_not(name) for each in (AGENTS, SHIELDS, VARIANTS) for name in each]
     return [reason for reason in found if reason is not None]
 
 
 def around_forms() -> tuple[str, ...]:
-    """Return every text that may follow a ``+``, such as ``search``, ``episode`` and ``episode:pairwise``."""
+    """Return every shield and search as it is written in a specification, after the ``+`` of ``ppo+episode``.
+
+    For example ``("search", "episode", "episode:pairwise")``: with each argument and variant that it takes.
+    """
     return tuple(word for entry in SHIELDS.usable().values() for word in entry.words)
 
 
 def shield_forms() -> tuple[str, ...]:
-    """Return every shield as it is written after a ``+``, such as ``episode:pairwise``, without variants."""
+    """Return every shield as it is written after the ``+`` of a specification: ``("episode", "robust:interior", ...)``.
+
+    Arguments are included, variants (last words that select another function) and searches are not.
+    """
     return tuple(each for each in around_forms() if not (around_entry(each).inner or is_variant(each)))
 
 
@@ -135,20 +161,28 @@ def shield_modes() -> dict[str, Any]:
 
 
 def variants_of(name: str) -> tuple[str, ...]:
-    """Return the variants of the agent or shield ``name``: words that may follow its argument after a further colon."""
+    """Return the variants of the agent or shield called ``name``, for example ``("believed",)``.
+
+    A variant is a last word after a further colon, as in ``episode:pairwise:believed``, that selects another function
+    to make the agent or shield.
+    """
     keys = (key.rpartition(".") for key in VARIANTS)
     return tuple(variant for of, _, variant in keys if of == name)
 
 
 def is_variant(form: str) -> bool:
-    """Return whether the last word of ``form``, such as ``step:mine``, is a registered variant."""
+    """Return whether the last word of ``form`` is a registered variant, as in ``step:believed``.
+
+    ``form``: an agent or shield with its argument, without ``+``.
+    """
     return form.rpartition(":")[2] in variants_of(form.partition(":")[0])
 
 
 def settings_needed(shield: str | None) -> Mapping[str, object]:
     """Return the settings that a shield requires, each with an example: ``{"uncertainty": "gaps_m=0.5"}``.
 
-    ``shield`` is written as after a ``+``. The result is empty for None and for a variant.
+    ``shield`` is a shield with its argument, such as ``robust`` or ``episode:pairwise``. The result is empty for None
+    and for a variant, such as ``robust:believed``.
     """
     return {} if shield is None or is_variant(shield) else around_entry(shield).needs
 
@@ -159,12 +193,16 @@ def shields_with(setting: str) -> tuple[str, ...]:
 
 
 def group_names() -> tuple[str, ...]:
-    """Return the names that stand for several agents in ``--agents``."""
+    """Return the names that stand for several agents in the command option ``--agents``, such as ``ladder``."""
     return tuple(dict.fromkeys(name.partition(".")[0] for name in GROUPS))
 
 
 def agents_of_group(group: str) -> tuple[str, ...]:
-    """Return the specifications of all agents in ``group``: its own, then those of ``GROUP.MORE``, sorted by name."""
+    """Return the specifications of all agents in ``group``, a name from ``group_names``.
+
+    The group ``ladder`` also contains the agents registered under ``ladder.search``, or any other ``ladder.WORD``: its
+    own come first, then these, sorted by name.
+    """
     return tuple(spec for name in sorted(GROUPS) if name.partition(".")[0] == group for spec in GROUPS[name])
 
 
@@ -179,8 +217,8 @@ def register_agent(
 ) -> None:
     """Register an agent, so that ``make_agent`` and every command know ``name`` and ``name:argument``.
 
-    An installed package registers an agent with an entry point of the group ``ethbrake_marl.agents``: its factory, or a
-    ``Part`` with the factory.
+    An installed package registers an agent with an entry point of the group ``ethbrake_marl.agents``: its factory, or
+    ``Part(factory, about=...)`` with arguments of this function.
 
     Args:
         name: plain name without argument.
@@ -219,7 +257,7 @@ def register_shield(
     """Register a shield or another wrapper, so that ``+name`` may follow every agent.
 
     An installed package registers a shield with an entry point of the group ``ethbrake_marl.shields``: its wrapper, or
-    a ``Part`` with the wrapper.
+    ``Part(wrapper, about=...)`` with arguments of this function.
 
     Args:
         name: plain name without argument.
@@ -251,7 +289,7 @@ def register_variant(key: str, make: Factory | Wrapper, *, about: str = "a varia
     An installed package registers a variant with an entry point of the group ``ethbrake_marl.variants``.
 
     Args:
-        key: ``name.variant``.
+        key: ``name.variant``: ``step.mine`` registers ``step:mine``, a variant of the shield ``step``.
         make: replaces the factory or wrapper of that name, with the same arguments; the argument does not contain the
             variant.
         about: description in one line, for ``ethbrake agent list``.

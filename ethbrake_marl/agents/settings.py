@@ -53,7 +53,7 @@ Wrapper = Callable[[Any, str | None, AgentSettings], Driver]
 
 
 class Variant(NamedTuple):
-    """A variant of an agent or a shield, selected by a word after its argument."""
+    """Variant of an agent or a shield, selected by a last word: ``believed`` in ``step:believed``."""
 
     make: Factory | Wrapper  # makes the agent or wrapper in place of the original function
     about: str  # description in one line

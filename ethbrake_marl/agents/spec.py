@@ -154,9 +154,9 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
 
 
 def _is_meant_around(before: str, core: str, last: str) -> bool:
-    """Return whether an unknown word after a ``+`` is a misspelt search or shield.
+    """Return whether an unknown word after a ``+`` was probably meant as a search or shield, but misspelt.
 
-    Otherwise it is part of an argument or a path.
+    If not, the word is part of an argument or a path.
 
     Args:
         before: specification up to the ``+``.

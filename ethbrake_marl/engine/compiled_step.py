@@ -119,9 +119,9 @@ class Step(NamedTuple):
 
 @compiled(apart=True, bare=True)
 def place_row(table: Floats, state: Floats, params: Floats, k: int, pieces: Floats) -> None:
-    """Write what only worlds with brake build-up need to the ``table`` of world ``k``, by ``place_forces``.
+    """Add to the ``table`` of world ``k`` what is needed only if brakes take time to build up.
 
-    That is: accelerations in force and rates of build-up, from row ``k`` of ``state`` and ``params``, and the braking
+    These are accelerations in force and rates of build-up, from row ``k`` of ``state`` and ``params``, and the braking
     profiles ``pieces`` [N, 2 K]. A separate function, because it would slow down the loop for worlds without build-up.
     """
     column, N = columns(state), pieces.shape[0]
@@ -291,7 +291,7 @@ class Rules(NamedTuple):
         return status
 
     def unpack(self, packed: Packed) -> Worlds:
-        """Return the packed worlds as ``Worlds`` in arrays of their own, with the braking profiles ``pieces``."""
+        """Return packed worlds as ``Worlds`` in new arrays, whose vehicles follow the braking profiles ``pieces``."""
         worlds = packed.worlds()
         if self.pieces.shape[1] == 0:
             return worlds

@@ -133,9 +133,10 @@ class Now(NamedTuple):
         return self._replace(state=self.state.copy(), roster=self.roster.apart(), stream=copy.copy(self.stream))
 
     def kept(self, packed: Packed) -> Packed:
-        """Return packed worlds with the columns that all rows here have.
+        """Return ``packed`` with the same columns as the rows of this engine.
 
-        These may include columns for an obstacle and for messages that the worlds themselves do not need.
+        Columns for an obstacle and for messages are added if the engine has them, even if these worlds do not need
+        them.
         """
         return packed.widened(self.obstacle, self.by_link)
 
@@ -261,9 +262,10 @@ class Engine:
         return new._now
 
     def _begin(self, rows: Ints, start: Start) -> None:
-        """Start episodes in the rows with the indices ``rows``, in the worlds of ``start``, in place.
+        """Start episodes in the rows with the indices ``rows``, in place.
 
-        This makes memories, and delivers messages and makes decisions of scripts before the first step.
+        ``start`` holds their worlds at the alert and at the first decision. Scripts, guard and watchers get their first
+        memory. Messages that arrive before the first step are delivered, and scripts that decide before it do so.
         """
         if not self._nobody_refuses_episodes:
             alert, memories = start.alert, self.memories
@@ -383,7 +385,10 @@ class Engine:
         return step
 
     def _ask_scripts(self) -> dict[int, Memory]:
-        """Let those deciders decide that are scripts with a memory; return vehicle index -> new memory."""
+        """Ask the scripts with a memory whose vehicles decide at every step; return vehicle index -> new memory.
+
+        Their commands are written to ``state.wanted``.
+        """
         asked: dict[int, Memory] = {}
         own_grid = self._own_grid.scripts
         if len(self._remembering) > len(own_grid):
@@ -418,9 +423,10 @@ class Engine:
         return Step(reward, outcome, self.reward, {}), some_failed
 
     def _drive_own_grid(self, columns: Floats) -> Way:
-        """Let the scripts that decide within a step do so, and return the part of the step up to their last decision.
+        """Move the worlds to the last decision that a script makes within the step; return this part of the step.
 
-        ``columns`` [n, L] are the learners' actions.
+        Such scripts decide at times of their own, between the decisions of the deciders. ``columns`` [n, L] are the
+        learners' actions.
         """
         way = self._own_grid.drive_step(self.state, self._now.rules, self._in_range(columns))
         self._change(memories=way.memories)
@@ -588,9 +594,9 @@ class Engine:
         self._now = self._now._replace(state=state, stream=stream, roster=roster, rules=self._rules_for(state))
 
     def _rules_for(self, state: State) -> Rules:
-        """Return the settings of the steps (``Rules``) for other rows, ``state``.
+        """Return the settings with which steps must advance the worlds of ``state``, instead of this engine's worlds.
 
-        They differ if brakes take time to build up in these rows but not in the present ones.
+        They differ from the present ones if only the worlds of ``state`` have brakes that take time to build up.
         """
         builds_up = self.scenario.builds_up or state.packed.builds_up or self.in_pieces
         return self._now.rules._replace(builds_up=builds_up)
@@ -604,7 +610,8 @@ class Engine:
         Args:
             worlds: n worlds at any time of their episodes.
             ledger: harm so far; None: none.
-            ended: [n] whether the episode has ended, so that no step moves the world; None: at the horizon it has.
+            ended: [n] whether the episode has ended, so that no step moves the world; None: ended if the worlds' time
+                is at or after the horizon.
 
         Raises ``InvalidInput`` for another number of worlds or vehicles, and if the reward needs every single impact.
 
@@ -704,7 +711,7 @@ class Engine:
 
     @property
     def seed(self) -> int:
-        """Seed of the training stream."""
+        """Seed of the training stream: the endless list of worlds from which new episodes come."""
         return self._now.stream.seed
 
     @property

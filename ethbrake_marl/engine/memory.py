@@ -122,8 +122,8 @@ def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
 def _check_kept(before: Memory, after: Memory, who: str) -> None:
     """Raise ``InvalidInput`` if a call of ``act`` changed the keys, shapes or dtypes of a memory.
 
-    ``before`` and ``after`` are the memory before and after the call; restarted rows would not fit. ``who`` begins the
-    message.
+    Such a change would make it impossible to restart single rows. ``before`` and ``after`` are the memory before and
+    after the call. ``who`` begins the message.
     """
     began, told = (map_memory(lambda array: (array.dtype, *array.shape[1:]), each) for each in (before, after))
     if began != told:

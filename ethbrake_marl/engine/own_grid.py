@@ -37,7 +37,7 @@ Stop = tuple[Floats, Floats]  # state [n, S] of all worlds at a script's decisio
 
 
 class Way(NamedTuple):
-    """The part of a step up to the last decision of a script on its own grid."""
+    """The first part of a step, up to the last decision of a script that decides at times of its own in between."""
 
     reward: Floats  # [n, N] reward of this part
     harm: Floats  # [2, n] harm of the line in this part: first-impact harm, total harm (m2/s2)

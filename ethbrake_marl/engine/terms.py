@@ -50,7 +50,10 @@ class Terms:
         return 0.0 if self._objectives else self.params.harm
 
     def objective_harm(self, state: State) -> Floats:
-        """Return the harm so far that each vehicle's objective counts, [n, N] m2/s2. Needs ``by_objective``."""
+        """Return the harm so far that each vehicle's objective counts, [n, N] m2/s2.
+
+        Only for a reward with objectives of vehicles (``by_objective`` is True).
+        """
         return objective_harm(state.ledger, self.params.harm_count, self._objectives)
 
     def add(

@@ -206,7 +206,7 @@ def _check_directory(data: bytes) -> None:
 
 @contextmanager
 def _damage() -> Iterator[None]:
-    """Context manager: turn every error of the zip reader in a damaged archive into ``ValueError``."""
+    """Context manager: an error of the zip reader that is raised in the block becomes a ``ValueError``."""
     try:
         yield
     except (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, RuntimeError, OverflowError) as error:

@@ -24,7 +24,7 @@ class FileSchema(GenerateJsonSchema):
 
     @staticmethod
     def publish(schema: dict[str, Any]) -> dict[str, Any]:
-        """Return the schema with its dialect as the first key, ready to be printed or shipped."""
+        """Return the schema, ready to be printed or shipped: with the JSON Schema version (``$schema``) first."""
         return {"$schema": DIALECT, **schema}
 
 

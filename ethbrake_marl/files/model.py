@@ -41,7 +41,10 @@ NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
 
 
 class FileModel(BaseModel):
-    """Base class of the content of a file: immutable; unknown keys and wrong types are errors."""
+    """Base class of pydantic models of a file's content: immutable; unknown keys and wrong types are errors.
+
+    A subclass declares a field for each key.
+    """
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
@@ -71,7 +74,9 @@ def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
 
 
 class Wording:
-    """Texts for error messages about one kind of file; subclasses add what they know about its keys.
+    """Texts for error messages about one kind of file.
+
+    A subclass may override ``needed``, ``instead``, ``owner`` and ``right`` to say more about the keys of this file.
 
     A *path* is the keys and indices that lead to a value, for example ``("mixture", 0, "weight")``.
 
@@ -118,8 +123,8 @@ class Wording:
 def explain(document: Document, error: ValidationError, wording: Wording) -> InvalidInput:
     """Return the ``InvalidInput`` for a document that does not fit its schema.
 
-    It shows the first mistake, unknown keys before all others, and counts the rest: "(and k more mistakes)". A missing
-    key that an unknown key was probably meant to be is not counted.
+    It shows the first mistake, unknown keys before all others, and counts the rest: "(and k more mistakes)". If an
+    unknown key is probably the misspelt name of a missing key, only the unknown key counts.
 
     Args:
         document: the parsed file, which knows the line of each value.
@@ -242,7 +247,7 @@ def _place(path: YamlPath, wording: Wording) -> str:
 
 
 def _unquote(detail: ErrorDetails) -> str:
-    """Return what would be right for a number in quotes; empty for anything else."""
+    """Return advice for a number that stands in quotes and so is a text; empty for any other mistake."""
     given = detail["input"]
     quoted = detail["type"] == "float_type" and isinstance(given, str) and parse_numeral(given) is not None
     return "must be a number, not text; write it without quotes" if quoted else ""

@@ -68,7 +68,10 @@ class Override:
 
 
 def _placed(part: Any, path: tuple[str, ...], override: Override) -> Any:
-    """Return a copy of ``part`` with the value of ``override`` inserted at ``path``, the keys that are left."""
+    """Return a copy of ``part`` (a mapping, list or other value) with the value of ``override`` at ``path`` inside it.
+
+    ``path``: the last keys of ``override.path``; ``()``: the value replaces ``part``. A missing mapping is created.
+    """
     if not path:
         return override.value
     key, rest = path[0], path[1:]

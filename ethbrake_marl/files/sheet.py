@@ -27,7 +27,7 @@ WIDE = 120  # width of a terminal (characters) from which on every column is sho
 class Estimate:
     """A value and its confidence interval; the interval is None if the data do not allow one (a single world)."""
 
-    value: float
+    value: float  # the estimate itself
     interval: tuple[float, float] | None  # low and high end
 
     @property
@@ -89,7 +89,7 @@ class Column:
     key: str = ""  # name in CSV and JSON; "": the heading
     digits: int = 2  # digits after the decimal point
     scale: float = 1.0  # numbers are multiplied by this
-    unit: str = ""
+    unit: str = ""  # text directly after the number
     sign: Literal["z", "+"] = "z"  # format option: "z" never shows -0.00, "+" always shows a sign
     text: bool = False  # left-aligned, and wrapped in a narrow terminal
     short: str = ""  # heading in a terminal; "": the heading

@@ -116,7 +116,10 @@ class Document:
 
     @contextmanager
     def refusing_at(self, path: YamlPath) -> Iterator[None]:
-        """Context manager: prefix an ``InvalidInput`` from the block with file and line of the value at ``path``."""
+        """Context manager: an ``InvalidInput`` raised in the block is raised again, beginning with file and line.
+
+        The line is that of the value at ``path``: keys and indices that lead to it.
+        """
         try:
             yield
         except InvalidInput as error:

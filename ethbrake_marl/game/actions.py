@@ -35,9 +35,10 @@ def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str) -> Flo
 
 
 def own_actions(actions: ArrayLike, names: str) -> NDArray[Any]:
-    """Return a copy of the actions; raise ``InvalidInput`` for values that are not numbers.
+    """Return a copy of the actions as an array, which later changes by the caller do not affect.
 
-    The values of a NumPy array are not checked. ``names`` names the vehicles in the message.
+    Raises ``InvalidInput`` for a list or tensor with values that are not numbers; a NumPy array is copied unchecked.
+    ``names``: names of the vehicles, for the message.
     """
     return actions.copy() if isinstance(actions, np.ndarray) else _numbers(actions, names).copy()
 

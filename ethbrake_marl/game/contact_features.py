@@ -38,7 +38,8 @@ class Contacts(NamedTuple):
 
     time_step_s: float  # time between two decisions (s)
     commands: Ints  # commands to forecast, as indices into CONTACT_COMMANDS
-    features: Floats  # 1 / scale, low, high of every contact feature: [3, 30], or [3, 42] with contact_far
+    # [3, 30], or [3, 42] with contact_far: rows 1 / scale, low and high; a column per contact feature
+    features: Floats
 
 
 @compiled
@@ -54,7 +55,7 @@ def observe_contacts(
         observers: indices of the observing vehicles.
         time_step: time between two decisions, s.
         commands: commands to forecast, as indices into CONTACT_COMMANDS.
-        features: 1 / scale, low, high of every contact feature: [3, 30], or [3, 42] with contact_far.
+        features: scaling, [3, 30], or [3, 42] with contact_far: rows 1 / scale, low and high, a column per feature.
         out: result; columns of commands that are not forecast stay as they are.
         failed: set to True where a check of the kernel failed, [n].
 

@@ -10,7 +10,7 @@ from ethbrake_marl.physics.state import Worlds
 
 
 class Drawn(Protocol):
-    """Worlds drawn from a game; a ``Sample`` is one."""
+    """What ``Game.sample`` returns: an object with the drawn worlds in ``worlds``, such as a ``Sample``."""
 
     @property
     def worlds(self) -> Worlds:

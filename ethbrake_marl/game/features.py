@@ -259,7 +259,10 @@ def listed_features(listed: object) -> tuple[str, ...]:
 
 
 class _ListSchema:
-    """Adds to a field the JSON schema of an observation: a list of the features that are registered at that time."""
+    """Annotation of a field that lists the features of an observation: its JSON schema names all features.
+
+    Features that are registered before the schema is made are included.
+    """
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:

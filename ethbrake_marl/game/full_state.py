@@ -57,7 +57,7 @@ def full_state(worlds: Worlds, scenario: Game) -> Observations:
 
 
 def row_features(own: tuple[Feature, ...], appended: Appended | None, scenario: Game) -> tuple[Feature, ...]:
-    """Return the features of a learner's row in order: its own observation, then what is appended to it.
+    """Return the features of a learner's whole observation, in order: its own, then what training appends to them.
 
     Raises ``InvalidInput`` for an invalid ``appended``.
 

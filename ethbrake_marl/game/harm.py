@@ -107,11 +107,12 @@ class Ledger:
         return harm
 
     def speed_changes(self, harm_count: HarmCount) -> tuple[Floats, Floats]:
-        """Return the change of speed of each vehicle hit in front, and of each hit at the rear, [n, N] m/s each.
+        """Return two changes of speed of each vehicle, [n, N] m/s each: by impacts in front, and at the rear.
 
-        It is the change in a single impact with the counted harm of the pair. This is exact for first impacts of one
-        pair at a time. If a pair has several impacts and ``total`` counts them all, it exceeds the change in the
-        hardest one. ``harm_count``: ``"first"`` impact of each pair, or ``"total"``.
+        They are computed from the harm of the pair, as if it came from one single impact of these two vehicles alone.
+        This is exact for a first impact in which no third vehicle takes part. If ``"total"`` counts several impacts of
+        a pair, the result exceeds the change in the hardest one. ``harm_count``: ``"first"`` impact of each pair, or
+        ``"total"``.
         """
         with_obstacle = np.concatenate([self.obstacle_harm(harm_count)[:, np.newaxis], self.pair_harm(harm_count)], 1)
         rebound = (1.0 + self.restitution[:, np.newaxis]) * np.sqrt(with_obstacle)

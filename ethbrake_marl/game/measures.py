@@ -44,7 +44,7 @@ class NamedMeasure:
     unit: str  # unit of its value; ``1`` for a plain number
     by: By  # ``step`` or ``impacts``: what it is computed from
     function: Callable[..., Any] | None = None  # computes the measure; None: the engine does
-    settings: tuple[str, ...] = ()  # fields of RewardParams that a built-in function takes after the step
+    settings: tuple[str, ...] = ()  # fields of RewardParams that a built-in function takes as further arguments
     form: str = ""  # result of a registered function, such as ``a number per vehicle`` or ``a truth per world``
 
     def built_in(self, step: StepOutcome, params: Any) -> Floats:

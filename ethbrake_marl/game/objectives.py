@@ -54,8 +54,8 @@ class HarmSoFar(NamedTuple):
     borne: Floats  # [n, N] harm that each vehicle bears, m2/s2
     whole: Floats  # [n] harm of all vehicles, m2/s2
     mass_t: Floats  # [n, N] mass of each vehicle, t
-    front_change_mps: Floats  # [n, N] change of speed of each vehicle if hit in front
-    rear_change_mps: Floats  # [n, N] change of speed of each vehicle if hit at the rear
+    front_change_mps: Floats  # [n, N] change of speed of each vehicle by impacts in front, m/s; 0: not hit there
+    rear_change_mps: Floats  # [n, N] change of speed of each vehicle by impacts at the rear, m/s; 0: not hit there
 
 
 ObjectiveFunction = Callable[[HarmSoFar, int], Floats]

@@ -182,7 +182,7 @@ class Scaling(NamedTuple):
     offsets: Ints  # place of each observed neighbour relative to the observer: -1 is the next vehicle ahead
     role: bool  # whether the place in the line is observed
     obstacle: bool  # whether the obstacle ahead is observed
-    features: Floats  # [3, F] 1 / scale, low, high of each feature
+    features: Floats  # [3, F] rows 1 / scale, low and high; a column per feature
 
 
 class Extra(NamedTuple):
@@ -197,7 +197,7 @@ class Extra(NamedTuple):
 class Plan(NamedTuple):
     """How to compute an observation from worlds: kernels fill whole groups, functions compute registered features."""
 
-    scaling: Scaling
+    scaling: Scaling  # how to compute all built-in features but the contact features
     contacts: Contacts | None  # contact features, after all other groups; None: no such features
     picked: Ints | None  # [F] columns to take from the features of whole groups; None: all
     extras: tuple[Extra, ...]  # registered features
@@ -284,7 +284,7 @@ def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature]
 
 
 def _scales(features: Sequence[Feature]) -> Floats:
-    """Return 1 / scale, low, high of every feature, [3, F]."""
+    """Return the scaling of features, [3, F]: rows 1 / scale, low and high, a column per feature."""
     return np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]])
 
 
@@ -304,7 +304,7 @@ def _observe_rows(
         offsets: place of each observed neighbour relative to the observer; -1 is the next vehicle ahead.
         role: whether the vehicle's place in the line is observed.
         with_obstacle: whether the obstacle ahead is observed.
-        features: 1 / scale, low and high of each feature, [3, F].
+        features: scaling, [3, F]: rows 1 / scale, low and high, a column per feature.
         out: result.
 
     """

@@ -36,7 +36,7 @@ from ethbrake_marl.physics.state import Floats, Worlds
 
 
 class WithoutEffect(UserWarning):
-    """Warning: a setting has no effect here."""
+    """Warning: a setting has no effect, for example an objective in a reward that gives harm the weight 0."""
 
 
 def own_terms() -> list[str]:
@@ -61,8 +61,9 @@ class RewardParams(FileModel):
     """Weights of the terms and their constants; a weight of 0 switches a term off.
 
     Args:
-        harm, collision, risk, jerk, terminal, shaping: weights, at least 0, of the terms that the module's head lists;
-            harm must be given beside any other.
+        harm, collision, risk, jerk, terminal, shaping: weights, at least 0, of these terms: harm of the line, all
+            impacts, nearness of a collision, change of the command, an end without collision, and change of a
+            potential. The head of the module has the formulas. harm must be given beside any other.
         harm_count: impacts that count, ``first`` of each pair or ``total``.
         objective: whose harm counts, one name or one for each vehicle; None: the scenario's.
         shaping_discount: the learner's own discount, in (0, 1].
@@ -70,7 +71,7 @@ class RewardParams(FileModel):
         ttc_scale_s: time to collision at which the risk term falls, s.
         safety_buffer_m: distance kept free in the risk term, m.
         target_gap_m: gap below which the risk term rises, m.
-        distance_slope_per_m: how steeply it does, 1/m.
+        distance_slope_per_m: how steeply the risk term rises below that gap, 1/m.
         terms: weights of registered measures, which may be negative: a measure of harm gets a negative one.
 
     >>> import ethbrake_marl as eb
@@ -185,11 +186,11 @@ class RewardParams(FileModel):
         return total
 
     def settled(self, of_scenario: Declared, vehicles: int) -> tuple[RewardParams, tuple[Objective, ...]]:
-        """Return this reward with the objective that applies, and the objective of each vehicle.
+        """Return this reward with its field ``objective`` filled in, and the parsed objective of each vehicle.
 
         The objective is the reward's own, or else the scenario's. If all vehicles minimise everybody's harm (the usual
-        case), the objective is None and there are no objectives of vehicles. The same holds if harm has weight 0; then
-        a warning (``WithoutEffect``) names an objective that changes nothing.
+        case), the field is None and the tuple is empty. The same holds if harm has weight 0; then a warning
+        (``WithoutEffect``) says that the objective changes nothing.
 
         Args:
             of_scenario: objective that the scenario declares.

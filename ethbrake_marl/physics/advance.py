@@ -41,12 +41,19 @@ def advance_worlds(
 ) -> tuple[int, bool]:  # fmt: skip
     """Advance every world to its time ``until``, in place; return the number of impacts and whether the input is valid.
 
-    Arguments are columns of ``Worlds`` and ``Vehicles`` under short names; ``time`` and ``until`` are [n] s. The first
-    seven arrays (state) are updated, the next six (harm) are filled. ``failed`` [n] receives the status of each world:
-    DONE, or the check of the kernel that failed. A failed world keeps its state; the others go on. ``at`` is 1 if some
-    world has an obstacle ``ahead``, otherwise 0; vehicle i is column ``at + i`` of the table (``physics.rows``).
-    ``rows`` [capacity, LISTED.WIDTH] receives impacts until it is full. The second result is False if some ``until`` or
-    command is invalid.
+    A failed world keeps its state; the others go on. The second result is False if some ``until`` or command is
+    invalid. Arguments that are not listed are fields of ``Worlds`` and ``Vehicles`` under short names, for example
+    ``gaps`` for ``gaps_m``.
+
+    - ``in_force``: accelerations in force at the start, [n, N] m/s2. The first seven arrays, the state, are updated.
+    - ``ahead``: gap to the obstacle ahead, [n] m.
+    - ``first_harm``: harm of first impacts, [n, P] m2/s2. The six arrays from this one to ``ahead_count`` are filled.
+    - ``command``: commands, [n, N] m/s2.
+    - ``until``: time at which each world's segment ends, [n] s.
+    - ``failed``: [n] receives the status of each world: ``FLAG.DONE``, or the code of the check that failed.
+    - ``at``: 1 if some world has an obstacle, otherwise 0; vehicle i is column ``at + i`` of the table
+      (``physics.rows``).
+    - ``rows``: list of impacts, [capacity, LISTED.WIDTH], filled until it is full; further impacts are only counted.
     """
     n, vehicles = speeds.shape
     building = pieces.shape[2] > 0 or finite_among(brake_rate.ravel()) + finite_among(release_rate.ravel()) > 0
@@ -166,7 +173,7 @@ class _Part(NamedTuple):
 
 
 def _advance_part(arrays: tuple[NDArray[Any], ...], at: int, capacity: int, part: slice) -> _Part:
-    """Advance the worlds of the slice ``part`` in place.
+    """Advance the worlds of the slice ``part`` in place; return their impacts and whether the input is valid.
 
     Args:
         arrays: array arguments of ``advance_worlds`` for all worlds, in its order.

@@ -32,10 +32,11 @@ _PARTS_LATE_MPS2 = 1e-12  # smallest difference of accelerations at a separation
 
 @compiled(bare=True)
 def built_up(table: Floats) -> bool:
-    """Return whether every vehicle's force already equals its command, and no piece of braking is still to come.
+    """Return whether no force will change before the next latency elapses: each already equals its command.
 
-    The force of a vehicle is the acceleration by its brakes or engine. If so, ``constant_motion.move`` is exact until
-    the next latency elapses. ``table``: one world in the layout of ``physics.rows``.
+    The force of a vehicle is the acceleration by its brakes or engine. A vehicle that brakes in *pieces* (by a fixed
+    sequence of commands) must also have begun the last one. If the result is True, ``constant_motion.move`` is exact.
+    ``table``: one world in the layout of ``physics.rows``.
     """
     there = True
     for i in range(table.shape[1]):
@@ -160,9 +161,10 @@ def plan_force(table: Floats, i: int, wanted: float) -> None:
 
 @compiled
 def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple[float, float, float, float]:
-    """Return the ends (low, high) of a vehicle's ``force_range``, m/s2, and the rates at which they move, m/s3.
+    """Return a vehicle's own acceleration if it is about to move forward and if backward, and how fast both change.
 
-    The two ends are the accelerations from the vehicle's own forces if it is about to move forward, and if backward.
+    The result is ``(forward, backward, rate of forward, rate of backward)``, in m/s2 and m/s3. The two accelerations
+    differ where the force depends on the direction, for example for brakes at standstill, see ``motion.force_range``.
 
     Args:
         force: present acceleration by brakes or engine, m/s2.
@@ -187,10 +189,10 @@ def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple
 
 @compiled
 def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) -> tuple[float, float]:
-    """Return acceleration (m/s2) and jerk (m/s3) of a free body whose force range changes with time.
+    """Return acceleration (m/s2) and jerk (m/s3) of a body (a vehicle, or several that move as one).
 
-    The acceleration is the value nearest to 0 in the range ``[low, high]`` (m/s2), as in ``motion.settle``;
-    ``low_jerk`` and ``high_jerk`` are the rates at which the two ends move (m/s3).
+    Its own forces allow every acceleration in the range ``[low, high]`` (m/s2), whose ends move at the rates
+    ``low_jerk`` and ``high_jerk`` (m/s3). The body takes the value nearest to 0, as in ``motion.settle``.
     """
     if low > 0.0 or (low == 0.0 and low_jerk > 0.0):
         return low, low_jerk
@@ -203,10 +205,10 @@ def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) ->
 def pool_moving(table: Floats, first: int, last: int) -> float:
     """Set accelerations and jerks of touching vehicles; return the time until two of them separate (s).
 
-    The vehicles are the columns ``first..last`` of ``table`` and have the same speed. The rule is the isotonic
-    regression of ``impact.pool`` with two differences: vehicles of equal acceleration are joined, and separate later by
-    their jerks; accelerations that differ by no more than rounding count as equal. The time is infinite if no joined
-    vehicles separate. Writes the rows ACCELERATION, JERK and JOINED.
+    The vehicles are the columns ``first..last`` of ``table`` and have the same speed. A vehicle whose acceleration is
+    at least as large as that of the vehicle in front, up to rounding, joins it: both move as one body with a common
+    acceleration and jerk. They separate later if their jerks differ. The time is infinite if no joined vehicles
+    separate. Writes the rows ACCELERATION, JERK and JOINED.
     """
     count = 0
     for i in range(first, last + 1):
@@ -345,8 +347,10 @@ def accelerate_moving(table: Floats) -> float:
 def next_moving_event(table: Floats, now: float, end: float, parting: float) -> float:
     """Return the time from ``now`` to the next event, at most ``end - now`` (s).
 
-    Version of ``constant_motion.next_event`` for brake build-up. Also writes into the table when each vehicle next
-    comes to rest or reaches its speed limit, and when each pair comes into contact.
+    An event is a contact, a separation, a vehicle that comes to rest or reaches its speed limit, a command that takes
+    effect, or a force that reaches its command. Also writes into the table when each vehicle next comes to rest or
+    reaches its speed limit, and when each pair comes into contact. Version of ``constant_motion.next_event`` for brake
+    build-up.
 
     Args:
         table: one world in the layout of ``physics.rows``, after ``accelerate_moving``.

@@ -76,13 +76,16 @@ class Packed(NamedTuple):
     """n worlds packed into two arrays, one row per world."""
 
     state: Floats  # [n, S] what changes during an episode; columns ``time`` to ``obstacle`` of ``Columns``
-    params: Floats  # [n, 1 + 7 N], [n, 1 + 8 N + N * N] or, with M columns of messages, [n, 1 + 8 N + N * N + M]
+    # parameters of the vehicles and state of the messages; columns ``restitution`` to ``messages`` of ``Columns``:
+    # [n, 1 + 7 N]; with news by link [n, 1 + 8 N + N * N]; with M columns of messages [n, 1 + 8 N + N * N + M]
+    params: Floats
 
     @classmethod
     def of(cls, worlds: Worlds) -> Packed:
         """Pack ``worlds`` at the start of their episode, with harm 0.
 
-        Columns of the obstacle and of news by link exist only if some world needs them.
+        Columns of the obstacle, and of news by link (the time from which each vehicle may act on information about each
+        other one), exist only if some world needs them.
         """
         v, (n, N) = worlds.vehicles, worlds.speeds_mps.shape
         none = np.zeros((n, 3 * (N - 1)))

@@ -47,8 +47,9 @@ def accelerate(table: Floats) -> None:
 def next_event(table: Floats, now: float, end: float) -> float:
     """Return the time from ``now`` to the next event, at most ``end - now`` (s).
 
-    Also writes into the table when each vehicle next comes to rest or reaches its speed limit, and when each pair comes
-    into contact.
+    An event is a contact, a vehicle that comes to rest or reaches its speed limit, or a command that takes effect. Also
+    writes into the table when each vehicle next comes to rest or reaches its speed limit, and when each pair comes into
+    contact.
 
     Args:
         table: one world in the layout of ``physics.rows``, after ``accelerate``.

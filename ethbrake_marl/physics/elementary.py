@@ -121,10 +121,11 @@ def exp(x: float) -> float:
 
 @compiled
 def _log_parts(x: float) -> tuple[float, float]:
-    """Return ``ln x`` of a finite x > 0 as a sum of two numbers: a multiple of a constant, exact, and a small rest.
+    """Return two numbers whose sum is ``ln x``, for a finite x > 0, more accurate than one number could be.
 
-    ``x = 2^k m`` with m around 1, and ``ln m = 2 artanh(s)`` with ``s = (m - 1) / (m + 1)``; the series of artanh
-    starts with separate first terms.
+    With ``x = 2^k m`` and m between ``sqrt(1/2)`` and ``sqrt(2)``, the first number is k times the leading bits of
+    ``ln 2``, without rounding. The second is the rest of ``k ln 2``, plus ``ln m = 2 artanh((m - 1) / (m + 1))`` by its
+    series.
     """
     k, m = 0, x
     while m >= _SQRT2:

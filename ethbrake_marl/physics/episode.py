@@ -39,8 +39,8 @@ class _Clock(NamedTuple):
     LAST_STEP: int = 2  # number of steps
     HORIZON: int = 3  # end of the last step (s)
     RESTITUTION: int = 4  # coefficient of restitution of every impact
-    HARM_IS_TOTAL: int = 5  # 1 if the search minimises total harm, 0 for first-impact harm
-    STEPWISE: int = 6  # 1 to advance one decision at a time, 0 one phase at a time
+    HARM_IS_TOTAL: int = 5  # 1 if total harm is to be minimised, 0 for first-impact harm
+    STEPWISE: int = 6  # 1 to advance decision by decision; 0 phase by phase (intervals of constant command)
     WIDTH: int = 7  # number of entries
 
 
@@ -63,9 +63,14 @@ class Grid(NamedTuple):
 
 
 class Episode(NamedTuple):
-    """One world, prepared for simulating profiles: commands of the controlled vehicles in each phase of time."""
+    """One world, prepared for simulating *profiles*: sequences of constant commands for the controlled vehicles.
 
-    table: Floats  # [rows_for(2 K), N], filled with latencies, masses, limits and other vehicles' commands
+    A phase is the time interval of one of these commands.
+    """
+
+    # [rows_for(2 K), N] table in the layout of ``physics.rows``, for K pieces of braking per vehicle; filled with
+    # latencies, masses, limits and other vehicles' commands
+    table: Floats
     clock: Floats  # [CLOCK.WIDTH] decision times and settings, see ``CLOCK``
     controlled: Ints  # [C] indices of the controlled vehicles
 
@@ -177,9 +182,10 @@ def step_episode(
 
 @compiled(within=True)
 def step_again(table: Floats, restitution: float, grid: Grid, step: int, end: int, no_rows: Floats) -> int:
-    """Advance a world from decision number ``step`` to decision number ``end``, with the result of ``step_episode``.
+    """Advance a world from decision number ``step`` to decision number ``end``; the result is as in ``step_episode``.
 
-    The table must still hold the world as the previous step left it; only onsets of commands are renewed.
+    The table must still hold the world as the previous step left it; only the times at which commands take effect are
+    computed anew.
 
     Args:
         table: the world in the layout of ``physics.rows``, with its rows of an episode; it is advanced.
@@ -213,11 +219,11 @@ def harm_so_far(table: Floats, total: float) -> float:
 
 @compiled
 def value_of(table: Floats, total: float) -> float:
-    """Return the number that a search minimises: harm under one count plus ``OTHER_WEIGHT`` times the other (m2/s2).
+    """Return the number that a search minimises (m2/s2): the chosen harm, plus ``OTHER_WEIGHT`` times the other one.
 
     Args:
         table: one world in the layout of ``physics.rows``, with its rows of an episode.
-        total: 1 if total harm is minimised, 0 for first-impact harm; the other one is the tie-breaker.
+        total: 1 if total harm is chosen, 0 for first-impact harm; the other one only decides between equals.
 
     """
     return harm_so_far(table, total) + OTHER_WEIGHT * harm_so_far(table, 1.0 - total)
@@ -260,7 +266,10 @@ def restore(table: Floats, state: Floats) -> None:
 
 @compiled(apart=True)
 def follow_whole(world: Episode, ends: Ints, commands: Floats, states: Floats, bound: float) -> tuple[float, int]:
-    """Simulate a profile from its first phase on; arguments and result are those of ``follow`` with ``phase`` 0."""
+    """Simulate a whole profile: a sequence of constant commands, one per phase.
+
+    Arguments and result are those of ``follow``, with ``phase`` 0.
+    """
     phase = min(0, ends.shape[0])  # 0, but not as a literal: numba would compile everything again for it
     return follow(world, ends, commands, states, phase, bound)
 
@@ -269,9 +278,10 @@ def follow_whole(world: Episode, ends: Ints, commands: Floats, states: Floats, b
 def follow(world: Episode, ends: Ints, commands: Floats, states: Floats, phase: int, bound: float) -> tuple[float, int]:
     """Simulate a profile from ``phase`` on; return its value (m2/s2) and the number of phases until the episode ends.
 
-    The value is the harm that a search minimises (``value_of``). The number is -1 if the kernel failed. With
-    ``clock[STEPWISE]`` it advances decision by decision, to the same bits as the engine. Otherwise it advances phase by
-    phase, which is several times faster and differs by rounding.
+    A profile is a sequence of constant commands; a phase is the time interval of one of them. The value is the harm
+    that a search minimises (``value_of``). The number is -1 if the kernel failed. If ``world.clock[CLOCK.STEPWISE]`` is
+    1, it advances decision by decision, to the same bits as the engine. Otherwise it advances phase by phase, which is
+    several times faster and differs by rounding.
 
     Args:
         world: the world and its decision times; its table is a workspace.

@@ -73,9 +73,16 @@ def forecast_worlds(
 ) -> None:  # fmt: skip
     """Simulate every world with each candidate command; fill ``first`` and ``total`` [n, K] with the harm (m2/s2).
 
-    Arguments are columns of ``Worlds`` and ``Vehicles`` under short names, and those of ``forecast``. ``ahead`` [n] is
-    the gap to an obstacle (m), ``FAR_AWAY_M`` in a world without one; it is empty if no world has one. ``failed`` [n]
-    is set to True where a check of the kernel failed. ``first`` and ``total`` must be 0 on entry.
+    ``first`` and ``total`` must be 0 on entry. Arguments that are not listed are fields of ``Worlds`` and ``Vehicles``
+    under short names, for example ``gaps`` for ``gaps_m``.
+
+    - ``ahead``: gap to an obstacle, [n] m, ``FAR_AWAY_M`` in a world without one; empty if no world has one.
+    - ``command``: commands of all vehicles, [n, N] m/s2; the column of ``vehicle`` is ignored.
+    - ``vehicle``: index of the vehicle that tries the candidates, from 0.
+    - ``candidates``: K candidate commands for it in each world, [n, K] m/s2.
+    - ``until_s``: absolute end of the forecast, s.
+    - ``in_force``: accelerations in force at the start, [n, N] m/s2.
+    - ``failed``: set to True where a check of the kernel failed, [n].
     """
     n, vehicles = speeds.shape
     at = min(ahead.shape[0], 1)  # vehicle i is column at + i; an obstacle is column 0

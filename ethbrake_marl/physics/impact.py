@@ -26,11 +26,11 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(bare=True)
 def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) -> int:
-    """Replace the values of touching vehicles by their isotonic regression, in row ``out``; return the block count.
+    """Give touching vehicles values with which none is faster than the vehicle in front; return the number of blocks.
 
-    The regression is weighted by mass: a vehicle that would be faster than the one in front is pooled with it into a
-    *block*, and all members of a block get the same bits. Rows BLOCK_* describe the blocks. A vehicle of infinite mass
-    (the obstacle) stands still, and so does its block.
+    A vehicle that would be faster than the one in front is pooled with it into a *block*, whose vehicles all get the
+    same value: the mean weighted by mass (isotonic regression). The values are written to row ``out``, and rows BLOCK_*
+    describe the blocks. A vehicle of infinite mass (the obstacle) stands still, and so does its block.
 
     Args:
         table: one world in the layout of ``physics.rows``.
@@ -72,13 +72,20 @@ def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) ->
 def resolve_cluster(table: Floats, restitution: float, first: int, last: int) -> None:
     """Replace the speeds of touching vehicles ``first..last`` by their speeds after the impact.
 
-    ``table``: one world in the layout of ``physics.rows``; ``restitution``: coefficient of restitution, equal for all
-    impacts of a world. A cluster is plastic if its largest closing speed is below ``PLASTIC_SPEED_MPS``. The common
-    speed of a block is corrected by the mean of the remaining error, so the momentum error stays within 4 eps of
-    ``sum(m |v|)`` for any masses. A vehicle that is not struck keeps its bits.
+    Nothing bounces (restitution 0) if the largest closing speed is below ``PLASTIC_SPEED_MPS``. The vehicles fall into
+    blocks with one common speed before the bounce (``pool``). This speed is corrected by the mean of the remaining
+    error, so the momentum error stays within 4 eps of ``sum(m |v|)`` for any masses. A vehicle that is not struck keeps
+    its bits.
 
-    Corrected block speeds are ordered only up to rounding. So in a plastic cluster each speed is finally limited to
-    that of the vehicle in front. Without this step two blocks could exchange a rounding error forever.
+    Corrected speeds are ordered only up to rounding. So if nothing bounces, each speed is finally limited to that of
+    the vehicle in front. Without this step two blocks could exchange a rounding error forever.
+
+    Args:
+        table: one world in the layout of ``physics.rows``.
+        restitution: coefficient of restitution of every impact.
+        first: column of the front vehicle.
+        last: column of the rear vehicle.
+
     """
     largest = 0.0
     for p in range(first, last):

@@ -215,7 +215,7 @@ def _without_c_wrapper(flags: Any) -> Any:
 
 
 def _symbols(library: Any) -> list[str]:
-    """Return the names of the functions that a library defines for callers from outside."""
+    """Return the names under which other kernels call the functions of ``library``, numba's code of one kernel."""
     return [function.name for function in library._final_module.functions if function.name.startswith("_ZN7cpython")]
 
 
@@ -303,7 +303,7 @@ def digest_of_sources(source: Path) -> str:
 
 
 def _place_of(file: Path) -> str:
-    """Return the path of a file inside this package, or the full path of any other file."""
+    """Return the path of ``file`` relative to this package's folder, or its full path if it lies elsewhere."""
     return file.relative_to(_PACKAGE).as_posix() if file.is_relative_to(_PACKAGE) else str(file)
 
 

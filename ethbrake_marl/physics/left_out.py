@@ -63,7 +63,7 @@ class ImpactRows:
 
     world: Ints  # row of the world in the batch
     pair: Ints  # index of the pair; -1: Vehicle 1 and the obstacle ahead
-    time_s: Floats  # since Vehicle 1 began to brake
+    time_s: Floats  # time since Vehicle 1 began to brake
     closing_speed_mps: Floats  # just before the impact, > 0
     first: Bools  # whether this is the pair's first impact
     front_speed_change_mps: Floats  # change of the front vehicle's speed in this round of impacts, >= 0

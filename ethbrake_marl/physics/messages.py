@@ -269,7 +269,10 @@ def hear_rows(
 
 @compiled
 def _start(state: Floats, params: Floats, column: Columns, wanted: Floats) -> None:
-    """Set the places, and take and receive the first sample, at the alert. Updates the rows ``state`` and ``params``.
+    """Begin the messages of one world at the alert. Updates the rows ``state`` and ``params``.
+
+    Sets the place of each vehicle along the road, stores the first sample of all states, and lets each vehicle measure
+    the vehicles in sight.
 
     Args:
         state: state row of one world, [S].
@@ -395,7 +398,7 @@ def _receive(time: float, told: Floats, N: int) -> None:
 def _take(told: Floats, link: int, sender: int, sent_s: float, N: int) -> None:
     """Receive one message: copy the sender's newest sample from the ring buffer to the link.
 
-    A sample counts if it was taken at ``sent_s`` or earlier; an older one than the receiver already has is ignored.
+    It is the newest sample taken at ``sent_s`` or earlier. Nothing changes if the receiver already has a newer one.
 
     Args:
         told: columns of messages of one world; updated.

@@ -51,9 +51,9 @@ command_acts = compiled(has_acted)
 def contact(gap: float, closing: float, pressing: float) -> tuple[float, float]:
     """Return the time to a pair's first contact (s) and the closing speed there (m/s); ``(inf, 0)`` if there is none.
 
-    With ``D = w^2 + 2 b g``: for ``w > 0`` no contact if ``D < 0``, otherwise ``t = 2 g / (w + sqrt D)``. For ``w <=
-    0`` contact only if ``b > 0``, ``t = (-w + sqrt D) / b``. The closing speed at contact is ``sqrt D``, because ``w +
-    b t`` would suffer cancellation.
+    With ``D = w^2 + 2 b g``: for ``w > 0`` there is no contact if ``D < 0``, otherwise ``t = 2 g / (w + sqrt(D))``. For
+    ``w <= 0`` there is one only if ``b > 0``: ``t = (sqrt(D) - w) / b``. The closing speed at contact is computed as
+    ``sqrt(D)``; the equal ``w + b t`` would suffer cancellation.
 
     Args:
         gap: present gap g >= 0, m.
@@ -143,7 +143,10 @@ def force_range(speed: float, command: float, limit: float) -> tuple[float, floa
 
 @compiled
 def settle(low: float, high: float) -> float:
-    """Return the acceleration of a free body whose forces range over ``[low, high]`` (m/s2): the value nearest to 0."""
+    """Return the acceleration of a body whose own forces allow ``[low, high]`` (m/s2): the value nearest to 0.
+
+    The body is a vehicle, or several that move as one.
+    """
     if low > 0.0:
         return low
     if high < 0.0:
@@ -210,7 +213,7 @@ def ramped_stopping_distance(speed: float, latency_left: float, capacity: float,
     """Return the distance (m) to rest under full braking with brakes that build up from 0 at a constant rate.
 
     It is ``v tau + v a / (2 r) - a^3 / (24 r^2) + v^2 / (2 a)``. If the vehicle stops before its brakes reach full
-    force, ``v < a^2 / (2 r)``: ``v tau + 2/3 v sqrt(2 v / r)``.
+    force, ``v < a^2 / (2 r)``, it is ``v tau + (2 / 3) v sqrt(2 v / r)``.
 
     Args:
         speed: present speed v, m/s.

@@ -112,7 +112,7 @@ def exchange_at_sample(
 
 @compiled
 def held_motion(speed: float, command: float, limit: float, step: float) -> tuple[float, float]:
-    """Return speed (m/s) and distance (m) after a step of constant command: ``v + h u`` and ``h v + h^2 / 2 u``.
+    """Return speed (m/s) and distance (m) after a step of constant command: ``v + h u`` and ``h v + h^2 u / 2``.
 
     u is the command, limited so that the speed ends at standstill or at its limit instead of beyond it. The distance is
     computed as h times the mean of both speeds, which is the same for constant u. Brakes act against the motion.
@@ -177,11 +177,19 @@ def sample_worlds(
     last: Ints, latency: Floats, mass: Floats, limit: Floats, restitution: Floats, first_harm: Floats,
     total_harm: Floats, count: Ints,
 ) -> None:  # fmt: skip
-    """Advance every world from sample ``first`` to sample ``last`` [n], in place; -1 means before sample 0.
+    """Advance every world by the paper's fixed-step map, from one sample to another, in place.
 
-    Arrays are columns of ``Worlds`` and ``Vehicles`` under short names. ``gaps``, ``speeds``, ``time`` and ``hit`` are
-    updated, and ``first_harm``, ``total_harm`` and ``count`` [n, P]. A world that ends before sample 0 ends at
-    ``until`` [n] s. ``step`` is the sampling period in s.
+    Sample 0 is at the latency of Vehicle 2. Arguments that are not listed are fields of ``Worlds`` and ``Vehicles``
+    under short names; ``gaps``, ``speeds``, ``time`` and ``hit`` are updated.
+
+    - ``command``: commands, [n, N] m/s2.
+    - ``until``: end times, [n] s; used only in a world that ends before sample 0.
+    - ``step``: sampling period, s.
+    - ``first``: number of the sample at which each world starts, [n]; -1: before sample 0.
+    - ``last``: number of the sample at which it ends, [n]; -1: before sample 0.
+    - ``first_harm``: first-impact harm, [n, P] m2/s2; updated.
+    - ``total_harm``: harm of all impacts, [n, P] m2/s2; updated.
+    - ``count``: number of impacts, [n, P]; updated.
     """
     for k in range(speeds.shape[0]):
         start = latency[k, 1]
@@ -210,10 +218,10 @@ def advance_sampled(
 ) -> tuple[Worlds, Impacts]:
     """Advance ``worlds`` by the paper's fixed-step map under constant commands; return new worlds and impacts.
 
-    Steps are whole: a world ends at its first sample at or after ``until_s``, or at ``until_s`` itself if that is
-    before its first sample. Impacts of the last sample belong to the next call, so calls can be chained; the returned
-    state is the paper's s(n), before these impacts. ``Impacts.rows`` is None. The result of a world does not depend on
-    its batch. Inputs are not changed.
+    Samples are ``step_s`` apart, the first one at the latency of Vehicle 2. A world ends at its first sample at or
+    after ``until_s``, or at ``until_s`` itself if that is before its first sample. Impacts of the last sample belong to
+    the next call, so calls can be chained; the returned state is the paper's s(n), before these impacts.
+    ``Impacts.rows`` is None. The result of a world does not depend on its batch. Inputs are not changed.
 
     Gaps of the result may be negative: it can be continued here, but not by ``advance``.
 

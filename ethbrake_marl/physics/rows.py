@@ -136,9 +136,9 @@ LISTED = _Listed()
 
 @compiled(bare=True)
 def builds_up(table: Floats) -> bool:
-    """Return whether brakes of this world build up (finite rate) or follow a fixed sequence of commands.
+    """Return whether some vehicle's brakes build up (finite rate) or follow a fixed sequence of commands.
 
-    ``table``: the world in this layout.
+    ``table``: one world in the layout of ``_Rows``.
     """
     return bool(table.shape[0] > ROW.OF_EPISODE and table[ROW.BUILDS_UP, 0] == 1.0)
 
@@ -184,7 +184,7 @@ def place_rates(table: Floats, brake_rate: Floats, release_rate: Floats, pieces:
 def place_forces(
     table: Floats, force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats
 ) -> None:  # fmt: skip
-    """Write rates, pieces and present forces of one world's vehicles into its table.
+    """Write brake and release rates, sequences of commands and present forces of one world's vehicles into its table.
 
     ``force``: present acceleration by brakes or engine, [N] m/s2. The other arguments are those of ``place_rates``.
     Forces are written only if BUILDS_UP is 1.

@@ -194,7 +194,9 @@ def to_next_event(table: Floats, now: float, duration: float, building: bool) ->
 
 @compiled(bare=True)
 def begin_commands(table: Floats, now: float, passed: float, building: bool) -> None:
-    """Put into effect the commands, and pieces of braking, that begin between ``now`` and ``now + passed``.
+    """Put into effect the commands that begin between ``now`` and ``now + passed``.
+
+    They include the next commands of vehicles that brake by a fixed sequence of commands.
 
     Args:
         table: the world in the layout of ``physics.rows``.

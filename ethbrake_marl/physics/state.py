@@ -221,9 +221,9 @@ class Worlds:
         return int(self.speeds_mps.shape[1])
 
     def _each(self, change: Callable[..., NDArray[Any]], *others: Worlds) -> Worlds:
-        """Return worlds whose columns are ``change`` of the columns of these worlds and of ``others``.
+        """Return new worlds, each field of which is ``change(own field, field of the first of others, ...)``.
 
-        ``change`` takes one array per batch and selects or joins rows, for example ``np.concatenate``.
+        ``change`` takes one array per batch and returns one array: it selects or joins rows.
         """
         parts = (self, *others)
         columns = (change(*(getattr(w, name) for w in parts)) for name in _OF_WORLDS)
@@ -409,10 +409,10 @@ class Worlds:
     def with_post_ahead(self, duration_s: Floats) -> Worlds:
         """Return these worlds with an obstacle each: their own, or one out of Vehicle 1's reach for ``duration_s`` [n].
 
-        Worlds store gaps and speeds, not places. With such a dummy the change of one more gap is the distance that
-        Vehicle 1 travels, and no motion changes. It is farther away than Vehicle 1 can travel, ``T sqrt(2 E / m_1)``,
-        if it had all the energy E that the line can ever have: impacts and brakes only remove energy; driving adds at
-        most ``m a v`` per second, and never above the speed limit.
+        Worlds store gaps and speeds, not places. With the obstacle, the change of its gap is the distance that Vehicle
+        1 travels. An added obstacle changes no motion: it is farther away than ``T sqrt(2 E / m_1)``, the distance that
+        Vehicle 1 would travel in the duration T if it had all the energy E that the line can ever have. Impacts and
+        brakes only remove energy; driving adds at most ``m a v`` per second, and never above the speed limit.
         """
         vehicles = self.vehicles
         driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
@@ -437,7 +437,10 @@ def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
 
 
 def _padded(pieces: Floats, most: int) -> Floats:
-    """Pad ``pieces`` [n, N, 2 K] with infinity to [n, N, most]; ``most`` is even."""
+    """Return ``pieces`` [n, N, 2 K] with added empty pieces (infinite entries), [n, N, most].
+
+    ``most`` is even: each piece has a start and a command.
+    """
     n, N, width = pieces.shape
     halves = pieces.reshape(n, N, 2, width // 2)
     more = [(0, 0), (0, 0), (0, 0), (0, (most - width) // 2)]
@@ -463,10 +466,10 @@ def _span(values: Floats) -> str:
 
 
 def _combined(change: Callable[..., NDArray[Any]], *parts: Vehicles) -> Vehicles:
-    """Return vehicles whose columns are ``change`` of the columns of ``parts``.
+    """Return new vehicles, each field of which is ``change(field of the first part, field of the second, ...)``.
 
-    ``change`` takes one array per part and selects or joins rows. If no part has a channel, latency and news share one
-    memory again in the result.
+    ``change`` takes one array per part and returns one array: it selects or joins rows. If no part has a channel,
+    ``latency_s``, ``own_latency_s`` and ``known_from_s`` share one memory in the result, as in ``at_once``.
     """
     at_once = all(part._is_view for part in parts)
     columns = [

@@ -53,11 +53,11 @@ class Actor:
         return chosen
 
     def take(self, number: NDArray[np.int64], x: Float32s) -> Float32s:
-        """Return the chosen actions, [1, rows].
+        """Return the action that each row's choice leads to, [1, rows].
 
         Args:
-            number: index of the choice in each row, [rows]: first the policies in ``NetworkSpec.among``, then single
-                actions.
+            number: index of the choice in each row, [rows]. The first indices are the policies in
+                ``NetworkSpec.among``, whose action is computed; the others are fixed actions.
             x: observations, [F, rows].
 
         """

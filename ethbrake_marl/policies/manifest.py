@@ -42,12 +42,12 @@ class _Strict(FileModel):
 class FeatureDefinition(_Strict):
     """Definition of a registered feature at the time when the policy was trained."""
 
-    name: Annotated[str, Field(max_length=64)]
-    of: Of  # ``own`` or ``neighbour``
+    name: Annotated[str, Field(max_length=64)]  # name under which it was registered
+    of: Of  # ``own``: of the vehicle itself; ``neighbour``: of a neighbour
     unit: str  # unit of the value
     scale: float  # the observed number is clip(value / scale, low, high)
-    low: float
-    high: float
+    low: float  # least observed number
+    high: float  # largest observed number
     unknown: float  # value for an unknown neighbour, in ``unit``
     tried: Annotated[tuple[float, ...], Field(max_length=64)]  # its values in a few test worlds
 
@@ -57,7 +57,7 @@ class ObservationSchema(_Strict):
 
     front: Neighbours  # number of observed neighbours ahead
     rear: Neighbours  # number of observed neighbours behind
-    features: Annotated[tuple[str, ...], Field(min_length=1, max_length=4096)]
+    features: Annotated[tuple[str, ...], Field(min_length=1, max_length=4096)]  # full names, in order
     scaling_sha256: Sha256  # hash of names, units, scales and bounds of the features
     registered: Annotated[tuple[FeatureDefinition, ...], Field(max_length=4096, exclude_if=not_)] = ()
 
@@ -93,12 +93,12 @@ class Manifest(_Strict):
     policies. Any other network keeps format 2, which earlier versions can read.
     """
 
-    format: Literal["ethbrake-policy"] = "ethbrake-policy"
-    format_version: Literal[2, 3, 4, 5] = 2
+    format: Literal["ethbrake-policy"] = "ethbrake-policy"  # marks the file as a manifest
+    format_version: Literal[2, 3, 4, 5] = 2  # depends on the network, see above
     algorithm: Annotated[str, Field(pattern=NAME_PATTERN)]  # name of the training algorithm
-    network: NetworkSpec
-    observation: ObservationSchema
-    action: Literal["fraction_of_own_capacity"] = "fraction_of_own_capacity"
+    network: NetworkSpec  # sizes and kind of the networks
+    observation: ObservationSchema  # features that the policy observes
+    action: Literal["fraction_of_own_capacity"] = "fraction_of_own_capacity"  # meaning of an action
     learners: Annotated[tuple[str, ...], Field(min_length=1)]  # vehicles that the policy learned to control
     scenario: dict[str, JsonValue]  # scenario of the training, every value
     reward: dict[str, JsonValue]  # reward of the training, every setting

@@ -51,11 +51,13 @@ class NetworkSpec(FileModel):
     policy_hidden: Annotated[PerhapsHidden, Field(min_length=1)]  # width of each hidden layer of an actor
     value_hidden: PerhapsHidden  # width of each hidden layer of the critic; empty: no critic
     activation: Activation  # function between the layers
-    output: Literal["clip", "tanh", "choice"]
+    output: Literal["clip", "tanh", "choice"]  # what makes an action of the actor's outputs
+    # number of actions that output "choice" scores; None for other outputs
     choices: Annotated[int | None, Field(ge=2, le=4096, exclude_if=lambda choices: choices is None)] = None
+    # number of actors; above 1: a mixture of experts
     networks: Annotated[int, Field(ge=1, le=16, exclude_if=lambda networks: networks == 1)] = 1
-    gate_hidden: Annotated[PerhapsHidden, Field(exclude_if=not_)] = ()
-    among: Annotated[tuple[NetworkSpec, ...], Field(max_length=16, exclude_if=not_)] = ()
+    gate_hidden: Annotated[PerhapsHidden, Field(exclude_if=not_)] = ()  # hidden layers of the gating network
+    among: Annotated[tuple[NetworkSpec, ...], Field(max_length=16, exclude_if=not_)] = ()  # policies that are scored
 
     @model_validator(mode="after")
     def _a_gate_between_several(self) -> NetworkSpec:

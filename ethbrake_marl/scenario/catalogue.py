@@ -308,7 +308,7 @@ def _line(key: str, values: Mapping[str, object]) -> str:
 
 
 def _short_member(entry: dict[str, Any]) -> dict[str, Any]:
-    """Return the entry of a mixture's list, with only the name of a shipped scenario that has the same content."""
+    """Return an entry of a mixture's list with a shorter ``scenario``: only the name, if it equals a shipped one."""
     content, name = entry["scenario"], entry["scenario"]["name"]
     as_shipped = name in _shipped_paths() and member_content(load_scenario(name)) == content
     return {**entry, "scenario": name} if as_shipped else entry

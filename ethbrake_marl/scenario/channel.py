@@ -6,7 +6,7 @@ from this time on:
     tau_ij = U(0, T) + k T + L_radio + t_proc + t_act        (T the message period)
 
 ``U(0, T)`` is the wait for the next message. ``k`` is the number of periods lost to a burst (Gilbert-Elliott channel:
-``P(k >= m) = p / (p + r) (1 - r)^(m - 1)``). On the share ``lost`` of the links no message ever arrives. Sensors see
+``P(k >= m) = (p / (p + r)) (1 - r)^(m - 1)``). On the share ``lost`` of the links no message ever arrives. Sensors see
 the direct neighbours, with a delay of ``sensing_s``, called a hop. Vehicle i can react from
 
     latency_i = max(own latency_i, min(tau_i1, latency_(i-1) + hop_(i, i-1)))
@@ -89,7 +89,9 @@ class Equipped(NamedTuple):
 class Channel(NamedTuple):
     """All settings that decide what each vehicle knows, and when; symbols as at the top of this file."""
 
-    timing: Literal["latency", "fixed", "messages"]  # delay tau of a link: own latency, link_latency_s, or generated
+    # delay tau of a link: "latency": none beyond the receiver's own latency; "fixed": link_latency_s; "messages": drawn
+    # from the settings of messages and losses below
+    timing: Literal["latency", "fixed", "messages"]
     hears: Hears = "all"  # whose messages a vehicle receives: everybody's, only from vehicles ahead, nobody's
     senses: Senses = "both"  # which direct neighbours are in sight
     link_latency_s: float = 0.0  # delay tau of every link for timing "fixed" (s)
@@ -100,8 +102,10 @@ class Channel(NamedTuple):
     radio_s: float = 0.02  # L_radio, time on the air (s)
     processing_s: float = 0.1  # t_proc, time until the receiver has read the message (s)
     actuation_s: float = 0.2  # t_act, time until the brakes answer (s)
-    sensing_s: tuple[float, float] = (0.8, 1.1)  # range of a hop, the delay of seeing a neighbour (s)
-    persistence: Persistence = "first"  # known after the first message: the present, or the newest message (periodic)
+    sensing_s: tuple[float, float] = (0.8, 1.1)  # smallest and largest delay of seeing a direct neighbour, a hop (s)
+    # what a vehicle knows of a sender after its first message: "first": the sender's present state; "periodic": the
+    # state in the newest message that has arrived
+    persistence: Persistence = "first"
 
     @property
     def delay_s(self) -> float:
@@ -152,7 +156,7 @@ Preset = Annotated[str, AfterValidator(_known_preset), _PresetSchema]
 
 
 class V2X(FileModel):
-    """A preset and the settings that differ from it; see ``docs/v2x.md``.
+    """The V2X channel of a scenario: a preset and the settings that differ from it; see ``docs/v2x.md``.
 
     In YAML it is written as the preset's name alone, or as a mapping.
     """
@@ -382,7 +386,7 @@ class V2X(FileModel):
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
     """Return the number k of message periods that a burst of losses lasts, in the shape of ``u``.
 
-    ``k >= m`` exactly if ``u < p / (p + r) (1 - r)^(m - 1)``: the inverse distribution function of the stationary
+    ``k >= m`` exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``: the inverse distribution function of the stationary
     Gilbert-Elliott channel. It uses multiplication only, so every machine gets the same k.
 
     Args:

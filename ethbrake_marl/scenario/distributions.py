@@ -32,7 +32,11 @@ Numbers = Annotated[tuple[Number, ...], Field(strict=False, min_length=1)]
 
 
 class _Distribution(FileModel):
-    """Base class of the distributions and of other ways to draw a quantity from a uniform number."""
+    """Base class of the distributions, such as ``Uniform``, that a scenario file may name for a quantity.
+
+    A subclass declares its parameters as fields, and defines two members: the property ``support``, which is the
+    smallest and largest possible value; and ``value(u)``, which turns uniform numbers ``u`` in [0, 1) into values.
+    """
 
 
 class Uniform(_Distribution):
@@ -88,14 +92,14 @@ class NormalShape(_Distribution):
 
     mean: Number  # before truncation
     sd: Number  # standard deviation before truncation
-    low: Number
-    high: Number
+    low: Number  # smallest possible value
+    high: Number  # largest possible value
 
 
 class Normal(_Distribution):
     """``{normal: {mean, sd, low, high}}``: a normal distribution truncated to [low, high]."""
 
-    normal: NormalShape
+    normal: NormalShape  # its parameters
 
     @model_validator(mode="after")
     def _possible(self) -> Normal:
@@ -134,14 +138,14 @@ class LogNormalShape(_Distribution):
 
     median: Number  # before truncation
     sigma: Number  # standard deviation of the logarithm, before truncation
-    low: Number
-    high: Number
+    low: Number  # smallest possible value
+    high: Number  # largest possible value
 
 
 class LogNormal(_Distribution):
     """``{lognormal: {median, sigma, low, high}}``: the logarithm is normal; truncated to [low, high]."""
 
-    lognormal: LogNormalShape
+    lognormal: LogNormalShape  # its parameters
     _of_logarithm: Normal = PrivateAttr()  # distribution of the logarithm
 
     @model_validator(mode="after")
@@ -163,7 +167,10 @@ class LogNormal(_Distribution):
         return self.lognormal.low, self.lognormal.high
 
     def value(self, u: Floats) -> Floats:
-        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape: ``exp`` of a normal number."""
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+
+        A value is ``exp(x)``; x has the truncated normal distribution of the logarithm.
+        """
         drawn = exp_each(self._of_logarithm.value(u).ravel()).reshape(u.shape)
         return np.clip(drawn, *self.support)
 

@@ -42,16 +42,16 @@ class QuantityRule:
 
     name: str  # key in a scenario, field of Worlds or Vehicles
     unit: str  # key of UNITS, or "" for a plain number
-    per: Literal["vehicle", "pair", "world"]  # what has a value of its own
+    per: Literal["vehicle", "pair", "world"]  # what has one value each
     high: float  # largest allowed value
     positive: bool  # whether 0 is refused
-    slot: int  # column inside a vehicle's block of uniform numbers
+    slot: int  # column of its uniform number inside the block of BLOCK numbers that each vehicle has
     column: str  # column name in a table of initial states, such as ``gap_{}_m``; "": no column
     meaning: str  # what it is, in words
     example: str  # an example of its value in a scenario file
     low: float = 0.0  # smallest allowed value
-    block: int = 0  # vehicle (from 0) whose block of uniform numbers holds entry 0
-    stream: tuple[int, ...] = ()  # separate stream of uniform numbers with column ``slot``; (): main stream
+    block: int = 0  # vehicle (from 0) in whose block the number of entry 0 is; entry i is in block ``block + i``
+    stream: tuple[int, ...] = ()  # stream of uniform numbers that contains the blocks; (): the main stream
 
     @property
     def symbol(self) -> str:
@@ -80,7 +80,7 @@ class QuantityRule:
         return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
 
     def place(self, index: int) -> Place:
-        """Return which of a world's uniform numbers draws entry ``index`` (from 0): a stream and a column in it."""
+        """Return the place of the uniform number that draws entry ``index`` (from 0): (stream, column in it)."""
         return self.stream, BLOCK * (self.block + index) + self.slot
 
     def column_of(self, index: int) -> str:
@@ -113,12 +113,13 @@ class QuantityRule:
 
 
 class Quantities(NamedTuple):
-    """All quantities by their keys."""
+    """All quantities that a scenario can declare: key, such as ``gaps_m`` -> rule, in several groups."""
 
     usual: dict[str, QuantityRule]  # quantities that every world has
     otherwise: dict[str, QuantityRule]  # other ways to declare speeds, gaps and an obstacle
     optional: dict[str, QuantityRule]  # quantities that a world may lack; drawn from streams of their own
-    # Pairs of which a scenario declares exactly one, or at most one if the quantity is optional.
+    # usual or optional key -> the key in ``otherwise`` that may replace it: {"gaps_m": "time_gaps_s", ...}; a scenario
+    # never declares both
     alternatives: dict[str, str]
     of_a_type: tuple[str, ...]  # keys that a vehicle type may declare
     needed: tuple[str, ...]  # keys without a default, which every vehicle needs

@@ -257,9 +257,10 @@ def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample
 
 
 def _redraw_one(scenario: ScenarioFields, seed: int, channel: Channel, index: Ints) -> None:
-    """Draw the one world numbered ``index`` [1] up to the last attempt; raise ``InvalidInput`` if all are rejected.
+    """Raise ``InvalidInput`` if all remaining attempts to draw world number ``index`` [1] are rejected.
 
-    So a list whose draws are all rejected fails early. Other arguments are the same as in ``sample``.
+    Testing one world first makes a list whose draws are all rejected fail early. Other arguments are the same as in
+    ``sample``.
     """
     for attempt in range(_PATIENCE, MOST_ATTEMPTS):
         if not early_impact(scenario, _draw(scenario, seed, channel, attempt, index).worlds)[0]:

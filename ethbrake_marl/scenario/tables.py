@@ -174,7 +174,10 @@ def _numbers(what: str, value: ArrayLike) -> Floats:
 
 
 def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
-    """Return header, rows (at least one) and first line of each row of a CSV file, with values unchecked."""
+    """Return the header of a CSV file, its rows (at least one), and the line number at which each row begins.
+
+    Values are texts and are not checked.
+    """
     rows: list[list[str]] = []
     lines: list[int] = []
     data = read_plain(file, SIZE_LIMIT)

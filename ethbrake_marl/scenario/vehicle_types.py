@@ -161,7 +161,10 @@ PerVehicle = Annotated[
 
 
 class _ObjectiveSchema:
-    """Adds to a text field the JSON schema of an objective, with all objectives that are registered at that time."""
+    """Annotation of a text field that holds an objective: its JSON schema lists all objectives.
+
+    Objectives that are registered before the schema is made are included.
+    """
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
@@ -175,7 +178,10 @@ ObjectiveName = Annotated[str, _ObjectiveSchema]
 
 
 class _MemberSchema:
-    """Adds the JSON schema of a mixture's member: in a file also a scenario's name or the path of its file."""
+    """Annotation of the field with one scenario of a mixture: its JSON schema allows a mapping or a text.
+
+    In a file the text is the name of a scenario or the path of its file.
+    """
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:

@@ -208,14 +208,15 @@ def will_stay_apart(table: Floats) -> bool:
     """Return whether no pair can have another impact, however long all commands last; False if that is not certain.
 
     ``table`` is the table of one world (``physics.rows``). Commands must be in full effect, and no vehicle may drive or
-    move backward. Then every vehicle keeps its acceleration (its body's, if several rest against each other) until it
-    stands. A pair of front ``f`` and rear ``r`` with gap g, closing speed w and decelerations d has no impact if
+    move backward. Then every vehicle keeps its acceleration until it stands; vehicles that rest against each other have
+    a common one. A pair of a front vehicle f and a rear vehicle r has gap g, closing speed w, speeds v and
+    decelerations d. It has no impact if one of these is true, the last one with margins for rounding:
 
-    * r stands, or both are one body;
-    * ``w <= 0`` and ``d_r >= d_f``: w stays so until r stands, also with the kernel's rounding;
-    * r would stop behind f, ``g + v_f^2 / 2 d_f > v_r^2 / 2 d_r``, the pair is apart (or separating), and, if r brakes
-      harder while it closes, the smallest gap is positive too: ``w^2 < 2 (d_r - d_f) g``. (If r brakes less hard, the
-      gap is concave until f stands, and decreases from then on.) All of this with margins.
+    * r stands, or both move as one body;
+    * ``w <= 0`` and ``d_r >= d_f``: then w stays at most 0 until r stands;
+    * r would stop behind f, ``g + v_f^2 / (2 d_f) > v_r^2 / (2 d_r)``; the pair does not touch, or separates; and if r
+      closes and brakes harder, the smallest gap is positive too: ``w^2 < 2 (d_r - d_f) g``. (If r brakes less hard, the
+      gap is least at one of its ends: it is concave until f stands, and decreases from then on.)
     """
     vehicles, hardest = table.shape[1], 0.0
     if pieces_to_come(table):

@@ -56,11 +56,11 @@ def optimise_coupled(
 ) -> CoupledOptimum:
     """Return the constant deceleration of ``vehicle`` with the least simulated harm until ``horizon_s``.
 
-    If the middle of the pairwise collision-free interval is harmless, it is taken. Otherwise an even grid and the
-    pairwise breakpoints are simulated. Where the number of impacts changes, one smooth piece of the harm ends; these
-    borders are located to 1e-9 m/s2. So are the best local minima, on the safe side if the harm jumps. Ties are decided
-    by the other count, then by the middle one of the equal decelerations. The result of a world does not depend on its
-    batch.
+    If the closed form (``optimise_pairwise``) finds decelerations that avoid both neighbours, and the middle one is
+    harmless in the simulation, it is taken. Otherwise an even grid of decelerations, and those at which the closed
+    form's harm has a kink, are simulated. The harm may jump where the number of impacts changes; these places and the
+    best local minima are located to 1e-9 m/s2. At a jump the result lies on the side of less harm. Among equals the
+    other harm decides, then the middle one is taken. The result of a world does not depend on its batch.
 
     Args:
         worlds: n worlds of N vehicles.
@@ -103,7 +103,7 @@ def _minimise(
 
     Args:
         worlds: n worlds.
-        told: the same worlds with the braking capacities that the closed form assumes.
+        told: the same worlds for the closed form, with the capacities of other vehicles set to their braking commands.
         command: commands of all vehicles, [n, N] m/s2; the controlled vehicle's is ignored.
         vehicle: index of the controlled vehicle, from 0.
         rows: [m] indices of the worlds to search.
@@ -205,7 +205,7 @@ class EV2XBM:
             return {"deceleration_mps2": closed.deceleration_mps2, "predicted_harm": closed.harm}
 
         def is_fixed(script: Script) -> bool:
-            """Return whether the script's command is fixed before that of ``vehicle``, scripted or free, is chosen."""
+            """Return whether the script's command is fixed at the alert without knowing the choice of ``vehicle``."""
             chooses_first = isinstance(script, EV2XBM) and (script._mode == "pairwise" or vehicle not in scripts)
             return is_state_free(script) or chooses_first
 

@@ -41,15 +41,17 @@ class PairwiseOptimum(NamedTuple):
 
 @compiled
 def early_breakpoints(gap: float, w: float, onset_l: float, onset_f: float) -> tuple[float, float]:
-    """Return kink and jump of the front pair's harm, as decelerations of the follower. [m/s2]
+    """Return two decelerations of the follower at which the harm of the pair has a kink, and a jump. [m/s2]
 
-    Both are 0 unless the follower may brake before the leader. Kink: contact exactly at the leader's onset, ``2 (w lead
-    - gap) / lead^2``. Jump: below ``w^2 / (2 gap)`` the follower strikes the coasting leader lightly; above, it grazes
-    past and may strike harder once the leader brakes. The open end of the jump is represented by the lightest contact
-    that still is an impact.
+    Both are 0 unless the follower may brake before the leader (front vehicle) does. ``lead`` is the time in between.
+
+    - Kink: contact exactly when the leader begins to brake, at ``2 (w lead - gap) / lead^2``.
+    - Jump: below ``w^2 / (2 gap)`` the follower strikes the coasting leader lightly. Above, it does not reach it, and
+      may strike harder once the leader brakes. The result is the deceleration just below, with the lightest contact
+      that counts as an impact.
 
     Args:
-        gap: m.
+        gap: gap at the present time, m.
         w: closing speed, follower minus leader, m/s.
         onset_l: time at which the leader begins to brake, s.
         onset_f: time at which the follower may begin to brake, s.
@@ -192,7 +194,7 @@ def optimise_pairwise(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
 
 
 def closed_form(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
-    """Return the optimum of ``vehicle`` as ``optimise_pairwise`` does, as if brakes never needed time to build up."""
+    """Version of ``optimise_pairwise`` that also accepts brakes that build up, and treats them as acting at once."""
     onset, capacity = onset_s(worlds, vehicle), worlds.vehicles.braking_capacity_mps2
     at, out = np.empty((worlds.n, CANDIDATES)), np.empty((4, worlds.n))
     optimise_worlds(worlds.gaps_m, worlds.speeds_mps, capacity, onset, vehicle, at, out)

@@ -76,8 +76,8 @@ def put_in_order(samples: Samples, n: int) -> None:
 def bound_cells(samples: Samples, n: int, bounds: Floats) -> None:
     """Write an estimate of the least harm between each two neighbouring samples to ``bounds`` [n - 1], m2/s2.
 
-    The first ``n`` samples are used; they must be sorted by deceleration. A slope of the harm that falls towards an
-    interval is extended into it, ``STEEPER`` times as steep.
+    The first ``n`` samples are used; they must be sorted by deceleration. If the harm falls towards an interval, from
+    the sample before it or from the sample after it, it is assumed to go on falling inside, ``STEEPER`` times as steep.
     """
     before, slope = 0.0, _slope(samples, 0)
     for k in range(n - 1):
@@ -141,8 +141,8 @@ def find_minima(samples: Samples, n: int, depth: Floats, places: Ints) -> None:
 def choose(samples: Samples, n: int, room: Floats) -> float:
     """Return the deceleration of least harm among the first ``n`` samples, m/s2.
 
-    Among equals, the least ``other`` harm decides, then the middle one of the rest is taken. ``room`` [n or more] is
-    overwritten. Sorted samples make it faster.
+    Among equals, the least ``other`` harm decides, then the middle one of the rest is taken. ``room`` [n or more] is a
+    workspace, overwritten. Sorted samples make it faster.
     """
     least, rest = least_harm(samples, n) + TIE, math.inf
     for k in range(n):

@@ -60,7 +60,11 @@ _FIFTHS = np.arange(1, 5) / 5  # new samples between the two sides of a border
 
 
 class Room(NamedTuple):
-    """Workspace of a search, reused for every world of a batch."""
+    """Workspace of a search, reused for every world of a batch.
+
+    A *cell* is the interval between two neighbouring decelerations of the grid. A *border* is a deceleration at which
+    the number of impacts changes.
+    """
 
     one: Samples  # the grid; later all samples so far
     two: Samples  # all samples so far; at the end with borders and minima
@@ -131,10 +135,11 @@ def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) ->
 
 @compiled(apart=True, bare=True)
 def look_inside(line: Line, room: Room) -> int:
-    """Step 2: refine the cells of the grid that contain a border, or may contain less harm than every sample so far.
+    """Step 2: simulate more decelerations in the intervals of the grid that may contain the least harm.
 
-    A border is a deceleration at which the number of impacts changes. Leaves ``_LOOKED`` samples in ``room.one``; if
-    there are fewer, the last one is repeated. Returns a status: ``FLAG.DONE``, or the failed check.
+    These are intervals in which the number of impacts changes, or whose estimated harm is below every sample so far.
+    Leaves ``_LOOKED`` samples in ``room.one``; if there are fewer, the last one is repeated. Returns a status:
+    ``FLAG.DONE``, or the code of the check of the physics that failed.
     """
     grid, looked, new, cells, bounds = room.one, room.two, room.new, room.cells, room.values
     best = least_harm(looked, GRID + CANDIDATES)
@@ -173,11 +178,11 @@ def _put_in_order(places: Ints, n: int) -> None:
 
 @compiled(apart=True, bare=True)
 def locate_borders(line: Line, room: Room) -> int:
-    """Step 3: locate borders that may hide less harm, to two samples 1e-9 m/s2 apart, one on each side.
+    """Step 3: locate the decelerations at which the number of impacts changes, if less harm may be found there.
 
-    A border is a deceleration at which the number of impacts changes. Between borders the harm is smooth, so harm that
-    falls towards a border is least there. Leaves all samples in ``room.two``. Returns a status: ``FLAG.DONE``, or the
-    failed check.
+    Between two such borders the harm is smooth, so harm that falls towards a border is least there. Each located border
+    ends up between two samples 1e-9 m/s2 apart. Leaves all samples in ``room.two``. Returns a status: ``FLAG.DONE``, or
+    the code of the check of the physics that failed.
     """
     looked, new, few, places, bounds = room.one, room.new, room.few, room.borders, room.values
     best = least_harm(looked, _LOOKED)
@@ -285,7 +290,8 @@ def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, t
 def step_back(line: Line, around: Samples, best: float, capacity: float, out: Floats) -> int:
     """Step 5: if ``best`` (m/s2) lies within 1e-9 m/s2 of a jump of the harm, move it to the lower side.
 
-    Otherwise the last bits, which differ if the same motion is advanced step by step, would decide the harm.
+    An engine advances the same motion step by step, which changes its last bits. Directly at a jump these bits would
+    decide on which side the harm is.
 
     Args:
         line: the world.
