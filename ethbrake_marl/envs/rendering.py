@@ -64,7 +64,8 @@ class Scene(NamedTuple):
     title: str  # name of the scenario
     time_s: float  # time since the alert (s)
     view: View  # the stretch of road that is shown
-    # [N] drawn positions of the front bumpers (m from Vehicle 1's at the alert): bodies of length BODY_M, true gaps
+    # [N] positions at which the front bumpers are drawn (m from Vehicle 1's at the alert). Vehicles have no length in
+    # the physics, but are drawn BODY_M long; the drawn gaps are the true ones.
     front_m: Floats
     gaps_m: Floats  # [P] gap of each pair of neighbours (m)
     speeds_mps: Floats  # [N] speed of each vehicle (m/s)

@@ -35,7 +35,7 @@ class Measure:
     """
 
     name: str  # key in JSON results, unique among all measures
-    of: Callable[[Outcome, Any], Values | None] | str
+    of: Callable[[Outcome, Any], Values | None] | str  # how the values are computed, see above
     heading: str = ""  # heading of its column in tables; "": no column
     short: str = ""  # short heading for terminals, possibly with line breaks
     about: str = ""  # explanation for users; may be empty if a measure whose heading begins alike has one
@@ -80,14 +80,16 @@ class GroupColumn:
 class MeasureSet:
     """Base class of a set of measures that are computed from the same knowledge of the worlds.
 
-    ``prepare`` computes this knowledge, the *context*, once per evaluation. A subclass lists its measures in
-    ``measures``, and overrides the methods that it needs.
+    A subclass must list its measures in ``measures``. It may override ``prepare``, which computes the common knowledge
+    (the *context*) once per evaluation; ``row``, which adds fields to JSON results; and ``warnings`` and ``notes``,
+    which add texts to a results table. By default there is no context, and nothing is added.
     """
 
-    measures: tuple[Measure, ...] = ()
+    measures: tuple[Measure, ...] = ()  # measures with a column or a JSON key, in the order of JSON
     counted: tuple[Measure, ...] = ()  # true/false measures without a column, whose true worlds ``row`` can read
     baseline: str | None = None  # agent to compare with; None: the baseline of ``summarise``
-    # Name of a counted measure. If it is false in some world, means are marked "≥" and comparisons are omitted.
+    # Name of a measure in ``counted`` that says whether a world's values are complete. If it is false in some world,
+    # means are marked "≥" and comparisons are omitted. None: all values are complete.
     whole: str | None = None
     narrow: tuple[str, ...] = ()  # names of measures that a narrow terminal also shows, if they have values
     notebook: tuple[str, ...] = ()  # names of measures that a notebook shows

@@ -64,7 +64,9 @@ class Moments:
     count: int = 0  # number of values
     total: Fraction = Fraction()  # sum of the values
     squares: Fraction = Fraction()  # sum of their squares
-    negative: int = field(default=0, compare=False)  # number of negative values; for differences, of all values
+    # Number of negative values. If it is 0, intervals do not reach below 0. For differences (``minus``), whose signs
+    # are not known, it is the number of all values.
+    negative: int = field(default=0, compare=False)
 
     @classmethod
     def of(cls, values: Floats) -> Moments:
@@ -108,8 +110,9 @@ class Moments:
     def ratio_error(self, others: Moments, products: Fraction) -> float:
         """Return the standard error of ``r = mean(values) / mean(others)``, paired by world, by the delta method.
 
-        The residuals ``values - r others`` have mean 0: ``s(residuals) / (sqrt(n) |mean(others)|)``. With sums S and
-        sums of products Q, ``n (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / (n - 1) / Sy^4`` is its square.
+        The residuals ``values - r * others`` have mean 0, so the error is
+        ``std(residuals) / (sqrt(n) * abs(mean(others)))``. With x the values, y the others, sums S and sums of products
+        Q, its square is ``n * (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / ((n - 1) * Sy^4)``.
 
         Args:
             others: moments of the denominator, in the same worlds.

@@ -39,7 +39,8 @@ class Tally:
 
         Args:
             part: outcomes of the agents.
-            objectives: also sum the harm that each vehicle bears, and its value under these objectives; None: neither.
+            objectives: objectives such as ``"social:45"``, which weigh a vehicle's own harm against the others'. Also
+                sum the harm that each vehicle bears, and its value under each objective; None: neither.
             long_list: omit sets of measures that do not apply to lists of more than 100,000 worlds.
 
         """

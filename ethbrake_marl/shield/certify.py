@@ -55,8 +55,8 @@ def best_constant(world: Members, states: Floats, ended: Bools, step: int, const
     Each action is held from now to the horizon, simulated in one segment.
 
     Args:
-        world: the M possible worlds of one world; the worst case is over them.
-        states: [M, S] their states now.
+        world: the M possible worlds of one world (``Members``); the worst case is over them.
+        states: [M, S] their states now, in the layout of ``Running.states``.
         ended: [M] whether their episodes have ended.
         step: number of the present decision.
         constants: [C, K] actions of the K shielded vehicles.
@@ -87,8 +87,8 @@ def better_plan(
     A plan holds one action for each decision. The replacement requires a harm below ``value`` and at most ``most``.
 
     Args:
-        world: the M possible worlds of one world.
-        states: [M, S] their states now.
+        world: the M possible worlds of one world (``Members``).
+        states: [M, S] their states now, in the layout of ``Running.states``.
         ended: [M] whether their episodes have ended.
         step: number of the present decision, from which on the plan is replaced.
         constants: [C, K] constant actions.
@@ -143,8 +143,8 @@ def try_action(
     action for which the physics fails is not certified.
 
     Args:
-        world: the M possible worlds of one world.
-        states: [M, S] their states now.
+        world: the M possible worlds of one world (``Members``).
+        states: [M, S] their states now, in the layout of ``Running.states``.
         ended: [M] whether their episodes have ended.
         step: number of the present decision.
         action: [K] action to try.
@@ -203,8 +203,8 @@ def decide_world(
     rear, each beside the actions that the plan holds by then.
 
     Args:
-        world: the M possible worlds of this world.
-        states: [M, S] their states now.
+        world: the M possible worlds of this world (``Members``).
+        states: [M, S] their states now, in the layout of ``Running.states``.
         ended: [M] whether their episodes have ended.
         step: number of the present decision.
         proposed: [K] proposed actions; NaN: none.

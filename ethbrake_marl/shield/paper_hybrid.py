@@ -102,10 +102,11 @@ ROUNDING = 1e-6  # rounding error of an action in 32 bits
 
 
 class EpisodeGuard(ShieldGuard):
-    """Guard of mode ``episode``: at each alert the agent ``hybrid`` chooses the driver, whatever is proposed.
+    """Guard of mode ``episode``: at each alert the agent ``hybrid`` chooses who drives the whole episode.
 
-    A proposal counts as replaced where it differs from the applied action by more than the rounding of 32 bits.
-    ``where`` names the interface in error messages.
+    The choice is the policy inside ``hybrid`` or E-V2X-BM; proposed actions do not change it. A proposal counts as
+    replaced where it differs from the applied action by more than the rounding of 32 bits. ``engine`` is the engine
+    that the guard will protect; ``where`` names the interface in error messages.
     """
 
     def __init__(self, engine: Engine, hybrid: HybridAgent, *, where: str = "shield") -> None:

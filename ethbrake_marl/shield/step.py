@@ -99,7 +99,7 @@ class StepShield:
 
     """
 
-    possible_are = "possible worlds"  # name of a world's members in error messages
+    possible_are = "possible worlds"  # what error messages call the possible worlds; a subclass may set another name
 
     def __init__(
         self,
@@ -290,9 +290,10 @@ class StepShield:
     def _bound_at_alert(
         self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
     ) -> tuple[Floats, Any]:
-        """Return the bound of the first plans, [n] m2/s2, and further memory of the shield (its enclosure).
+        """Return the bound of the first plans, [n] m2/s2, and the shield's further memory (``StepMemory.enclosure``).
 
-        Here the bound is ``harm``, and there is no enclosure. A subclass may compute another bound.
+        Here the bound is ``harm``, and the further memory is None. A subclass may compute another bound, and use the
+        memory.
 
         Args:
             possible: the possible worlds at the alert, M for each world.
@@ -315,13 +316,15 @@ class StepShield:
         """Decide on the proposed actions in every running episode.
 
         Args:
-            proposed: [n], or [n, K] for several vehicles: proposed actions; clipped to [-1, 1]. NaN: none, the plan's
-                is taken.
+            proposed: [n], or [n, K] for several vehicles: proposed actions; clipped to [-1, 1]. Where it is NaN,
+                nothing is proposed, and the plan's action is applied.
             seen: [n, columns] the observed worlds, as the first columns of ``Running.states``; None: they are not
                 compared with the prediction.
             only: [n] worlds in which to decide; the others stay unchanged. None: all whose episode has not ended.
-            proposer: the policies; they are simulated from here on where nothing else certifies a proposal. None: they
-                are not.
+            proposer: the policies. Where nothing else certifies a proposal, they are simulated from this decision on,
+                and their actions are tried as a plan. None: this is not tried.
+
+        Returns the decision, with the actions to apply. Afterwards ``memory`` holds the predicted next state.
 
         """
         memory = self.memory
