@@ -48,7 +48,7 @@ class Lineup:
     """The agents of an evaluation as plain data, from which every worker process builds the same agents.
 
     Args:
-        agents: specs, as on the command line.
+        agents: specs (texts that name agents, such as ``full_brake``), as on the command line.
         scenario: the scenario whose learners they drive.
         harm_count: harm that agents minimise: each pair's first impact only (``first``) or all impacts (``total``).
         uncertainty: uncertainty for shields that need one, as text: ``gaps_m=0.5``.

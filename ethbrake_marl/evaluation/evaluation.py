@@ -99,7 +99,7 @@ class Evaluation:
         Args:
             parts: evaluations of the same agents, in the order of their worlds in the list.
 
-        Raises ``PhysicsError`` if no part has any world, because all of them were left out.
+        Raises ``PhysicsError`` if every world was left out.
 
         """
         left_out = tuple(left for part in parts for left in part.left_out)

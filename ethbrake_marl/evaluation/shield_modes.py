@@ -223,7 +223,13 @@ def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[Mode, _Part]:
 def _row(agent: str, mode: Mode, parts: list[_Part], harm: Mapping[Mode, Floats], task: Task) -> ModeRow:
     """Return the row of an agent in one mode.
 
-    ``parts`` are the results of the chunks in this mode; ``harm`` maps every mode to the harms of all worlds [n].
+    Args:
+        agent: name of the agent.
+        mode: the shield's mode.
+        parts: results of the chunks of worlds in this mode.
+        harm: mode -> harm of the agent in every world [n], to compare this mode with the others.
+        task: the scenario, the controlled vehicles, and the harm that the shield bounds.
+
     """
 
     def minus(other: Mode) -> Estimate | None:

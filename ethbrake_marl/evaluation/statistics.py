@@ -70,7 +70,10 @@ class Moments:
 
     @classmethod
     def of(cls, values: Floats) -> Moments:
-        """Return the moments of ``values`` [n]; raise ``InvalidInput`` unless all are finite."""
+        """Return the moments (number, sum and sum of squares) of ``values`` [n].
+
+        Raises ``InvalidInput`` unless all values are finite.
+        """
         return cls(len(values), exact_sum(values), exact_sum(values, values), int(np.count_nonzero(values < 0.0)))
 
     def __add__(self, other: Moments) -> Moments:
@@ -218,9 +221,16 @@ def paired_difference(values: Floats, baseline: Floats) -> Estimate:
 def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> Estimate:
     """Return ``value - baseline`` of two means over n and m independent worlds, with Welch's interval.
 
-    The standard errors ``s_1``, ``s_2`` follow from the half-widths ``h = t_(n-1) s`` of the t intervals. Welch:
-    ``s^2 = s_1^2 + s_2^2``, with ``s^4 / (s_1^4 / (n - 1) + s_2^4 / (m - 1))`` degrees of freedom. There is no interval
-    if one of the two means has none.
+    The half-width of each mean's t interval, divided by its t quantile, is its standard error (``s1``, ``s2``). The
+    difference has the standard error ``s = sqrt(s1^2 + s2^2)``, with ``s^4 / (s1^4 / (n - 1) + s2^4 / (m - 1))``
+    degrees of freedom. There is no interval if one of the two means has none.
+
+    Args:
+        value: first mean with its interval.
+        n: number of its worlds.
+        baseline: second mean with its interval.
+        m: number of its worlds.
+
     """
     difference = value.value - baseline.value
     if value.interval is None or baseline.interval is None:

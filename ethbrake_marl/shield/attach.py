@@ -147,7 +147,7 @@ class Attached:
         return self.memory.shield
 
     def _reached(self) -> Any:
-        """Return the engine of the wrapped environment, looked up anew at each call."""
+        """Return the engine of the wrapped environment, looked up anew at each call; None if there is none."""
         return getattr(getattr(self._env, "unwrapped", self._env), "engine", None)
 
     def check_open(self) -> None:

@@ -172,10 +172,10 @@ class ShieldGuard(ABC):
         return last
 
     def _of_vehicles(self, infos: Mapping[str, Any], running: Engine) -> dict[str, NDArray[Any]]:
-        """Return the ``infos`` with every value expanded to all vehicles of the engine, [n, N].
+        """Return the ``infos`` (name -> value) with every value expanded to all vehicles, [n, N].
 
-        A vehicle without a shield gets reason ``NO_DECISION``, and 0 in all other entries that have a column per
-        learner.
+        ``running`` is the engine. A vehicle without a shield gets reason ``NO_DECISION``, and 0 in all other entries
+        that have a column per learner.
         """
         shape, spread = running.wanted_mps2.shape, dict[str, NDArray[Any]]()
         for name, value in infos.items():
@@ -220,7 +220,10 @@ class ShieldGuard(ABC):
         return proposed, memories
 
     def _proposer(self, memories: dict[int, Memory], worlds: Worlds | None) -> Proposer | None:
-        """Return the policies with their memories and the current worlds, for rollouts; None without policies."""
+        """Return the policies with their ``memories`` and the current ``worlds``, for rollouts.
+
+        None if there are no policies, or if ``worlds`` is None.
+        """
         return Proposer(self._policies, memories, worlds) if self._policies and worlds is not None else None
 
 

@@ -76,7 +76,11 @@ class HybridAgent(AgentAround):
         }  # fmt: skip
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the command of the driver chosen at the alert, [n] m/s2, and the new memory."""
+        """Return the command of the driver that ``begin`` chose at the alert, [n] m/s2, and the new memory.
+
+        ``worlds`` are the worlds now; ``memory`` is what ``begin`` or the last call returned; ``vehicle`` is the index
+        of the controlled vehicle.
+        """
         command, policy = ask_script(self.policy, worlds, memory["policy"], vehicle)
         constant, _ = self.backup.act(worlds, memory["backup"], vehicle)
         return np.where(memory["chosen_policy"], command, constant), {**memory, "policy": policy}

@@ -84,7 +84,7 @@ Number = TypeVar("Number", bound=np.generic)
 
 
 def put(old: NDArray[Number], rows: Ints, new: NDArray[Number]) -> NDArray[Number]:
-    """Return a copy of ``old`` in which the rows with the indices ``rows`` are replaced by those of ``new``."""
+    """Return a copy of ``old`` in which row ``rows[j]`` is replaced by row j of ``new``."""
     placed = old.copy()
     placed[rows] = new
     return placed

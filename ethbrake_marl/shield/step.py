@@ -421,7 +421,10 @@ class StepShield:
         return np.asarray(within | (self._leaves_range(running) & np.isfinite(seen).all(axis=1)), np.bool_)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Return whether a world may leave the range of its possible worlds, [n]: after an impact in one of them."""
+        """Return whether an impact has happened in one of a world's possible worlds, [n].
+
+        From then on the world itself may lie outside their range. ``running`` are the predicted episodes.
+        """
         N = running.problem.mass.shape[1]
         predicted = running.states.reshape(running.n, running.members, -1)
         return np.asarray((predicted[:, :, 2 * N - 1 : 3 * N - 2] == 1.0).any(axis=(1, 2)), np.bool_)

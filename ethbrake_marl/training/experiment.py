@@ -210,7 +210,7 @@ def write_results(
 def results_csv(rows: Sequence[SummaryRow]) -> str:
     """Return a results table as CSV text, with one line per agent.
 
-    The interval of column ``x`` is in ``x_low`` and ``x_high``; missing values are empty.
+    ``rows`` is the table. The interval of column ``x`` is in ``x_low`` and ``x_high``; missing values are empty.
     """
     lines = []
     for told in (row.to_json() for row in rows):
