@@ -60,7 +60,8 @@ class Evaluation:
     seed: int | None  # seed from which the worlds were drawn; None for worlds that the caller passed
     outcomes: dict[str, Outcome]  # results of each agent in these worlds, by the agent's name
     left_out: tuple[LeftOut, ...] = ()  # worlds that failed with some agent; they are in none of the arrays
-    # Group of each world, [n], by kind of group: ``scenario`` (of a mixture), ``vehicle_2_type``.
+    # Groups of the worlds: ``{"scenario": [n names], "vehicle_2_type": [n names]}``. Only a mixture has ``scenario``,
+    # and only a scenario with vehicle types has the types; else it is empty.
     kinds: Mapping[str, NDArray[np.str_]] = field(default_factory=dict)
     host: str = ""  # name of the simulator that moved the worlds; "": the physics of this package
     _computed: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # cache of ``once``

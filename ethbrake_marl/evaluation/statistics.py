@@ -89,7 +89,7 @@ class Moments:
 
     @property
     def mean(self) -> float:
-        """Mean of the values, rounded once; raises ``ZeroDivisionError`` without values."""
+        """Mean of the values: exact, then rounded to a float; raises ``ZeroDivisionError`` without values."""
         return float(self.total / self.count)
 
     @property

@@ -181,10 +181,17 @@ def try_action(
 
 @compiled
 def tell_action(out: Floats, action: Floats, bound: float, margin: float) -> None:
-    """Write applied action, bound and margin of each shielded vehicle into ``out`` [K, 4]; ``action`` is [K].
+    """Write the applied action, bound and margin of each shielded vehicle into its row of ``out`` [K, 4].
 
-    The bound is the harm that is guaranteed from now on, the margin the budget minus the harm found, both m2/s2. A
+    ``out`` has the columns ``APPLIED``, ``REASON``, ``BOUND`` and ``MARGIN``; its reasons are filled in before. A
     vehicle whose proposal was rejected keeps the margin that is in ``out`` already.
+
+    Args:
+        out: changed in place.
+        action: [K] applied actions.
+        bound: harm that is guaranteed from now on, m2/s2.
+        margin: budget minus the harm found, m2/s2.
+
     """
     for c in range(action.shape[0]):
         out[c, APPLIED], out[c, BOUND] = action[c], bound
