@@ -27,12 +27,11 @@ def describe_worlds(engine: Engine) -> Columns:
     """Return the random draw of each running world, as columns: ``{"gap_1_m": [n], "mass_2_t": [n], ...}``.
 
     There is a column for each quantity of the world at the alert (the moment at which the episode begins), named as in
-    a table of initial states. A mixture adds ``scenario``, vehicle types add ``vehicle_2_type``. ``world_seed`` and
-    ``world`` are as in the infos. If the caller passed some of the worlds and others were drawn, only the drawn ones
-    have types.
+    a table of initial states. A mixture adds ``scenario``, vehicle types add ``vehicle_2_type`` for worlds that were
+    drawn. ``world_seed`` and ``world`` are as in the infos.
 
-    Raises ``InvalidInput`` for worlds whose draw is unknown. These are passed worlds after a snapshot was restored, and
-    a world that could not be advanced to its first decision, so that another world replaced it.
+    Raises ``InvalidInput`` for worlds whose draw is unknown. These are worlds that the caller passed, after a snapshot
+    was restored, and a world that could not be advanced to its first decision, so that another world replaced it.
     """
     numbers, given = engine.roster.numbers, engine.roster.given
     named = {"world_seed": np.full(engine.n, engine.roster.seed), "world": numbers.copy()}
