@@ -344,7 +344,8 @@ def _x(scene: Scene, place_m: float) -> float:
 def _spaces(scene: Scene) -> list[tuple[float, float, float, bool]]:
     """Return the free stretches of road, from the front backwards: to an obstacle, and between the vehicles.
 
-    Each is a tuple: left and right end (pixels), length (m), and whether the two beside it have had an impact.
+    Each is a tuple: left and right end (pixels), length (m), and whether the bodies at its two ends have hit each
+    other.
     """
     front, obstacle = float(scene.front_m[0]), scene.obstacle_m
     spaces = [(_x(scene, front), _x(scene, obstacle), obstacle - front, any(s.pair < 0 for s in scene.struck))]

@@ -146,13 +146,13 @@ class _Follower(Tape):
 
 
 def join_pieces(pieces: Floats, vehicles: int) -> Floats:
-    """Return the same motion with fewer pieces.
+    """Return the same motion with fewer pieces; a piece is a stretch of time in which all jerks are constant.
 
-    A piece is dropped if the piece before it already gives its state, within rounding. Of several pieces that begin
+    A piece is dropped if the piece before it, continued, gives its state within rounding. Of several pieces that begin
     within the same 0.1 ms, only the last is kept.
 
     Args:
-        pieces: [k, 1 + 4 N] as in ``EpisodeMotion``.
+        pieces: [k, 1 + 4 N] time and state at the beginning of each piece, as in ``EpisodeMotion``.
         vehicles: number of vehicles, N.
 
     """

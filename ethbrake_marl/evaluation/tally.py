@@ -78,10 +78,11 @@ class Tally:
         )
 
     def rescore(self, objectives: Sequence[str], vehicles: int) -> Rescores:
-        """Return the mean harm of every agent, by vehicle, under these objectives and both counts of harm.
+        """Return the mean value of every agent under each objective, for each vehicle and both counts of harm.
 
         Args:
-            objectives: objectives that the tally was computed with, such as ``social:45``.
+            objectives: objectives that the tally was computed with, such as ``social:45``, which weighs a vehicle's own
+                harm against the others'.
             vehicles: number of vehicles, N.
 
         """
