@@ -240,7 +240,7 @@ class Installed(TyperCommand):
         self.entry, self.is_ours = entry, givers == [OURS]
 
     def command(self) -> Any:
-        """Import the actual command and return it as a Typer (click) command."""
+        """Import the actual command of the entry point, and return it as a Typer (click) command."""
         found = COMMANDS[self.entry]
         found.name = self.name
         return with_installed(found, self.entry)

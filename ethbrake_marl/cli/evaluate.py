@@ -185,10 +185,18 @@ def _tell_worlds(out: Out, worlds: int) -> Callable[[int], None]:
 def _evaluate_group(
     out: Out, output: Path | None, group: Sequence[Task], agents: str, episodes: int | None, seed: int | None
 ) -> None:
-    """Evaluate each agent in each scenario of a group, and print a table.
+    """Evaluate each agent in each scenario of a group, and print one table with a row for each of them.
 
-    It shows whether vehicles collide, how hard the worst impact is, and harm, in ``episodes`` worlds of ``seed``
-    (None: 400 worlds of the standard seed). ``output``: folder that also gets the results as JSON; None: no folder.
+    It shows whether vehicles collide, how hard the worst impact is, and harm.
+
+    Args:
+        out: output of the command.
+        output: folder that also gets the results as JSON; None: no folder.
+        group: the scenarios, each with its controlled vehicles.
+        agents: specs with commas between them.
+        episodes: number of worlds of each scenario; None: 400.
+        seed: seed of the worlds; None: the standard seed.
+
     """
     told: list[dict[str, Any]] = []
     rows: list[Any] = []

@@ -16,7 +16,9 @@ def register_page(shows: str, write: Callable[..., None]) -> None:
 
     Args:
         shows: what the page is about: ``"evaluation"`` (``evaluate --report``) or ``"worlds"`` (``scenario sample``).
-        write: the function; ``cli.evaluate`` and ``cli.scenario`` show its arguments.
+        write: the function. For ``"evaluation"`` it takes the file, the evaluation, its results table and the agents by
+            name; for ``"worlds"`` the file, the scenario and the sample. ``cli.evaluate`` and ``cli.scenario`` show the
+            keyword arguments.
 
     """
     PAGES.add(shows, write, lambda other: other is write)

@@ -110,10 +110,10 @@ def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
 
 
 def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tuple[list[str], str, dict[str, Any]]:
-    """Return three descriptions of the quantities of the worlds in ``sample``.
+    """Return three descriptions of the quantities of the worlds in ``sample``: (lines, text, columns).
 
-    They are the lines of a table with the ranges of varying quantities, a text about fixed ones, and column -> least,
-    median and largest value for JSON.
+    ``lines`` are a table with the range of each varying quantity; ``text`` lists the fixed ones. ``columns`` is for
+    JSON: ``{"gap_1_m": {"least": 5.0, "median": 7.0, "largest": 9.0}}``.
     """
     import numpy as np
 

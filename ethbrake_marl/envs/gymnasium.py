@@ -25,11 +25,14 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 class Specified:
-    """Mixin for environments that ``gymnasium.make`` makes: their ``spec`` holds only settings that JSON can store."""
+    """Mixin for environments that ``gymnasium.make`` makes: its ``spec`` stores settings only as plain data for JSON.
 
-    engine: Engine
-    max_episode_steps: int | None = None
-    _spec: EnvSpec | None = None
+    A scenario object, for instance, becomes a mapping, and a path becomes a text.
+    """
+
+    engine: Engine  # the engine that moves the worlds, set by the environment
+    max_episode_steps: int | None = None  # largest number of steps of an episode; None: the horizon limits it alone
+    _spec: EnvSpec | None = None  # the value of ``spec``
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -52,7 +55,7 @@ class Specified:
 
 
 def _plain(setting: Any) -> Any:
-    """Return a setting of an environment, such as a ``Scenario`` or a path, as plain data for JSON."""
+    """Return a setting of an environment as plain data for JSON: a ``Scenario`` as a mapping, a path as a text."""
     if isinstance(setting, Scenario):
         return setting.declared()
     if isinstance(setting, RewardParams):

@@ -60,12 +60,14 @@ def shield_columns(engine: Engine, rows: Ints | None = None) -> Columns:
 
 
 def plain_rows(columns: Columns, vehicles: Ints, count: int) -> list[dict[str, Any]]:
-    """Return one dictionary of plain values for each vehicle in ``vehicles``, world by world: ``[{name: value}, ...]``.
+    """Return one dictionary of plain values for each world and vehicle: ``[{"time_s": 0.5, "collided": 0.0}, ...]``.
+
+    The list begins with the vehicles of the first world.
 
     Args:
         columns: name -> values [n, N].
         vehicles: indices of the vehicles to include.
-        count: number of dictionaries to return if there are no columns; they are empty.
+        count: length of the list if ``columns`` is empty; its dictionaries are then empty.
 
     """
     values = [column.take(vehicles, axis=1).reshape(-1).tolist() for column in columns.values()]
@@ -237,14 +239,15 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
 
 
 class Begun:
-    """Base class of all interfaces: it holds an engine, and starts episodes by seed and options.
+    """Base class of all environments: it holds an engine, and starts episodes by a seed and options.
 
-    ``np_random`` and ``np_random_seed`` have the same meaning as in ``gymnasium.Env``.
+    A subclass sets ``engine`` in its constructor, and calls ``_restart`` in its ``reset``. ``np_random`` and
+    ``np_random_seed`` have the same meaning as in ``gymnasium.Env``.
     """
 
-    engine: Engine
-    _known_options: Sequence[str] = (INITIAL_STATE, LISTED_WORLD)
-    _started = False
+    engine: Engine  # the engine that moves the worlds
+    _known_options: Sequence[str] = (INITIAL_STATE, LISTED_WORLD)  # keys that ``options`` of ``reset`` may have
+    _started = False  # whether an episode has begun
     _goes_on = False  # whether a reset without a seed continues the running stream
     _np_random: np.random.Generator | None = None
     _np_random_seed: int | None = None  # -1: unknown, because the user set the generator
@@ -303,10 +306,10 @@ class Begun:
         self._begin(named, wanted_worlds(self.engine, options or {}))
 
     def _begin(self, seed: int | None, worlds: Worlds | None) -> None:
-        """Start episodes in ``worlds`` (at the alert) or, if None, in worlds of a stream.
+        """Start episodes in ``worlds`` (at the alert), or, if None, in the next worlds of a stream.
 
-        The stream is that of ``seed`` or, if None, of a seed drawn from a generator that the user has set, or the
-        current one.
+        With a ``seed`` the stream starts anew from its first world. Without a seed the current stream continues; but if
+        the user has set ``np_random``, a new seed is drawn from it.
         """
         drawn, used = seed is None and self._np_random_seed == -1, seed
         if drawn:
@@ -334,9 +337,12 @@ class Begun:
 
 
 class OneWorld(Begun):
-    """Base class of the interfaces with a single world, which a viewer can show."""
+    """Base class of the environments with a single world: adds ``describe_world``, ``render`` and ``close``.
 
-    viewer: Viewer
+    A subclass sets ``viewer`` in its constructor.
+    """
+
+    viewer: Viewer  # draws the pictures of the running episode
 
     def describe_world(self) -> dict[str, Any]:
         """Return the random draw of the running world: name -> number or text; see ``envs.draws.describe_worlds``."""

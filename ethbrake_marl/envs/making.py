@@ -146,10 +146,11 @@ def chosen_seed(seed: int | None) -> int:
 
 
 def wanted_worlds(engine: Engine, options: Mapping[str, Any]) -> Worlds | None:
-    """Return the worlds that the options of a reset request, one for each of the engine's rows.
+    """Return the worlds that the ``options`` of a reset choose, one for each of the engine's worlds.
 
-    None means that the worlds come from the stream. Raises ``InvalidInput`` if both options are given, and for an
-    invalid one.
+    ``initial_state`` puts all of them in one state; ``listed_world`` chooses consecutive worlds of an evaluation list.
+    Without either key the result is None: the worlds come from the stream. Raises ``InvalidInput`` if both keys are
+    present, or if one is invalid.
     """
     if LISTED_WORLD not in options:
         if INITIAL_STATE not in options:

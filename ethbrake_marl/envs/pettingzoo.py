@@ -25,9 +25,9 @@ from ethbrake_marl.physics.state import Ints
 
 
 class SeededInside:
-    """Mixin for wrappers: ``np_random`` and ``np_random_seed`` are those of the environment inside all wrappers."""
+    """Mixin for wrappers: ``np_random`` and ``np_random_seed`` are read from, and set on, the innermost environment."""
 
-    unwrapped: Any
+    unwrapped: Any  # the innermost environment
 
     @property
     def np_random(self) -> np.random.Generator:

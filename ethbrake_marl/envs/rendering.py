@@ -64,7 +64,8 @@ class Scene(NamedTuple):
     title: str  # name of the scenario
     time_s: float  # time since the alert (s)
     view: View  # the stretch of road that is shown
-    # [N] drawn positions of the front bumpers (m from Vehicle 1's at the alert): bodies of length BODY_M, true gaps
+    # [N] positions at which the front bumpers are drawn (m from Vehicle 1's at the alert). Vehicles have no length in
+    # the physics, but are drawn BODY_M long; the drawn gaps are the true ones.
     front_m: Floats
     gaps_m: Floats  # [P] gap of each pair of neighbours (m)
     speeds_mps: Floats  # [N] speed of each vehicle (m/s)
@@ -343,7 +344,8 @@ def _x(scene: Scene, place_m: float) -> float:
 def _spaces(scene: Scene) -> list[tuple[float, float, float, bool]]:
     """Return the free stretches of road, from the front backwards: to an obstacle, and between the vehicles.
 
-    Each is a tuple: left and right end (pixels), length (m), and whether the two beside it have had an impact.
+    Each is a tuple: left and right end (pixels), length (m), and whether the bodies at its two ends have hit each
+    other.
     """
     front, obstacle = float(scene.front_m[0]), scene.obstacle_m
     spaces = [(_x(scene, front), _x(scene, obstacle), obstacle - front, any(s.pair < 0 for s in scene.struck))]

@@ -32,22 +32,27 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Recorded motion of n worlds: one step of each, or the time from its alert to its first decision."""
+    """Recorded motion of n worlds during one step, or from the alert to the first decision.
+
+    A motion is *open* while it is the latest one: its end is the engine's current state. ``closed`` returns it with a
+    fixed end, and with its ``parts``, which ``scenes`` needs.
+    """
 
     start: Worlds  # the n worlds at the start
-    command_mps2: Floats  # [n, N] commands (m/s2); if ``fresh``, those in force at the end, set by ``closed``
-    until_s: Floats  # [n] time at the end (s); NaN: the engine's current time
-    fresh: Bools  # [n] whether the motion begins at the alert
+    command_mps2: Floats  # [n, N] commands (m/s2); where ``fresh``, 0 until ``closed`` sets the commands at the end
+    until_s: Floats  # [n] time at the end since the alert (s); NaN while the motion is open
+    fresh: Bools  # [n] whether the motion begins at the alert, not at a decision
     front_m: Floats  # [n] position of Vehicle 1 at the start, relative to the alert (m)
     harm: Floats  # [n, 2] first-impact harm and total harm at the start (m2/s2)
     left_m: Floats  # [n] left end of the road that pictures of the episode show (m from Vehicle 1 at the alert)
     right_m: Floats  # [n] right end of that road (m)
     struck: Floats  # [k, 4] impacts shortly before the start: row of the world, pair, time (s), closing speed (m/s)
     stepped_in: Bools | None  # [n] whether a shield replaced an action; None: no shield
-    parts: tuple[tuple[Worlds, Floats, Floats], ...] = ()  # parts from ``Engine.segments``, set by ``closed``
+    # Parts of the motion with constant commands, set by ``closed``: worlds at the start, commands, time at the end.
+    parts: tuple[tuple[Worlds, Floats, Floats], ...] = ()
 
     def closed(self, engine: Engine) -> Motion:
-        """Return this motion with the engine's current state as its end."""
+        """Return this motion with its end fixed at the current state of ``engine``."""
         worlds = engine.worlds
         command = np.where(self.fresh[:, np.newaxis], worlds.command_mps2, self.command_mps2)
         parts = tuple(engine.segments(self.start, command))
@@ -130,9 +135,13 @@ class Trace:
         engine.watch(self, () if alert is None else self.begun((), alert, np.arange(alert.n)))
 
     def begun(self, memory: Memory, alert: Worlds, rows: Ints) -> Memory:
-        """Return the recorded motions after episodes have started in the rows with the indices ``rows``.
+        """Return the recorded motions (``Motion``) after episodes have started in the rows with the indices ``rows``.
 
-        ``alert`` holds only the new worlds, at t = 0. ``memory`` are the motions before.
+        Args:
+            memory: the motions recorded before.
+            alert: the worlds of these rows only, at t = 0.
+            rows: indices of the worlds whose episodes have started.
+
         """
         v, n = alert.vehicles, alert.n
         # The view contains each line from the alert to rest if all brake fully as soon as they can. A rear vehicle that
@@ -160,10 +169,10 @@ class Trace:
         return (replace(last, start=last.start.assign(rows, alert), struck=struck, **columns),)
 
     def stepped(self, memory: Memory, before: Engine, after: Engine) -> Memory:
-        """Return the recorded motions after a step, given those before (``memory``).
+        """Return the recorded motions after a step: those of ``memory``, and the motion of the step.
 
-        The motion before the step is closed, and the motion of the step begins. ``before`` and ``after`` are the engine
-        before and after the step.
+        The last motion of ``memory`` is closed first. Unless the trace was made with ``whole``, only the motion of the
+        step is kept. ``before`` and ``after`` are the engine before and after the step.
         """
         last = memory[-1].closed(before)
         front_m, met = last.front_m, [last.struck]

@@ -37,7 +37,7 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
     """Wrapper with a separate cost: ``step`` returns observation, reward, cost, terminated, truncated, info.
 
     This is the format of Safety-Gymnasium, which OmniSafe expects. The cost is the harm that the step added to the line
-    (m2/s2), as the reward counts impacts, independent of the reward's other terms.
+    (m2/s2). It counts first impacts only, or all impacts, as the reward does; other terms of the reward do not enter.
 
     Args:
         env: ``EthBrakeEnv``, or a wrapper of one that passes its infos on.

@@ -75,10 +75,11 @@ VEHICLE_2 = 1  # index of the vehicle whose latency sets the time of the map's f
 
 
 class SampledHarm:
-    """Watcher that replays the commands of the episodes through the paper's fixed-step map, ``advance_sampled``.
+    """Watcher that computes the harm of the episodes as the paper does, which samples the motion at fixed steps.
 
-    Every world runs to the horizon; after its exact episode has ended, the last commands are held. The agents saw the
-    exact motion and do not decide again. Create it with ``of``; the engine calls ``see`` after each step.
+    It replays the commands through ``advance_sampled``, the paper's equations of motion. Every world runs to the
+    horizon; after its exact episode has ended, the last commands are held. The agents saw the exact motion and do not
+    decide again. Create it with ``of``; the engine calls ``see`` after each step, and ``finish`` returns the harm.
 
     Args:
         worlds: the n worlds at the alert; they are copied.

@@ -74,8 +74,8 @@ def tally_agents(
         outcomes: outcome of each agent, by the agent's name.
         contexts: what each set of measures prepared for these worlds; see ``contexts_of``.
         baseline: name of the agent to compare with, for sets of measures without a baseline of their own.
-        objectives: also sum the harm that each vehicle bears, and its value under these objectives (``"social:45"``);
-            None: neither.
+        objectives: objectives such as ``"social:45"``, which weigh a vehicle's own harm against the others'. Also sum
+            the harm that each vehicle bears, and its value under each objective; None: neither.
 
     """
     values: dict[str, dict[str, Values]] = {}
@@ -134,9 +134,16 @@ def estimate_all(
 def _estimate(
     measure: Measure, own: AgentTally, baseline: AgentTally | None, worlds: int, whole: str | None
 ) -> Estimate | None:
-    """Return the estimate of one measure from the agent's own sums and the baseline's.
+    """Return the estimate of one measure; None if it lacks a value in some of the ``worlds``, or cannot be compared.
 
-    ``whole``: name of a counted measure that must be true in all ``worlds`` for a comparison (``MeasureSet.whole``).
+    Args:
+        measure: the measure.
+        own: the agent's sums.
+        baseline: the sums of the agent to compare with; None: there is none.
+        worlds: number of evaluated worlds.
+        whole: name of a true/false measure (``MeasureSet.whole``). The agent is compared with the baseline only if this
+            is true in all worlds; None: no such condition.
+
     """
     name = measure.name if callable(measure.of) else measure.of
     if own.share(name, worlds) is not None:
@@ -154,8 +161,9 @@ def _estimate(
 def lower_bounds(tally: AgentTally, worlds: int) -> frozenset[str]:
     """Return the names of the measures whose means are only lower bounds for one agent.
 
-    ``tally`` holds the agent's sums over ``worlds`` worlds. A set of measures may name a condition
-    (``MeasureSet.whole``); unless it is true in all of them, the means of the set are lower bounds.
+    ``tally`` holds the agent's sums over ``worlds`` worlds. A set of measures may name a true/false measure
+    (``MeasureSet.whole``) that says whether a world's values are complete. If this is false in some world, the means of
+    the set are lower bounds.
     """
 
     def is_partial(each: MeasureSet) -> bool:

@@ -48,7 +48,7 @@ class Lineup:
     """The agents of an evaluation as plain data, from which every worker process builds the same agents.
 
     Args:
-        agents: specs, as on the command line.
+        agents: specs (texts that name agents, such as ``full_brake``), as on the command line.
         scenario: the scenario whose learners they drive.
         harm_count: harm that agents minimise: each pair's first impact only (``first``) or all impacts (``total``).
         uncertainty: uncertainty for shields that need one, as text: ``gaps_m=0.5``.
@@ -192,7 +192,8 @@ def tally_list(
         lineup: the agents.
         episodes: number of worlds.
         seed: seed from which the worlds are drawn.
-        objectives: also sum the harm that each vehicle bears, and its value under these objectives (``"social:45"``).
+        objectives: objectives such as ``"social:45"``, which weigh a vehicle's own harm against the others'. Also sum
+            the harm that each vehicle bears, and its value under each objective.
         jobs: number of processes; None: one, or as many as Ray has cores.
         ray: address of a Ray cluster, or ``local``; None: no Ray.
         on_done: called with the number of worlds done so far.

@@ -60,7 +60,8 @@ class Evaluation:
     seed: int | None  # seed from which the worlds were drawn; None for worlds that the caller passed
     outcomes: dict[str, Outcome]  # results of each agent in these worlds, by the agent's name
     left_out: tuple[LeftOut, ...] = ()  # worlds that failed with some agent; they are in none of the arrays
-    # Group of each world, [n], by kind of group: ``scenario`` (of a mixture), ``vehicle_2_type``.
+    # Groups of the worlds: ``{"scenario": [n names], "vehicle_2_type": [n names]}``. Only a mixture has ``scenario``,
+    # and only a scenario with vehicle types has the types; else it is empty.
     kinds: Mapping[str, NDArray[np.str_]] = field(default_factory=dict)
     host: str = ""  # name of the simulator that moved the worlds; "": the physics of this package
     _computed: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # cache of ``once``
@@ -99,7 +100,7 @@ class Evaluation:
         Args:
             parts: evaluations of the same agents, in the order of their worlds in the list.
 
-        Raises ``PhysicsError`` if no part has any world, because all of them were left out.
+        Raises ``PhysicsError`` if every world was left out.
 
         """
         left_out = tuple(left for part in parts for left in part.left_out)

@@ -82,8 +82,8 @@ def _arrays_sha256(arrays: dict[str, np.ndarray]) -> str:
 def _arrays(value: Any) -> dict[str, np.ndarray]:
     """Return the arrays of the dataclass ``value`` and of the dataclasses inside it, by name.
 
-    Arrays without information are omitted: empty ones, of messages or braking pieces, and infinite build-up rates of
-    brakes.
+    Arrays that say nothing are omitted: those of messages and braking profiles if the worlds have none, and build-up
+    rates of brakes that are all infinite.
     """
     found: dict[str, np.ndarray] = {}
     for field in fields(value):

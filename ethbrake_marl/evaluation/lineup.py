@@ -53,11 +53,11 @@ def make_lineup(
     alone: bool = False,
     bare: bool = False,
 ) -> dict[str, Driver]:
-    """Return a new agent for each spec, by spec, to drive the scenario's learners.
+    """Make one agent for each spec, to drive the scenario's learners, and return spec -> agent.
 
     Args:
-        specs: specs as ``make_agent`` takes them (``"full_brake"``, ``"ppo@shipped+step"``): a list, or a text with
-            commas between them. A name of a group, such as ``ladder``, stands for several agents.
+        specs: texts that name agents, as ``make_agent`` takes them (``"full_brake"``, ``"ppo@shipped+step"``): a list,
+            or one text with commas between them. A name of a group, such as ``ladder``, stands for several agents.
         scenario: the scenario whose learners they drive.
         harm_count: harm that agents minimise, if they optimise: ``first`` or ``total``.
         uncertainty: uncertainty for the shields that need one, as ``make_agent`` takes it.
@@ -93,8 +93,9 @@ def make_lineup(
 
 
 def make_agents(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCount = "first") -> dict[str, Agent]:
-    """Return a new agent for each spec, by spec, to drive a single vehicle; see ``make_lineup``.
+    """Make one agent for each spec, to drive a single vehicle, and return spec -> agent; see ``make_lineup``.
 
-    ``harm_count`` is the harm that agents minimise, if they optimise. Raises ``InvalidInput`` for a team.
+    ``specs`` are texts that name agents, such as ``full_brake``. ``harm_count`` is the harm that agents minimise, if
+    they optimise. Raises ``InvalidInput`` for a team.
     """
     return make_lineup(specs, scenario, harm_count=harm_count, alone=True)  # type: ignore[return-value]  # no teams

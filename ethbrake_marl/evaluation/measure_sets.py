@@ -35,10 +35,10 @@ class Measure:
     """
 
     name: str  # key in JSON results, unique among all measures
-    of: Callable[[Outcome, Any], Values | None] | str
+    of: Callable[[Outcome, Any], Values | None] | str  # how the values are computed, see above
     heading: str = ""  # heading of its column in tables; "": no column
     short: str = ""  # short heading for terminals, possibly with line breaks
-    about: str = ""  # explanation for users; may be empty if a measure whose heading begins alike has one
+    about: str = ""  # explanation for users; "": that of the measure whose heading begins with the same words
     percent: bool = False  # whether tables show percent
     # Comparison with the baseline, paired by world: none, mean difference, or relative decrease of the mean.
     against: Literal["", "difference", "decrease"] = ""
@@ -80,14 +80,16 @@ class GroupColumn:
 class MeasureSet:
     """Base class of a set of measures that are computed from the same knowledge of the worlds.
 
-    ``prepare`` computes this knowledge, the *context*, once per evaluation. A subclass lists its measures in
-    ``measures``, and overrides the methods that it needs.
+    A subclass must list its measures in ``measures``. It may override ``prepare``, which computes the common knowledge
+    (the *context*) once per evaluation; ``row``, which adds fields to JSON results; and ``warnings`` and ``notes``,
+    which add texts to a results table. By default there is no context, and nothing is added.
     """
 
-    measures: tuple[Measure, ...] = ()
+    measures: tuple[Measure, ...] = ()  # measures with a column or a JSON key, in the order of JSON
     counted: tuple[Measure, ...] = ()  # true/false measures without a column, whose true worlds ``row`` can read
     baseline: str | None = None  # agent to compare with; None: the baseline of ``summarise``
-    # Name of a counted measure. If it is false in some world, means are marked "≥" and comparisons are omitted.
+    # Name of a measure in ``counted`` that says whether a world's values are complete. If it is false in some world,
+    # means are marked "≥" and comparisons are omitted. None: all values are complete.
     whole: str | None = None
     narrow: tuple[str, ...] = ()  # names of measures that a narrow terminal also shows, if they have values
     notebook: tuple[str, ...] = ()  # names of measures that a notebook shows
@@ -120,11 +122,17 @@ class MeasureSet:
         return {}
 
     def warnings(self, rows: Sequence[Any]) -> Sequence[str]:
-        """Return warnings about the rows of a results table (``SummaryRow``, one per agent), as clauses."""
+        """Return warnings about a results table, each a clause without capital and full stop; by default none.
+
+        ``rows`` are the table's rows (``SummaryRow``, one per agent).
+        """
         return ()
 
     def notes(self, rows: Sequence[Any]) -> Sequence[str]:
-        """Return notes to print below a results table with these rows (``SummaryRow``, one per agent), as sentences."""
+        """Return notes to print below a results table, each a whole sentence; by default none.
+
+        ``rows`` are the table's rows (``SummaryRow``, one per agent).
+        """
         return ()
 
 
@@ -232,10 +240,11 @@ MEASURE_SETS: Registry[MeasureSet] = Registry("set of measures", "measure_sets",
 
 
 def contexts_of(evaluation: Any, *, long_list: bool = False) -> dict[str, Any]:
-    """Return what each installed set of measures prepared for an ``Evaluation`` (its context), by the set's name.
+    """Return the context of each installed set of measures for an ``Evaluation``, by the set's name.
 
-    Each context is computed once per evaluation. ``long_list``: the evaluation is a part of a list of more than 100,000
-    worlds; sets that do not apply to such lists get ``Silent``.
+    The context is what ``MeasureSet.prepare`` returned: the set's knowledge of the worlds, or ``Silent`` with the
+    reason why the set does not apply. It is computed once per evaluation. ``long_list``: the evaluation is a part of a
+    list of more than 100,000 worlds, to which some sets do not apply.
     """
     silent = silent_in_long_lists() if long_list else {}
     return {name: silent.get(name) or evaluation.once(each.prepare) for name, each in MEASURE_SETS.items()}
@@ -256,9 +265,10 @@ def silent_because(contexts: Mapping[str, Any]) -> dict[str, str | None]:
 
 
 def every_set(columns: Iterable[str] = ()) -> Iterator[tuple[str, MeasureSet]]:
-    """Yield (name, set) for all sets of measures, in the order of JSON; the core's and the user's set have name "".
+    """Yield (name, set) for all sets of measures, in the order in which JSON results hold their measures.
 
-    ``columns``: keys of ``Outcome.metrics``, the measures that the user registered.
+    The set of the core (``EpisodeMeasures``) and that of the user's measures have the name "". ``columns`` are the keys
+    of ``Outcome.metrics``, the measures that the user registered.
     """
     yield "", EPISODE
     yield "", RegisteredMeasures(columns)
@@ -266,8 +276,8 @@ def every_set(columns: Iterable[str] = ()) -> Iterator[tuple[str, MeasureSet]]:
 
 
 def measures(columns: Iterable[str] = ()) -> tuple[Measure, ...]:
-    """Return the measures of all sets, in the order of JSON.
+    """Return the measures of all sets, in the order in which JSON results hold them.
 
-    ``columns``: keys of ``Outcome.metrics``, the measures that the user registered.
+    ``columns`` are the keys of ``Outcome.metrics``, the measures that the user registered.
     """
     return tuple(measure for _, each in every_set(columns) for measure in each.measures)

@@ -83,7 +83,14 @@ class _Follower(Tape):
         self._engine, self._ruling = engine, engine.ruling
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Record one step: worlds at its beginning, commands [n, N] during it, time [n] at which it ends."""
+        """Record one step.
+
+        Args:
+            before: the worlds at the beginning of the step.
+            command_mps2: [n, N] commanded accelerations during the step.
+            until_s: [n] time at which the step ends.
+
+        """
         super().see(before, command_mps2, until_s)
         ruling = self._engine.ruling
         if ruling is not None and ruling is not self._ruling:  # ``see`` may be called several times in a step
@@ -139,13 +146,13 @@ class _Follower(Tape):
 
 
 def join_pieces(pieces: Floats, vehicles: int) -> Floats:
-    """Return the same motion with fewer pieces.
+    """Return the same motion with fewer pieces; a piece is a stretch of time in which all jerks are constant.
 
-    A piece is dropped if the piece before it already gives its state, within rounding. Of several pieces that begin
+    A piece is dropped if the piece before it, continued, gives its state within rounding. Of several pieces that begin
     within the same 0.1 ms, only the last is kept.
 
     Args:
-        pieces: [k, 1 + 4 N] as in ``EpisodeMotion``.
+        pieces: [k, 1 + 4 N] time and state at the beginning of each piece, as in ``EpisodeMotion``.
         vehicles: number of vehicles, N.
 
     """

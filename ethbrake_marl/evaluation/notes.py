@@ -48,7 +48,7 @@ def identity_line(rows: Sequence[SummaryRow]) -> str:
 
 
 def _sets_in(rows: Sequence[SummaryRow]) -> list[MeasureSet]:
-    """Return the sets of measures of which these rows have fields."""
+    """Return the registered sets of measures that added fields to these rows (``SummaryRow.more``)."""
     return [each for name, each in MEASURE_SETS.items() if rows and name in rows[0].more]
 
 

@@ -164,7 +164,7 @@ class Outcome:
 
 
 def none_for_nan(column: Values) -> list[Any]:
-    """Return the values of ``column`` [n] as a list, with None in place of NaN."""
+    """Return the values of ``column`` [n] as a list, in which None replaces NaN."""
     return [None if value != value else value for value in column.tolist()]
 
 

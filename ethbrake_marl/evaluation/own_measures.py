@@ -17,8 +17,9 @@ def load_measures(names: Iterable[str]) -> None:
     """Load measures by name, and show them in every evaluation from now on.
 
     A name is ``risk``, ``injury``, or the name of a measure of an installed package. ``my_file.py:measure`` runs that
-    Python file, with your permissions, and takes ``measure`` from it: a function or a ``Part``. Raises ``UnknownName``
-    with a suggestion, and ``InvalidInput`` for a measure that cannot be loaded.
+    Python file, with your permissions, and takes ``measure`` from it: a function, or a ``Part``, which holds a function
+    with the settings of ``register_measure``. Raises ``UnknownName`` with a suggestion, and ``InvalidInput`` for a
+    measure that cannot be loaded.
     """
     for name in names:
         file, colon, own = name.rpartition(":")

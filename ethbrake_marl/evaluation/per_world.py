@@ -38,7 +38,8 @@ def write_per_world(
     Args:
         path: the file to write.
         evaluation: results of the agents.
-        objectives: objectives such as ``"social:45"``; each adds columns with its value for every vehicle.
+        objectives: objectives such as ``"social:45"``, which weigh a vehicle's own harm against the others'. Each adds
+            columns with its value for every vehicle.
         force: replace an existing file.
 
     Raises ``AlreadyExists`` for an existing file unless ``force``, ``InvalidInput`` for a missing folder or another

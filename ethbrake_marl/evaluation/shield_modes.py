@@ -56,7 +56,8 @@ class ModeRow:
     replaced: float | None = None  # share, 0 to 1, of all decisions of shielded vehicles that the shield replaced
     bound: Estimate | None = None  # mean over worlds of the harm that the shield promises at the alert (m2/s2)
     vehicles: tuple[VehicleRow, ...] = ()  # results of each vehicle, front to rear
-    # Shares of the interventions that were needed, harmless and costly (``VERDICTS``); None without interventions.
+    # Shares, 0 to 1, of the replaced decisions without which harm would be higher (needed), the same (harmless) and
+    # lower (costly), in this order; None if none was replaced.
     verdicts: tuple[float, ...] | None = None
     above_bound: int | None = None  # number of worlds whose harm exceeds the bound at the alert
     left_out: LeftOutRows = ()  # (row, reason) of each world that failed with some agent and mode; no row counts it
@@ -140,8 +141,8 @@ def compare_modes(
         agents: agents or teams by name, without a shield. They are not changed.
         worlds: worlds at the alert.
         task: the scenario, the controlled vehicles, and the harm that the shield bounds.
-        behind: instead of ``agents``, compare the policies behind those of them that have an episode or step shield;
-            the result is empty if none has.
+        behind: ``agents`` have shields already. Compare the policies inside those that have an episode or step shield,
+            and ignore the others; the result is empty if there is none.
         on_progress: called with an agent's name and its number of worlds done.
 
     Raises ``InvalidInput`` where a shield refuses the scenario, ``PhysicsError`` where every world is left out.
@@ -222,7 +223,13 @@ def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[Mode, _Part]:
 def _row(agent: str, mode: Mode, parts: list[_Part], harm: Mapping[Mode, Floats], task: Task) -> ModeRow:
     """Return the row of an agent in one mode.
 
-    ``parts`` are the results of the chunks in this mode; ``harm`` maps every mode to the harms of all worlds [n].
+    Args:
+        agent: name of the agent.
+        mode: the shield's mode.
+        parts: results of the chunks of worlds in this mode.
+        harm: mode -> harm of the agent in every world [n], to compare this mode with the others.
+        task: the scenario, the controlled vehicles, and the harm that the shield bounds.
+
     """
 
     def minus(other: Mode) -> Estimate | None:

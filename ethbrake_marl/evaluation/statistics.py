@@ -64,11 +64,16 @@ class Moments:
     count: int = 0  # number of values
     total: Fraction = Fraction()  # sum of the values
     squares: Fraction = Fraction()  # sum of their squares
-    negative: int = field(default=0, compare=False)  # number of negative values; for differences, of all values
+    # Number of negative values. If it is 0, intervals do not reach below 0. For differences (``minus``), whose signs
+    # are not known, it is the number of all values.
+    negative: int = field(default=0, compare=False)
 
     @classmethod
     def of(cls, values: Floats) -> Moments:
-        """Return the moments of ``values`` [n]; raise ``InvalidInput`` unless all are finite."""
+        """Return the moments (number, sum and sum of squares) of ``values`` [n].
+
+        Raises ``InvalidInput`` unless all values are finite.
+        """
         return cls(len(values), exact_sum(values), exact_sum(values, values), int(np.count_nonzero(values < 0.0)))
 
     def __add__(self, other: Moments) -> Moments:
@@ -84,7 +89,7 @@ class Moments:
 
     @property
     def mean(self) -> float:
-        """Mean of the values, rounded once; raises ``ZeroDivisionError`` without values."""
+        """Mean of the values: exact, then rounded to a float; raises ``ZeroDivisionError`` without values."""
         return float(self.total / self.count)
 
     @property
@@ -108,8 +113,9 @@ class Moments:
     def ratio_error(self, others: Moments, products: Fraction) -> float:
         """Return the standard error of ``r = mean(values) / mean(others)``, paired by world, by the delta method.
 
-        The residuals ``values - r others`` have mean 0: ``s(residuals) / (sqrt(n) |mean(others)|)``. With sums S and
-        sums of products Q, ``n (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / (n - 1) / Sy^4`` is its square.
+        The residuals ``values - r * others`` have mean 0, so the error is
+        ``std(residuals) / (sqrt(n) * abs(mean(others)))``. With x the values, y the others, sums S and sums of products
+        Q, its square is ``n * (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / ((n - 1) * Sy^4)``.
 
         Args:
             others: moments of the denominator, in the same worlds.
@@ -215,9 +221,16 @@ def paired_difference(values: Floats, baseline: Floats) -> Estimate:
 def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> Estimate:
     """Return ``value - baseline`` of two means over n and m independent worlds, with Welch's interval.
 
-    The standard errors ``s_1``, ``s_2`` follow from the half-widths ``h = t_(n-1) s`` of the t intervals. Welch:
-    ``s^2 = s_1^2 + s_2^2``, with ``s^4 / (s_1^4 / (n - 1) + s_2^4 / (m - 1))`` degrees of freedom. There is no interval
-    if one of the two means has none.
+    The half-width of each mean's t interval, divided by its t quantile, is its standard error (``s1``, ``s2``). The
+    difference has the standard error ``s = sqrt(s1^2 + s2^2)``, with ``s^4 / (s1^4 / (n - 1) + s2^4 / (m - 1))``
+    degrees of freedom. There is no interval if one of the two means has none.
+
+    Args:
+        value: first mean with its interval.
+        n: number of its worlds.
+        baseline: second mean with its interval.
+        m: number of its worlds.
+
     """
     difference = value.value - baseline.value
     if value.interval is None or baseline.interval is None:

@@ -78,9 +78,10 @@ class SummaryTable(list[SummaryRow]):
         return sheet.only(k for k, name in enumerate(sheet.names) if name in shown).html()
 
     def meanings(self) -> dict[str, str]:
-        """Return the explanation of each column: beginning of its heading -> text.
+        """Return the explanations of the columns: heading (up to a comma) -> text.
 
-        Measures that the user registered come last, by their names.
+        Columns with the same beginning, such as "Decrease, total" and "Decrease, first-impact", share one. Measures
+        that the user registered come last, by their names.
         """
         about = {each.heading.partition(",")[0]: each.about for each in measures() if each.about and each.heading}
         own = [registered_measure(column) for column in self[0].metrics] if self else []

@@ -119,7 +119,10 @@ class SummaryRow:
         }
 
     def _estimates_of(self, of: MeasureSet) -> dict[str, Any]:
-        """Return the estimates of one set of measures as JSON entries, values and intervals side by side."""
+        """Return the estimates of one set of measures as JSON entries, values and intervals side by side.
+
+        For instance ``{"total_harm": 37.0, "total_harm_interval": [30.1, 43.9]}``.
+        """
         there = {m.name: self.estimates[m.name] for m in of.measures if m.name in self.estimates}
         optional = {measure.name for measure in of.measures if not measure.always}
         return Estimate.side_by_side({name: each for name, each in there.items() if each or name not in optional})

@@ -39,7 +39,8 @@ class Tally:
 
         Args:
             part: outcomes of the agents.
-            objectives: also sum the harm that each vehicle bears, and its value under these objectives; None: neither.
+            objectives: objectives such as ``"social:45"``, which weigh a vehicle's own harm against the others'. Also
+                sum the harm that each vehicle bears, and its value under each objective; None: neither.
             long_list: omit sets of measures that do not apply to lists of more than 100,000 worlds.
 
         """
@@ -77,10 +78,11 @@ class Tally:
         )
 
     def rescore(self, objectives: Sequence[str], vehicles: int) -> Rescores:
-        """Return the mean harm of every agent, by vehicle, under these objectives and both counts of harm.
+        """Return the mean value of every agent under each objective, for each vehicle and both counts of harm.
 
         Args:
-            objectives: objectives that the tally was computed with, such as ``social:45``.
+            objectives: objectives that the tally was computed with, such as ``social:45``, which weighs a vehicle's own
+                harm against the others'.
             vehicles: number of vehicles, N.
 
         """

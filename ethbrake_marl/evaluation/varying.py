@@ -38,9 +38,9 @@ _LONGEST_OWNERS = 30  # longest list of vehicle or pair names, in characters
 def drawn_alike(worlds: Worlds, scenario: Scenario) -> dict[str, dict[str, Floats]]:
     """Return the values of every quantity that varies: ``{"gaps_m": {"": values}, "mass_t": {"vehicle_2": values}}``.
 
-    Vehicles or pairs for which the scenario declares the same smallest and largest value form a group. For each key of
-    a quantity, the result maps the name of a group ("" if it contains all of them) to its values [n, entries]. Worlds
-    without the quantity are omitted.
+    The result maps the key of a quantity to its groups, and each group's name to values [n, entries]. A group consists
+    of the vehicles (or pairs) for which the scenario declares the same smallest and largest value. Its name lists them,
+    such as ``vehicle_2``; it is "" if they are all vehicles of the line. Worlds without the quantity are omitted.
     """
     found: dict[str, dict[str, Floats]] = {}
     for key, rule in QUANTITY.of(worlds).items():

@@ -18,9 +18,9 @@ from ethbrake_marl.shield.options import ShieldOptions
 
 
 def proposing_agent(policy: object, where: str) -> Agent:
-    """Return ``policy`` as an agent that proposes actions; an agent is returned unchanged.
+    """Return ``policy`` as an agent that proposes actions: an agent unchanged, a learned policy as a ``LearnedAgent``.
 
-    ``where`` begins the message of the ``InvalidInput`` that is raised for anything else.
+    Anything else raises ``InvalidInput``, whose message begins with ``where``.
     """
     if not isinstance(policy, type):
         if isinstance(policy, Agent):
@@ -99,13 +99,14 @@ class Attached:
 
     Args:
         env: the environment to shield.
-        interface: class that it must have.
-        maker: how such an environment is made, for error messages.
+        interface: class of which ``env`` must be an instance, such as ``gymnasium.Env``.
+        maker: code that makes such an environment, for error messages.
         policy: proposes the actions that the caller leaves out; None: nobody.
         where: name of the wrapper, for error messages.
         options: keywords of ``ShieldOptions``.
 
-    Raises ``InvalidInput`` if ``env`` is not an environment of this package, or is shielded already.
+    The attributes are ``engine``, ``guard`` and ``options``, besides the properties below. Raises ``InvalidInput`` if
+    ``env`` is not an environment of this package, or is shielded already.
 
     """
 
@@ -146,7 +147,7 @@ class Attached:
         return self.memory.shield
 
     def _reached(self) -> Any:
-        """Return the engine of the wrapped environment, looked up anew at each call."""
+        """Return the engine of the wrapped environment, looked up anew at each call; None if there is none."""
         return getattr(getattr(self._env, "unwrapped", self._env), "engine", None)
 
     def check_open(self) -> None:

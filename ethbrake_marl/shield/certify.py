@@ -55,8 +55,8 @@ def best_constant(world: Members, states: Floats, ended: Bools, step: int, const
     Each action is held from now to the horizon, simulated in one segment.
 
     Args:
-        world: the M possible worlds of one world; the worst case is over them.
-        states: [M, S] their states now.
+        world: the M possible worlds of one world (``Members``); the worst case is over them.
+        states: [M, S] their states now, in the layout of ``Running.states``.
         ended: [M] whether their episodes have ended.
         step: number of the present decision.
         constants: [C, K] actions of the K shielded vehicles.
@@ -87,8 +87,8 @@ def better_plan(
     A plan holds one action for each decision. The replacement requires a harm below ``value`` and at most ``most``.
 
     Args:
-        world: the M possible worlds of one world.
-        states: [M, S] their states now.
+        world: the M possible worlds of one world (``Members``).
+        states: [M, S] their states now, in the layout of ``Running.states``.
         ended: [M] whether their episodes have ended.
         step: number of the present decision, from which on the plan is replaced.
         constants: [C, K] constant actions.
@@ -143,8 +143,8 @@ def try_action(
     action for which the physics fails is not certified.
 
     Args:
-        world: the M possible worlds of one world.
-        states: [M, S] their states now.
+        world: the M possible worlds of one world (``Members``).
+        states: [M, S] their states now, in the layout of ``Running.states``.
         ended: [M] whether their episodes have ended.
         step: number of the present decision.
         action: [K] action to try.
@@ -181,10 +181,17 @@ def try_action(
 
 @compiled
 def tell_action(out: Floats, action: Floats, bound: float, margin: float) -> None:
-    """Write applied action, bound and margin of each shielded vehicle into ``out`` [K, 4]; ``action`` is [K].
+    """Write the applied action, bound and margin of each shielded vehicle into its row of ``out`` [K, 4].
 
-    The bound is the harm that is guaranteed from now on, the margin the budget minus the harm found, both m2/s2. A
+    ``out`` has the columns ``APPLIED``, ``REASON``, ``BOUND`` and ``MARGIN``; its reasons are filled in before. A
     vehicle whose proposal was rejected keeps the margin that is in ``out`` already.
+
+    Args:
+        out: changed in place.
+        action: [K] applied actions.
+        bound: harm that is guaranteed from now on, m2/s2.
+        margin: budget minus the harm found, m2/s2.
+
     """
     for c in range(action.shape[0]):
         out[c, APPLIED], out[c, BOUND] = action[c], bound
@@ -203,8 +210,8 @@ def decide_world(
     rear, each beside the actions that the plan holds by then.
 
     Args:
-        world: the M possible worlds of this world.
-        states: [M, S] their states now.
+        world: the M possible worlds of this world (``Members``).
+        states: [M, S] their states now, in the layout of ``Running.states``.
         ended: [M] whether their episodes have ended.
         step: number of the present decision.
         proposed: [K] proposed actions; NaN: none.

@@ -68,15 +68,18 @@ class Guarded(NamedTuple):
 
     @property
     def told(self) -> dict[str, Any]:
-        """Predicted harm and whether the policy drives, each [n], by their names in an agent's memory.
+        """``{"predicted_harm": [n], "chosen_policy": [n]}``: the shield's values, None for a value that it lacks.
 
-        The names are ``predicted_harm`` and ``chosen_policy``; the value is None if unknown.
+        These are the harm predicted at the alert (m2/s2), and whether the policy drives.
         """
         return {what: getattr(self.shield, what, None) for what in ("predicted_harm", "chosen_policy")}
 
 
 class ShieldGuard(ABC):
     """Base class of the guards of all modes: the part of an engine that certifies or replaces the learners' actions.
+
+    A subclass implements ``decide`` (which actions are applied), ``_started`` (the shield after episodes have begun)
+    and ``tell`` (the infos). It may override ``check``, which compares a step with the prediction, and ``intervened``.
 
     Args:
         engine: the engine that the guard will protect. All its learners are shielded, front to rear.
@@ -104,7 +107,8 @@ class ShieldGuard(ABC):
         Args:
             running: the engine before the step.
             memory: memory of the guard.
-            proposed: [n, L] proposed actions; NaN is no valid action, a column of NaN means that none was given.
+            proposed: [n, L] proposed actions. A column of NaN: the caller gave that learner no action, so its policy
+                proposes. A single NaN: an invalid action, which is never applied.
 
         """
 
@@ -168,10 +172,10 @@ class ShieldGuard(ABC):
         return last
 
     def _of_vehicles(self, infos: Mapping[str, Any], running: Engine) -> dict[str, NDArray[Any]]:
-        """Return the ``infos`` with every value expanded to all vehicles of the engine, [n, N].
+        """Return the ``infos`` (name -> value) with every value expanded to all vehicles, [n, N].
 
-        A vehicle without a shield gets reason ``NO_DECISION``, and 0 in all other entries that have a column per
-        learner.
+        ``running`` is the engine. A vehicle without a shield gets reason ``NO_DECISION``, and 0 in all other entries
+        that have a column per learner.
         """
         shape, spread = running.wanted_mps2.shape, dict[str, NDArray[Any]]()
         for name, value in infos.items():
@@ -216,7 +220,10 @@ class ShieldGuard(ABC):
         return proposed, memories
 
     def _proposer(self, memories: dict[int, Memory], worlds: Worlds | None) -> Proposer | None:
-        """Return the policies with their memories and the current worlds, for rollouts; None without policies."""
+        """Return the policies with their ``memories`` and the current ``worlds``, for rollouts.
+
+        None if there are no policies, or if ``worlds`` is None.
+        """
         return Proposer(self._policies, memories, worlds) if self._policies and worlds is not None else None
 
 

@@ -21,7 +21,8 @@ CHUNK = 500  # worlds advanced together; limits memory, and does not change resu
 class Shielded(NamedTuple):
     """Results of whole episodes behind a step shield: n worlds, N vehicles, K of them shielded.
 
-    ``stack`` adds an axis of drivers in front of every shape below.
+    The shapes below are for one driver. The result of ``stack``, for several drivers, has one more axis in front:
+    ``harm`` is then [drivers, n].
     """
 
     harm: Floats  # [n] harm of the episode, first-impact or total as the shield guarantees it (m2/s2)

@@ -36,7 +36,7 @@ class Review(NamedTuple):
     trusted: Bools  # [m] whether the world behaved as the shield predicted
 
     def share(self, verdict: str) -> float:
-        """Return the share (0 to 1) of the interventions that have this verdict, one of ``VERDICTS``.
+        """Return the share (0 to 1) of the interventions with this ``verdict``: ``needed``, ``costly`` or ``harmless``.
 
         It is 0 if there are no interventions.
         """

@@ -81,7 +81,8 @@ class StepGuard(ShieldGuard):
         Args:
             running: the engine before the step.
             memory: memory of the guard.
-            proposed: [n, L] proposed actions; NaN is no valid action, a column of NaN means that none was given.
+            proposed: [n, L] proposed actions. A column of NaN: the caller gave that learner no action, so its policy
+                proposes. A single NaN: an invalid action, which is never applied.
 
         """
         shield: StepShield = memory.shield

@@ -27,15 +27,19 @@ OF_COMMAND, OF_LATENCY, OF_MASS, OF_LIMIT, OF_BRAKE_RATE, OF_RELEASE_RATE, OF_CA
 
 
 class Members(NamedTuple):
-    """Parameters of M possible worlds, of one world or of a whole batch, and workspace."""
+    """Parameters of M possible worlds, and workspace, as input for the compiled functions of this package.
+
+    The possible worlds of a world are the variants of it in all of which the shield's bound must hold; usually there is
+    one, the world itself. ``all_members`` returns those of a whole batch, ``members_from`` those of one world.
+    """
 
     table: Floats  # workspace in which one possible world is simulated, see ``physics.rows``
-    clock: Floats  # [M, CLOCK.WIDTH] times of the decisions and settings of each, see ``physics.episode``
+    clock: Floats  # [M, CLOCK.WIDTH] times of the decisions, and settings of the episode, see ``physics.episode``
     bounds: Floats  # [M, K, 2] smallest and largest command of the shielded vehicles (m/s2)
-    lines: Floats  # [M, rows, N] parameters of the vehicles; a single array, because each array costs time per call
+    lines: Floats  # [M, rows, N] parameters of the vehicles, in the rows ``OF_COMMAND`` to ``OF_CAP``
     pieces: Floats  # [M, N, 2 P] braking profiles with P intervals of constant command, as in ``Vehicles``
     vehicles: Ints  # [K] indices of the shielded vehicles, front to rear
-    critical: Ints  # [1] number of the one that broke a limit last, tried first for speed; does not affect results
+    critical: Ints  # [1] possible world that last exceeded a limit; it is simulated first, which only saves time
 
 
 @compiled
@@ -81,7 +85,7 @@ def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, 
     """Advance one possible world by one decision, and save its new state.
 
     Args:
-        world: the possible worlds.
+        world: the M possible worlds of one world (``Members``).
         m: number of the one to advance.
         state: [S] its state now.
         step: number of the present decision.
@@ -109,8 +113,8 @@ def take_steps(
     """Advance every possible world of one world by one decision with the same action.
 
     Args:
-        world: the M possible worlds.
-        states: [M, S] their states now.
+        world: the M possible worlds of one world (``Members``).
+        states: [M, S] their states now, in the layout of ``Running.states``.
         ended: [M] whether their episodes have ended; these keep their states.
         step: number of the present decision.
         action: [K] actions of the shielded vehicles.
@@ -189,7 +193,7 @@ def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, p
     It is computed with the engine's operations, so it equals the engine's harm to the bit.
 
     Args:
-        world: the possible worlds.
+        world: the M possible worlds of one world (``Members``).
         m: number of the one to simulate.
         state: [S] its state now.
         ended: whether its episode has ended.
@@ -222,8 +226,8 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
     """Return the largest harm of a plan over the possible worlds of one world, m2/s2.
 
     Args:
-        world: the M possible worlds.
-        states: [M, S] their states now.
+        world: the M possible worlds of one world (``Members``).
+        states: [M, S] their states now, in the layout of ``Running.states``.
         ended: [M] whether their episodes have ended.
         step: number of the present decision.
         plan: [L, K] one action for each decision, executed from now on.
@@ -250,7 +254,7 @@ def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int,
     It is simulated in one segment. Returns infinity if the physics fails.
 
     Args:
-        world: the possible worlds.
+        world: the M possible worlds of one world (``Members``).
         m: number of the one to simulate.
         state: [S] its state now.
         ended: whether its episode has ended.

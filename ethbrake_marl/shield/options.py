@@ -65,7 +65,11 @@ class ShieldOptions:
     where: str = field(default="shield", compare=False)
 
     def __new__(cls, mode: str | None = None, **settings: Any) -> ShieldOptions:
-        """Create an instance of the subclass that has these settings: that of ``mode``, or else of another mode."""
+        """Create an instance of the class for these settings: the mode's own class, or a subclass of another mode.
+
+        ``ShieldOptions(mode, setting=...)`` thus also accepts settings that only the subclass of an extension's mode
+        has.
+        """
         if cls is ShieldOptions:
             cls = _class_with("step" if mode is None else check_mode(mode), settings)
         return object.__new__(cls)

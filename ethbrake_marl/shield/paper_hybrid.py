@@ -76,7 +76,11 @@ class HybridAgent(AgentAround):
         }  # fmt: skip
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the command of the driver chosen at the alert, [n] m/s2, and the new memory."""
+        """Return the command of the driver that ``begin`` chose at the alert, [n] m/s2, and the new memory.
+
+        ``worlds`` are the worlds now; ``memory`` is what ``begin`` or the last call returned; ``vehicle`` is the index
+        of the controlled vehicle.
+        """
         command, policy = ask_script(self.policy, worlds, memory["policy"], vehicle)
         constant, _ = self.backup.act(worlds, memory["backup"], vehicle)
         return np.where(memory["chosen_policy"], command, constant), {**memory, "policy": policy}
@@ -102,10 +106,11 @@ ROUNDING = 1e-6  # rounding error of an action in 32 bits
 
 
 class EpisodeGuard(ShieldGuard):
-    """Guard of mode ``episode``: at each alert the agent ``hybrid`` chooses the driver, whatever is proposed.
+    """Guard of mode ``episode``: at each alert the agent ``hybrid`` chooses who drives the whole episode.
 
-    A proposal counts as replaced where it differs from the applied action by more than the rounding of 32 bits.
-    ``where`` names the interface in error messages.
+    The choice is the policy inside ``hybrid`` or E-V2X-BM; proposed actions do not change it. A proposal counts as
+    replaced where it differs from the applied action by more than the rounding of 32 bits. ``engine`` is the engine
+    that the guard will protect; ``where`` names the interface in error messages.
     """
 
     def __init__(self, engine: Engine, hybrid: HybridAgent, *, where: str = "shield") -> None:

@@ -63,14 +63,14 @@ def rolled_out(
 def certify_by_policy(
     decision: Decision, running: Running, proposed: Floats, budget: Floats, held: Floats, proposer: Proposer
 ) -> Decision:
-    """Return a decision in which rejected proposals that a rollout of the policy can certify are accepted.
+    """Return the decision with every rejected proposal accepted that a rollout (simulation) of the policy certifies.
 
     Args:
         decision: the decision without rollouts.
         running: the n episodes at this decision.
         proposed: [n] or [n, K] proposed actions.
         budget: [n] largest accepted harm, m2/s2.
-        held: [n, L] or [n, L, K] plans before the decision.
+        held: [n, L] or [n, L, K] plans that the shield held before the decision: one action for each decision.
         proposer: the policies.
 
     """
@@ -100,7 +100,7 @@ def certify_rollouts(
         proposed: [n] or [n, K] proposed actions of the whole batch.
         rows: [m] worlds in which to decide again.
         budget: [n] largest accepted harm, m2/s2.
-        held: [n, L] or [n, L, K] current plans of the whole batch.
+        held: [n, L] or [n, L, K] plans (one action for each decision) that the shield now holds in the whole batch.
         proposer: the policies.
 
     Returns a decision for the m worlds of ``rows`` only.

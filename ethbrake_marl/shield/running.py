@@ -72,9 +72,10 @@ class Running(NamedTuple):
 
 
 def begin_running(problem: ProfileProblem, members: int = 1) -> Running:
-    """Return the episodes of a problem at their first decision.
+    """Return the episodes of ``problem`` at their first decision.
 
-    ``members`` is the number M of possible worlds of each world; each M consecutive rows of ``problem`` are one world.
+    A problem holds the states of the worlds at that decision, and the commands of the unshielded vehicles. ``members``
+    is the number M of possible worlds of each world: each M consecutive rows of ``problem`` are one world.
     """
     steps, ended = np.zeros(problem.n // members, np.int64), np.zeros(problem.n, np.bool_)
     return Running(problem, problem.start, steps, ended)
@@ -84,7 +85,7 @@ Number = TypeVar("Number", bound=np.generic)
 
 
 def put(old: NDArray[Number], rows: Ints, new: NDArray[Number]) -> NDArray[Number]:
-    """Return a copy of ``old`` in which the rows with the indices ``rows`` are replaced by those of ``new``."""
+    """Return a copy of ``old`` in which row ``rows[j]`` is replaced by row j of ``new``."""
     placed = old.copy()
     placed[rows] = new
     return placed

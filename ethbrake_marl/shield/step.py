@@ -99,7 +99,7 @@ class StepShield:
 
     """
 
-    possible_are = "possible worlds"  # name of a world's members in error messages
+    possible_are = "possible worlds"  # what error messages call the possible worlds; a subclass may set another name
 
     def __init__(
         self,
@@ -290,9 +290,10 @@ class StepShield:
     def _bound_at_alert(
         self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
     ) -> tuple[Floats, Any]:
-        """Return the bound of the first plans, [n] m2/s2, and further memory of the shield (its enclosure).
+        """Return the bound of the first plans, [n] m2/s2, and the shield's further memory (``StepMemory.enclosure``).
 
-        Here the bound is ``harm``, and there is no enclosure. A subclass may compute another bound.
+        Here the bound is ``harm``, and the further memory is None. A subclass may compute another bound, and use the
+        memory.
 
         Args:
             possible: the possible worlds at the alert, M for each world.
@@ -315,13 +316,15 @@ class StepShield:
         """Decide on the proposed actions in every running episode.
 
         Args:
-            proposed: [n], or [n, K] for several vehicles: proposed actions; clipped to [-1, 1]. NaN: none, the plan's
-                is taken.
+            proposed: [n], or [n, K] for several vehicles: proposed actions; clipped to [-1, 1]. Where it is NaN,
+                nothing is proposed, and the plan's action is applied.
             seen: [n, columns] the observed worlds, as the first columns of ``Running.states``; None: they are not
                 compared with the prediction.
             only: [n] worlds in which to decide; the others stay unchanged. None: all whose episode has not ended.
-            proposer: the policies; they are simulated from here on where nothing else certifies a proposal. None: they
-                are not.
+            proposer: the policies. Where nothing else certifies a proposal, they are simulated from this decision on,
+                and their actions are tried as a plan. None: this is not tried.
+
+        Returns the decision, with the actions to apply. Afterwards ``memory`` holds the predicted next state.
 
         """
         memory = self.memory
@@ -418,7 +421,10 @@ class StepShield:
         return np.asarray(within | (self._leaves_range(running) & np.isfinite(seen).all(axis=1)), np.bool_)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Return whether a world may leave the range of its possible worlds, [n]: after an impact in one of them."""
+        """Return whether an impact has happened in one of a world's possible worlds, [n].
+
+        From then on the world itself may lie outside their range. ``running`` are the predicted episodes.
+        """
         N = running.problem.mass.shape[1]
         predicted = running.states.reshape(running.n, running.members, -1)
         return np.asarray((predicted[:, :, 2 * N - 1 : 3 * N - 2] == 1.0).any(axis=(1, 2)), np.bool_)

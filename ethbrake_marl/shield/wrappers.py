@@ -29,9 +29,9 @@ Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # observations, rew
 
 
 class _Closing:
-    """Mixin: removes the guard from the engine before the wrapped environment is closed."""
+    """Mixin for wrappers, with a ``close`` that removes the guard from the engine and then closes the environment."""
 
-    attached: Attached
+    attached: Attached  # the link to the engine and its guard
 
     def close(self, **settings: Any) -> None:
         """Remove the shield from the environment, then close the environment with its keywords ``settings``."""

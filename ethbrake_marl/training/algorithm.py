@@ -19,9 +19,10 @@ from ethbrake_marl.training.training import Training
 class Algorithm(ABC):
     """Base class of a learning algorithm whose model is a ``BaseAlgorithm`` of Stable-Baselines3.
 
-    A subclass must implement ``build``. The other methods say which policies a model holds, which of its state a
-    checkpoint must save in addition to the state of every Stable-Baselines3 model, and which numbers must stay valid.
-    The defaults fit a model whose ``policy`` has one ``optimizer``, as in PPO and A2C.
+    A subclass must implement ``build``, which returns the model. It may override ``actors`` and ``tensors`` (the
+    policies inside the model, and their weights), ``optimizers`` and ``learned_beside`` (what a checkpoint saves
+    besides ``model.policy``), and ``log_noise`` (which must stay finite). The defaults fit a model whose ``policy`` has
+    one ``optimizer``, as in PPO and A2C.
     """
 
     @abstractmethod
@@ -52,7 +53,10 @@ class Algorithm(ABC):
         return {"policy": model.policy.optimizer}
 
     def learned_beside(self, model: BaseAlgorithm) -> Mapping[str, Tensor]:
-        """Return learned tensors that are not part of ``model.policy``, by name; a checkpoint saves them too."""
+        """Return learned tensors outside ``model.policy``, by name, which a checkpoint saves too; by default none.
+
+        SAC returns ``{"log_ent_coef": ...}``, the entropy coefficient that it learns.
+        """
         return {}
 
     def log_noise(self, model: BaseAlgorithm) -> Tensor | None:

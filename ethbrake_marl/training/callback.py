@@ -64,7 +64,7 @@ class RunCallback(BaseCallback):
 
     """
 
-    model: Model
+    model: Model  # the model that learns
 
     def __init__(self, run: RunDirectory, learner: Learner, watchers: Watchers) -> None:
         super().__init__()

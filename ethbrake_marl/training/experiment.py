@@ -210,7 +210,7 @@ def write_results(
 def results_csv(rows: Sequence[SummaryRow]) -> str:
     """Return a results table as CSV text, with one line per agent.
 
-    The interval of column ``x`` is in ``x_low`` and ``x_high``; missing values are empty.
+    ``rows`` is the table. The interval of column ``x`` is in ``x_low`` and ``x_high``; missing values are empty.
     """
     lines = []
     for told in (row.to_json() for row in rows):
@@ -224,9 +224,10 @@ def results_csv(rows: Sequence[SummaryRow]) -> str:
 
 @contextmanager
 def _status(run: RunDirectory, status: str) -> Iterator[None]:
-    """Context manager that records in ``run.json`` that the evaluation is running, and afterwards how it ended.
+    """Context manager around the evaluation of a run: record in ``run.json`` that it is running, then how it ended.
 
-    ``status`` is what to record if no exception is raised: the status of the training.
+    Without an exception, ``status`` (the status of the training) is recorded. For an exception inside, ``interrupted``
+    (Ctrl-C) or ``failed`` is recorded with the error, which is raised again.
     """
     _note(run, "running", "evaluation", None)
     try:

@@ -86,7 +86,10 @@ def restore_model(model: Model, algorithm: Algorithm, state: TrainingState) -> N
 
 
 def _captured_weights(model: Model, algorithm: Algorithm) -> Arrays:
-    """Return as arrays by name: weights of the model's policy, other learned tensors, states of its optimisers."""
+    """Return the numbers that the model has learned, as arrays by name.
+
+    These are the weights of its policy, its other learned tensors, and the states of its optimisers.
+    """
     arrays = {f"policy.{name}": _copy(tensor) for name, tensor in model.policy.state_dict().items()}
     arrays |= {name: _copy(tensor) for name, tensor in algorithm.learned_beside(model).items()}
     for name, optimizer in algorithm.optimizers(model).items():
@@ -181,7 +184,10 @@ def _try_step(optimizer: torch.optim.Optimizer) -> None:
 
 
 def check_counter(name: str, value: object, kind: type) -> None:
-    """Raise ``ValueError``, with ``name``, unless ``value`` has the type ``kind`` and is no negative integer."""
+    """Raise ``ValueError`` unless ``value`` has the type ``kind`` and, for ``int``, is from 0 to 2^53 - 1.
+
+    ``name`` begins the message.
+    """
     if type(value) is not kind or (kind is int and not 0 <= value < 1 << 53):  # type: ignore[operator]  # an int
         right = "a whole number, at least 0" if kind is int else f"of type {kind.__name__}"
         raise ValueError(f"{name} = {value!r:.60}: must be {right}")

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 @contextmanager
 def own_random_state() -> Iterator[None]:
-    """Context manager that restores the global random generators of Python, NumPy and torch on exit.
+    """Context manager that restores the global random generators at its end, also after an error.
 
-    Inside, torch uses one thread: with a network this small, a second thread makes training 3 to 15 times slower as
-    soon as another process needs a core.
+    These are the generators of Python, NumPy and torch. Inside, torch uses one thread: with a network this small, a
+    second thread makes training 3 to 15 times slower as soon as another process needs a core.
     """
     states = random.getstate(), np.random.get_state(), torch.get_rng_state(), torch.get_num_threads()  # noqa: NPY002
     torch.set_num_threads(1)

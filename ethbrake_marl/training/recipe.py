@@ -61,7 +61,11 @@ class LearningRate(FileModel):
 
 
 class Shape(FileModel):
-    """Base class of the key ``network`` of a recipe: the sizes of the networks, which a subclass declares as keys."""
+    """Base class of the value of the key ``network`` in a recipe: the sizes of the networks.
+
+    A subclass declares the keys as fields. It needs ``policy`` (sizes of the actor's hidden layers, ``[64, 64]``) and
+    ``activation``, or its own ``spec``.
+    """
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
         """Return the description of the network in a policy bundle: an actor with one action in [-1, 1].
@@ -425,8 +429,9 @@ def _checked(source: Path | Document) -> TrainingRecipe:
 
 class _RecipeWording(Wording):
     def known(self, path: YamlPath) -> list[str]:
-        """Return the keys that are allowed beside the key at ``path``, for suggestions.
+        """Return the keys that are allowed beside a key, from which an error message suggests one.
 
-        Below ``reward`` they include the weights of registered measures.
+        ``path`` holds the keys that lead to it in the file, such as ``("reward", "harm")``. Below ``reward``, the
+        weights of registered measures are included.
         """
         return setting_names() if path[:-1] == ("reward",) else super().known(path)

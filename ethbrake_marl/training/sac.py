@@ -16,7 +16,7 @@ from ethbrake_marl.training.training import Training
 
 
 class Sac(Algorithm):
-    """Stable-Baselines3's SAC, with one policy for all learners."""
+    """Algorithm SAC, with the model of Stable-Baselines3 and one policy for all learners."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> SAC:
         """Return a new SAC model for a training, seeded by its recipe, which learns in ``environment``."""

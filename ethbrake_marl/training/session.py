@@ -173,14 +173,15 @@ def build(
 ) -> Iterator[RunCallback]:
     """Context manager: build environment and model of a training, and yield the callback to pass to ``learn``.
 
+    Inside, Ctrl-C stops the training after the current update. At the end, also after an error, the environment is
+    closed and the global random generators are restored.
+
     Args:
         training: recipe and scenario.
         run: folder of the run; nothing is written yet.
         measure: as in ``train``.
         stop_at: as in ``train``.
         on_progress: as in ``train``.
-
-    Inside, Ctrl-C stops after the current update; at the end the global random generators are restored.
 
     """
     evaluate = None if measure is None else measure(training)
