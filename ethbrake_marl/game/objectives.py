@@ -100,7 +100,10 @@ def parse_objective(text: str) -> Objective:
 
 
 def check_declared(declared: object) -> None:
-    """Raise ``InvalidInput`` unless ``declared`` is the text of an objective, or a list of such texts of any length."""
+    """Raise ``InvalidInput`` unless ``declared`` is an objective as a scenario writes it, such as ``own``, or a list.
+
+    The number of objectives in a list is not checked here.
+    """
     each = [declared] if isinstance(declared, str) else declared
     if not isinstance(each, list | tuple) or not all(isinstance(text, str) for text in each):
         raise InvalidInput("objective: must be a name, for instance own or social:45, or a list with one per vehicle")

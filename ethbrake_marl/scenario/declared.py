@@ -22,12 +22,12 @@ from ethbrake_marl.physics.state import Floats, Ints, Worlds, as_road_allows
 from ethbrake_marl.scenario.channel import V2X, Equipage, Equipped
 from ethbrake_marl.scenario.distributions import LEAVE_OUT, AnyQuantity, AnyTypeQuantity, Quantity, TableColumn, support
 from ethbrake_marl.scenario.fields import ALSO, MEANING, QUANTITY, Entry, columns_of_table, is_tabled
+from ethbrake_marl.scenario.member import Member
 from ethbrake_marl.scenario.roles import LEARNER, Role, Roles, ScriptSpec
 from ethbrake_marl.scenario.vehicle_types import (
     ANY,
     LEFT_OUT,
     ListedByVehicle,
-    Member,
     ObjectiveName,
     PerVehicle,
     Table,

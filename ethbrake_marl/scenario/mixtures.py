@@ -12,7 +12,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import Document, flow_text
 from ethbrake_marl.scenario.declared import ScenarioFields
 from ethbrake_marl.scenario.fields import QUANTITY
-from ethbrake_marl.scenario.vehicle_types import Member
+from ethbrake_marl.scenario.member import Member
 
 WORDS = ("title", "description", "source")
 

@@ -176,18 +176,6 @@ class _ObjectiveSchema:
 
 ObjectiveName = Annotated[str, _ObjectiveSchema]
 
-
-class _MemberSchema:
-    """Annotation of the field with one scenario of a mixture: its JSON schema allows a mapping or a text.
-
-    In a file the text is the name of a scenario or the path of its file.
-    """
-
-    @classmethod
-    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        return {"anyOf": [{"type": "string"}, {"type": "object"}]}
-
-
 MOST_NUMBERS = 100_000  # largest number of values in a table, which every copy of the scenario contains
 
 Column = Annotated[str, Field(pattern=r"^[a-z_]+(_[0-9]+)?[a-z0-9_]*$", max_length=64)]
@@ -238,10 +226,3 @@ class Table(FileModel):
             name: TableColumn(name, column, cumulative / cumulative[-1])
             for name, column in zip(self.columns, rows.T, strict=True)
         }
-
-
-class Member(FileModel):
-    """One scenario of a mixture, with its weight relative to the others."""
-
-    scenario: Annotated[dict[str, Any], _MemberSchema] = Field(description="a name, a path, or what its file says")
-    weight: Weight = Field(default=1.0, description="how likely it is, relative to the other scenarios")

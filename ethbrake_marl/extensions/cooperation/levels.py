@@ -131,9 +131,9 @@ def _check_same(one: Level, first: Sample, other: Level, sample: Sample, names: 
 
 
 def _values(name: str, level: Level, sample: Sample) -> Floats:
-    """Return the quantity called ``name`` of a level, such as ``gaps_m``, as an array with one row per world.
+    """Return the quantity called ``name``, such as ``gaps_m``, in the worlds of ``sample``: one row per world.
 
-    A number of the whole scenario, such as ``time_step_s``, gives a single row.
+    A number of the level's whole scenario, such as ``time_step_s``, gives a single row.
     """
     if name in _LINE:
         return np.array([getattr(level.scenario, name)], np.float64)

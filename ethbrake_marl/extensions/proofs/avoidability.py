@@ -210,8 +210,9 @@ def plan_behind(
     gap: Floats, speed: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, keep: float,
     plan: Floats, out: Floats,
 ) -> None:  # fmt: skip
-    """Write the trajectory that is farthest ahead at all times, but ``keep`` metres behind the front vehicle, to
-    ``plan``.
+    """Write to ``plan`` the most forward trajectory of vehicle i among those that stay ``keep`` metres behind i - 1.
+
+    Vehicle i drives as hard as it can, then brakes fully, then follows the vehicle ahead at that distance.
 
     Args:
         gap: [P] gaps, m.
@@ -221,7 +222,7 @@ def plan_behind(
         driving: [N] driving capacities, m/s2.
         limit: [N] speed limits, m/s.
         i: index of the controlled vehicle.
-        keep: distance to keep to the front vehicle, m.
+        keep: distance to keep to the vehicle ahead, m.
         plan: [2, PIECES] receives the trajectory: ends (s) and accelerations (m/s2) of its pieces.
         out: [RESULT_WIDTH] receives columns DRIVE (s; end of the drive), TOUCH (s; end of the full braking after it)
             and FOLLOW (m/s2; the command after that).

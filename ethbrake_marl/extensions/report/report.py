@@ -334,7 +334,7 @@ class Report:
 
 
 def _words(estimate: Estimate | None) -> str:
-    """Return a mean as text, without its interval."""
+    """Return a mean as text, without its interval; a dash if there is no estimate."""
     return Column("").show(estimate).value
 
 

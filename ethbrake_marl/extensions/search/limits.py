@@ -42,7 +42,7 @@ class Proof:
 
     @property
     def impact(self) -> Bools:
-        """True for worlds in which every command leads to an impact, not only to contact, [n]."""
+        """True where no sequence of commands avoids an impact (contact with a closing speed above 0), [n]."""
         return np.asarray(self.harm > 0.0, np.bool_)
 
     @property

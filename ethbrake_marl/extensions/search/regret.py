@@ -77,7 +77,7 @@ class Between:
 
     @property
     def text(self) -> str:
-        """A sentence with these values, to append to another sentence; empty if there are no such worlds."""
+        """A sentence with the share of these worlds and their least known harm, to append; empty if there are none."""
         if self.rate == 0.0:
             return ""
         text = f" In {100 * self.rate:.1f} % contact is certain, but perhaps no impact"
