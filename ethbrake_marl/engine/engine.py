@@ -196,7 +196,7 @@ class Engine:
         self.deciders = self.learners if deciders is None else tuple(deciders)
         if not set(self.deciders) <= set(range(scenario.vehicles)):
             raise InvalidInput(f"engine: deciders {self.deciders} must be from 0 to {scenario.vehicles - 1}")
-        self._terms = Terms(reward, scenario, self.deciders)
+        self._terms = Terms(reward, scenario, self.learners or self.deciders)
         self.reward = self._terms.params
         self.observations = observations_of(scenario, observation)  # of each vehicle
         self._plans = tuple(each.plan for each in self.observations)
@@ -618,7 +618,7 @@ class Engine:
         """
         state = self.state
         if state.impacts is not None:
-            names = ", ".join(self.reward.terms)
+            names = ", ".join(term.name for term in self.reward.registered if term.by == "impacts")
             raise InvalidInput(f"place: reward: {names} needs every impact, which is not known of worlds placed here")
         if worlds.speeds_mps.shape != state.wanted.shape:
             n, N = state.wanted.shape
