@@ -618,7 +618,7 @@ class Engine:
         """
         state = self.state
         if state.impacts is not None:
-            names = ", ".join(term.name for term in self.reward.registered if term.by == "impacts")
+            names = ", ".join(self._terms.impact_names)
             raise InvalidInput(f"place: reward: {names} needs every impact, which is not known of worlds placed here")
         if worlds.speeds_mps.shape != state.wanted.shape:
             n, N = state.wanted.shape
