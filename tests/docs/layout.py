@@ -12,10 +12,10 @@ BEGINNING = """# How the code is laid out
 
 Where does something live? The package is a core and extensions. The core is what the paper needs,
 and what training, scenarios and levels of cooperation need. An extension is a folder that can be
-deleted: it registers itself by entry points (`pyproject.toml`), and no module of the core names it.
-To delete one, delete its folder, its folder in `tests/extensions/`, its lines in `pyproject.toml`, and
-likewise what uses it; then `make venv`. `make core` does so with all of them in a copy, and runs the
-core's tests there.
+deleted: it registers itself by entry points (`pyproject.toml`), and no module of the core names
+it. To delete one, delete its folder, its folder in `tests/extensions/`, its lines in
+`pyproject.toml`, and likewise what uses it; then `make venv`. `make core` does so with all of
+them in a copy, and runs the core's tests there.
 
 A module imports from its own folder, or from what stands below it. `make lint` checks it.
 This page is made from the code: `python -m tests.docs.layout`.
