@@ -21,11 +21,12 @@ INSTALL := sh .ci/install $(VENV)
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint docs figures programme clean
+.PHONY: help venv run test core lint docs figures programme clean
 
 help:
 	@echo "make venv             the environment alone: $(VENV)"
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
+	@echo "make core [ARGS=...]   a copy without any extension passes the core's tests, trains, evaluates and shields"
 	@echo "make test [ARGS=...]  the test suite, without the tests marked slow or long (.ci/run runs the slow ones, too)"
 	@echo "make lint             ruff, ruff format --check, mypy --strict, deptry, import-linter"
 	@echo "make docs             the documentation site, its notebooks run: docs/_build/html; a warning is an error"
@@ -87,6 +88,10 @@ run: $(STAMP)
 test: $(STAMP)
 	@echo "== pytest"
 	@$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal $(ARGS)
+
+core: $(STAMP)
+	@echo "== the core without any extension"
+	@$(PROGRAMME) core $(ARGS)
 
 lint: $(STAMP)
 	@echo "== ruff check"

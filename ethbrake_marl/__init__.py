@@ -1,10 +1,10 @@
-"""Research environment for ethical emergency braking: exact physics, multi-agent, with a shield whose bound holds.
+"""Research environment for ethical emergency braking: exact multi-vehicle physics, shielded by a proven bound on harm.
 
-Importing it registers ``EthBrake-v0`` with Gymnasium and ``ethbrake/ethbrake-v0`` with PettingZoo, and nothing more: a
-public name is imported when it is first used, so torch and matplotlib are loaded only by what needs them.
+Importing the package registers ``EthBrake-v0`` with Gymnasium and ``ethbrake/ethbrake-v0`` with PettingZoo. Everything
+else is imported when its public name is first used, so torch and matplotlib are loaded only if they are needed.
 
-The imports below are the table of public names, each once. Type checkers read them as imports; at run time they are
-read from this file, and each is made on first use.
+The ``if TYPE_CHECKING`` block below lists every public name once. Type checkers read it as imports. At run time the
+package reads the list from this file and imports each name on first use.
 """
 
 from __future__ import annotations
@@ -17,110 +17,87 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ethbrake_marl.doors import names_behind
-from ethbrake_marl.envs import register_environments
+from ethbrake_marl.envs.registration import register_environments
 from ethbrake_marl.errors import naming_extras
 
 if TYPE_CHECKING:
     # Environments
-    from ethbrake_marl.engine import Engine as Engine
-    from ethbrake_marl.envs import (
+    from ethbrake_marl.engine.engine import Engine as Engine
+    from ethbrake_marl.envs.making import make_engine as make_engine
+    from ethbrake_marl.envs.pettingzoo import (
         EthBrakeParallelEnv as EthBrakeParallelEnv,
         env as env,
-        make_engine as make_engine,
         parallel_env as parallel_env,
         raw_env as raw_env,
     )
-    from ethbrake_marl.envs import EthBrakeVecEnv as EthBrakeVecEnv, make_sb3_vec_env as make_sb3_vec_env
-    from ethbrake_marl.envs import (
-        CostEnv as CostEnv,
-        EthBrakeEnv as EthBrakeEnv,
-        EthBrakeVectorEnv as EthBrakeVectorEnv,
-    )
+    from ethbrake_marl.envs.sb3 import EthBrakeVecEnv as EthBrakeVecEnv, make_sb3_vec_env as make_sb3_vec_env
+    from ethbrake_marl.envs.gymnasium import EthBrakeEnv as EthBrakeEnv
+    from ethbrake_marl.envs.vector import CostEnv as CostEnv, EthBrakeVectorEnv as EthBrakeVectorEnv
 
     # Scenarios, and the worlds drawn from them
-    from ethbrake_marl.scenario import (
-        Sample as Sample,
-        Scenario as Scenario,
-        list_scenarios as list_scenarios,
-        load_scenario as load_scenario,
-    )
-    from ethbrake_marl.physics import Worlds as Worlds, advance as advance, make_worlds as make_worlds
+    from ethbrake_marl.scenario.catalogue import list_scenarios as list_scenarios, load_scenario as load_scenario
+    from ethbrake_marl.scenario.sample import Sample as Sample
+    from ethbrake_marl.scenario.schema import Scenario as Scenario
+    from ethbrake_marl.scenario.tables import read_worlds as read_worlds, worlds_from_table as worlds_from_table
+    from ethbrake_marl.physics.advance import advance as advance
+    from ethbrake_marl.physics.state import Worlds as Worlds, make_worlds as make_worlds
 
     # Observations and rewards
-    from ethbrake_marl.observations import ObservationSpec as ObservationSpec, choose_observation as choose_observation
-    from ethbrake_marl.scenario import observation_for as observation_for
-    from ethbrake_marl.rewards import RewardParams as RewardParams
+    from ethbrake_marl.game.observations import (
+        ObservationSpec as ObservationSpec,
+        choose_observation as choose_observation,
+    )
+    from ethbrake_marl.game.observed import observation_for as observation_for
+    from ethbrake_marl.game.rewards import RewardParams as RewardParams
 
     # Agents, teams and policies
-    from ethbrake_marl.agents import LearnedAgent as LearnedAgent, policy_agent as policy_agent
-    from ethbrake_marl.agents import Agent as Agent, Team as Team
-    from ethbrake_marl.agents import (
-        AgentSettings as AgentSettings,
-        agent_names as agent_names,
-        make_agent as make_agent,
-    )
-    from ethbrake_marl.policies import Policy as Policy, load_policy as load_policy, load_shipped as load_shipped
+    from ethbrake_marl.agents.foreign import policy_agent as policy_agent
+    from ethbrake_marl.agents.learned import LearnedAgent as LearnedAgent
+    from ethbrake_marl.agents.protocol import Agent as Agent, Team as Team
+    from ethbrake_marl.agents.making import make_agent as make_agent
+    from ethbrake_marl.agents.registry import agent_names as agent_names
+    from ethbrake_marl.agents.settings import AgentSettings as AgentSettings
+    from ethbrake_marl.policies.bundle import load_policy as load_policy
+    from ethbrake_marl.policies.policy import Policy as Policy
+    from ethbrake_marl.policies.shipped import load_shipped as load_shipped
 
     # Shields: for any interface, and one for each
-    from ethbrake_marl.shield import shield as shield
-    from ethbrake_marl.shield import (
+    from ethbrake_marl.shield.wrappers import shield as shield
+    from ethbrake_marl.shield.reasons import ShieldReason as ShieldReason
+    from ethbrake_marl.shield.contract import ShieldMode as ShieldMode
+    from ethbrake_marl.shield.options import ShieldOptions as ShieldOptions
+    from ethbrake_marl.shield.wrappers import (
         HybridShield as HybridShield,
         ShieldedEnv as ShieldedEnv,
         ShieldedVectorEnv as ShieldedVectorEnv,
-        ShieldMode as ShieldMode,
-        ShieldOptions as ShieldOptions,
-        ShieldReason as ShieldReason,
         shielded_aec as shielded_aec,
     )
-    from ethbrake_marl.shield import ShieldedVecEnv as ShieldedVecEnv
+    from ethbrake_marl.shield.sb3 import ShieldedVecEnv as ShieldedVecEnv
 
     # Training
-    from ethbrake_marl.learning import TrainingRecipe as TrainingRecipe, load_recipe as load_recipe
-    from ethbrake_marl.learning import TrainResult as TrainResult, resume as resume, train as train
-    from ethbrake_marl.errors import Progress as Progress
+    from ethbrake_marl.training.recipe import TrainingRecipe as TrainingRecipe, load_recipe as load_recipe
+    from ethbrake_marl.training.session import TrainResult as TrainResult, resume as resume, train as train
+    from ethbrake_marl.progress import Progress as Progress
 
     # Evaluation
-    from ethbrake_marl.evaluation import (
-        EpisodeRecord as EpisodeRecord,
-        Evaluation as Evaluation,
-        Outcome as Outcome,
-        SummaryRow as SummaryRow,
-        SummaryTable as SummaryTable,
-        evaluate as evaluate,
-        record_episode as record_episode,
-        summarise as summarise,
-    )
-    from ethbrake_marl.evaluation import compare_results as compare_results, read_result as read_result
-    from ethbrake_marl.evaluation import write_dataset as write_dataset
-    from ethbrake_marl.evaluation import summarise_by as summarise_by
-
-    # Somebody else's simulator
-    from ethbrake_marl.hosts import (
-        Host as Host,
-        HostCommand as HostCommand,
-        HostFailed as HostFailed,
-        HostState as HostState,
-        drive_host as drive_host,
-    )
-
-    # Figures: matplotlib's, which a notebook shows
-    from ethbrake_marl.evaluation import deceleration_curve as deceleration_curve
-    from ethbrake_marl.figures import (
-        deceleration_figure as deceleration_figure,
-        trajectories as trajectories,
-        harm_against_total_gap as harm_against_total_gap,
-        write_picture as write_picture,
-    )
+    from ethbrake_marl.evaluation.evaluation import Evaluation as Evaluation
+    from ethbrake_marl.evaluation.outcome import Outcome as Outcome
+    from ethbrake_marl.evaluation.record import EpisodeRecord as EpisodeRecord, record_episode as record_episode
+    from ethbrake_marl.evaluation.rollout import evaluate as evaluate
+    from ethbrake_marl.evaluation.summary import SummaryTable as SummaryTable, summarise as summarise
+    from ethbrake_marl.evaluation.summary_row import SummaryRow as SummaryRow
+    from ethbrake_marl.evaluation.comparison import compare_results as compare_results
+    from ethbrake_marl.evaluation.per_world import read_result as read_result
+    from ethbrake_marl.evaluation.groups import summarise_by as summarise_by
 
     # Your own parts
-    from ethbrake_marl.agents import register_agent as register_agent
-    from ethbrake_marl.evaluation import register_measure as register_measure
-    from ethbrake_marl.learning import register_algorithm as register_algorithm
-    from ethbrake_marl.harm import register_objective as register_objective
-    from ethbrake_marl.observations import register_feature as register_feature
-    from ethbrake_marl.rewards import register_term as register_term
-    from ethbrake_marl.scenario import register_scenarios as register_scenarios
-    from ethbrake_marl.scenario import register_preset as register_preset
+    from ethbrake_marl.agents.registry import register_agent as register_agent
+    from ethbrake_marl.game.measures import register_measure as register_measure
+    from ethbrake_marl.training.recipe import register_algorithm as register_algorithm
+    from ethbrake_marl.game.objectives import register_objective as register_objective
+    from ethbrake_marl.game.features import register_feature as register_feature
+    from ethbrake_marl.scenario.catalogue import register_scenarios as register_scenarios
+    from ethbrake_marl.scenario.channel import register_preset as register_preset
     from ethbrake_marl.registry import Part as Part
 
     # Errors
@@ -134,13 +111,16 @@ _NEED_TRAIN = ("EthBrakeVecEnv", "ShieldedVecEnv", "TrainResult", "make_sb3_vec_
 
 
 def _usable() -> list[str]:
-    """The public names that can be imported here; each of the others says which extra it needs when it is used."""
+    """Return the public names that can be imported with the installed packages.
+
+    Importing one of the other public names raises an error that says which optional extra it needs.
+    """
     missing = _NEED_TRAIN if find_spec("stable_baselines3") is None else ()
     return [name for name in _HOMES if name not in missing]
 
 
 def _import_public(name: str) -> Any:
-    """Import a public name from the file it lives in, once."""
+    """Import the public name ``name`` from its module, on first use (the ``__getattr__`` of the package)."""
     if name == "__all__":
         return ["__version__", *_usable()]
     if name not in _HOMES:
@@ -150,12 +130,12 @@ def _import_public(name: str) -> Any:
     register_environments()
     with naming_extras():
         value = getattr(import_module(_HOMES[name]), name)
-    value = sys.modules.get(f"{__name__}.{name}", value)  # a folder of that name, as ``shield``, is called like it
+    value = sys.modules.get(f"{__name__}.{name}", value)  # a callable folder: ``shield``
     globals()[name] = value
     return value
 
 
-if not TYPE_CHECKING:  # type checkers would take any name for a public one
+if not TYPE_CHECKING:  # a type checker that sees __getattr__ accepts any name
     __getattr__ = _import_public
 
 
@@ -163,6 +143,6 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *_usable(), "__all__"})
 
 
-# The command `ethbrake` registers them when it calls a command: Gymnasium takes longer to import than --help may take.
+# The command line registers the environments only when a command runs: importing Gymnasium would slow down --help.
 if Path(sys.argv[0] if sys.argv else "").name != "ethbrake":
     register_environments()

@@ -6,6 +6,12 @@ from typing import Any, assert_type
 import numpy as np
 
 import ethbrake_marl as eb
+from ethbrake_marl.extensions.datasets.minari import write_dataset
+from ethbrake_marl.extensions.hosts.protocol import Host, HostCommand, HostFailed, HostState, drive_host
+from ethbrake_marl.extensions.report.deceleration import deceleration_curve, deceleration_figure
+from ethbrake_marl.extensions.report.episode_figure import trajectories
+from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap
+from ethbrake_marl.extensions.report.style import write_picture
 
 
 class Cautious:
@@ -24,7 +30,7 @@ def make_cautious(argument: str | None, settings: eb.AgentSettings) -> eb.Agent:
 def register(recipe: type[eb.TrainingRecipe], algorithm: type[Any]) -> tuple[str, ...]:
     eb.register_agent("cautious", make_cautious)
     eb.register_algorithm("own", recipe, algorithm)
-    eb.register_term("smooth", lambda step: -np.abs(step.command_mps2), unit="m/s2")
+    eb.register_measure("smooth", lambda step: -np.abs(step.command_mps2), unit="m/s2", by="step")
     eb.register_feature("load", lambda worlds, i: worlds.vehicles.mass_t[:, i], unit="t", scale=10.0, low=0.0, high=6.0)
     eb.register_preset("deaf", {"preset": "nominal", "lost": 0.5})
     eb.register_objective("front", lambda harm, vehicle: harm.borne[:, 0])
@@ -81,6 +87,8 @@ def learn(folder: Path) -> eb.TrainResult:
 
 def measure(folder: Path) -> list[eb.SummaryRow]:
     scenario = eb.load_scenario(eb.list_scenarios()[0].name)
+    eb.read_worlds(scenario, "mine.csv")
+    eb.worlds_from_table(scenario, {"gap_1_m": [7.0], "gap_2_m": [7.0]})
     policies = [eb.load_policy(folder), eb.load_shipped("ppo")]
     team: eb.Team = eb.Team({1: eb.LearnedAgent(policies[0])}, "learned")
     agents = {"full_brake": eb.make_agent("full_brake"), "learned": team}
@@ -88,18 +96,18 @@ def measure(folder: Path) -> list[eb.SummaryRow]:
     outcome: eb.Outcome = found.outcome("learned")
     record: eb.EpisodeRecord = eb.record_episode(found.worlds.take([0]), Cautious(), scenario=scenario)
     assert record.ledger.world_harm("first").shape == outcome.first_impact_harm[:1].shape
-    eb.write_dataset(folder / "brakes.parquet", agents, scenario=scenario, episodes=10, format="parquet")
+    write_dataset(folder / "brakes.parquet", agents, scenario=scenario, episodes=10, format="parquet")
     return eb.summarise(found)
 
 
 def show(found: eb.Evaluation, folder: Path) -> list[Any]:
     record = eb.record_episode(found.worlds.take([0]), Cautious(), scenario=found.scenario)
-    eb.write_picture(folder / "episode.svg", eb.trajectories({"world 0": record}))
+    write_picture(folder / "episode.svg", trajectories({"world 0": record}))
     eb.compare_results(eb.read_result(folder / "a.json"), eb.read_result(folder / "b.json"))
-    curve = eb.deceleration_curve(found.worlds.take([0]), found.task)
+    curve = deceleration_curve(found.worlds.take([0]), found.task)
     assert_type(eb.summarise(found), eb.SummaryTable)
     assert_type(eb.summarise_by(found, "scenario"), dict[str, eb.SummaryTable])
-    figures = [eb.deceleration_figure(curve), eb.harm_against_total_gap(found)]
+    figures = [deceleration_figure(curve), harm_against_total_gap(found)]
     return [found.to_frame(), *figures]
 
 
@@ -111,18 +119,18 @@ class Still:
     def __init__(self, worlds: eb.Worlds) -> None:
         self.worlds, self.time_s = worlds, 0.0
 
-    def state(self) -> eb.HostState:
-        return eb.HostState(self.time_s, self.worlds.gaps_m, self.worlds.speeds_mps)
+    def state(self) -> HostState:
+        return HostState(self.time_s, self.worlds.gaps_m, self.worlds.speeds_mps)
 
-    def apply(self, command: eb.HostCommand) -> None:
+    def apply(self, command: HostCommand) -> None:
         self.time_s += float(command.acceleration_mps2.max())
 
 
 def bench(worlds: eb.Worlds) -> eb.Outcome:
-    host: eb.Host = Still(worlds)
+    host: Host = Still(worlds)
     try:
-        return eb.drive_host(host, Cautious(), "paper-random", worlds).outcome
-    except eb.HostFailed as failed:
+        return drive_host(host, Cautious(), "paper-random", worlds).outcome
+    except HostFailed as failed:
         raise SystemExit(str(failed.ledger)) from None
 
 

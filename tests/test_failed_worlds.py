@@ -5,14 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
-from ethbrake_marl.engine import FailedWorld
-from ethbrake_marl.envs.interfaces import make_engine
+from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.engine.profiles import profile_problem
+from ethbrake_marl.engine.stream import FailedWorld
+from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.errors import PhysicsError
-from ethbrake_marl.physics import advance, forecast, leaving_out_failed
-from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.search import profile_problem
-from ethbrake_marl.shield.step_shield import Backup, StepShield, begin_running, certify
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.forecast import forecast
+from ethbrake_marl.physics.left_out import leaving_out_failed
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.certify import Backup, certify
+from ethbrake_marl.shield.running import begin_running
+from ethbrake_marl.shield.step import StepShield
 from tests.failing_worlds import plant, planted_list, without
 
 PAPER = load_scenario("paper-random")

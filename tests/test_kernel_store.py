@@ -20,8 +20,8 @@ import pytest
 import ethbrake_marl
 from ethbrake_marl import kernel_store
 from ethbrake_marl.kernel_store import cache_folder
-from ethbrake_marl.physics import compiling as compiled
-from ethbrake_marl.physics.compiling import digest_of_sources, keep_kernel, kernel_sources, load_kernel
+from ethbrake_marl.physics import jit
+from ethbrake_marl.physics.jit import digest_of_sources, keep_kernel, kernel_sources, load_kernel
 
 needs_compiler = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="compilation is switched off")
 PACKAGE = Path(ethbrake_marl.__file__).parent
@@ -36,7 +36,7 @@ def _own_folder(monkeypatch, tmp_path):
 
 
 def forget() -> None:
-    for remembered in (cache_folder, digest_of_sources, compiled._imports):
+    for remembered in (cache_folder, digest_of_sources, jit._imports):
         remembered.cache_clear()
 
 
@@ -115,13 +115,13 @@ def test_load_kernel__of_another_users_file_is_nothing(monkeypatch, user, loaded
         found[4] = user
         return os.stat_result(found)
 
-    monkeypatch.setattr(compiled.os, "fstat", owned)
-    monkeypatch.setattr(compiled.os, "getuid", lambda: 1001)
+    monkeypatch.setattr(jit.os, "fstat", owned)
+    monkeypatch.setattr(jit.os, "getuid", lambda: 1001)
     assert (load_kernel("one-1") is not None) == loaded
 
 
 def test_keep_kernel__on_a_full_disk_costs_a_warning(monkeypatch):
-    monkeypatch.setattr(compiled.os, "replace", Mock(side_effect=OSError("No space left on device")))
+    monkeypatch.setattr(jit.os, "replace", Mock(side_effect=OSError("No space left on device")))
     with pytest.warns(UserWarning, match="could not be kept: No space left"):
         keep_kernel("one-1", b"machine code")
     assert list(cache_folder().iterdir()) == []
@@ -134,7 +134,7 @@ def test_keep_kernel__on_a_full_disk_costs_a_warning(monkeypatch):
 def copied(monkeypatch, tmp_path) -> Path:
     package = tmp_path / "copied" / "ethbrake_marl"
     shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
-    monkeypatch.setattr(compiled, "_PACKAGE", package)
+    monkeypatch.setattr(jit, "_PACKAGE", package)
     return package
 
 
@@ -146,17 +146,17 @@ def digest_in(package: Path, name: str) -> str:
 @pytest.mark.parametrize(
     ("kernel", "edited", "moves"),
     [
-        ("physics/batch.py", "physics/batch.py", True),  # its own file
-        ("physics/batch.py", "physics/kernel.py", True),  # what it calls
-        ("shield/step_shield.py", "physics/kernel.py", True),  # through several files
-        ("search.py", "errors.py", False),  # a file without kernels or constants
-        ("physics/batch.py", "search.py", False),  # kernels that it does not call
-        ("physics/kernel.py", "physics/batch.py", False),  # its callers
-        ("physics/batch.py", "physics/worlds.py", False),  # types
+        ("physics/advance.py", "physics/advance.py", True),  # its own file
+        ("physics/advance.py", "physics/impact.py", True),  # what it calls
+        ("shield/members.py", "physics/impact.py", True),  # through several files
+        ("shield/options.py", "errors.py", False),  # a file without kernels or constants
+        ("physics/advance.py", "shield/options.py", False),  # kernels that it does not call
+        ("physics/impact.py", "physics/advance.py", False),  # its callers
+        ("physics/advance.py", "physics/state.py", False),  # types
     ],
 )
 def test_digest_of_sources__changes_with_what_its_kernels_are_made_of(copied, monkeypatch, kernel, edited, moves):
-    monkeypatch.setattr(compiled, "_IMPORTED_S", float("inf"))
+    monkeypatch.setattr(jit, "_IMPORTED_S", float("inf"))
     before = digest_in(copied, kernel)
     assert digest_in(copied, kernel) == before and len(before) == 64
     source = copied / edited
@@ -166,20 +166,20 @@ def test_digest_of_sources__changes_with_what_its_kernels_are_made_of(copied, mo
 
 def test_digest_of_sources__is_not_known_of_code_in_no_file_edited_since_or_from_the_future_which_is_told(copied):
     assert digest_of_sources(Path("<stdin>")) == ""
-    assert digest_in(copied, "physics/batch.py")
+    assert digest_in(copied, "physics/advance.py")
     now = time.time()
-    for date in ((compiled._IMPORTED_S + now) / 2, now + 3600.0):
-        os.utime(copied / "physics" / "kernel.py", (date, date))
+    for date in ((jit._IMPORTED_S + now) / 2, now + 3600.0):
+        os.utime(copied / "physics" / "impact.py", (date, date))
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
-            assert digest_in(copied, "physics/batch.py") == ""
+            assert digest_in(copied, "physics/advance.py") == ""
         expected = [f"{copied}: dates of files lie in the future"] * (date > now)
         assert [str(each.message)[: len(expected[0])] for each in told] == expected
 
 
 def kernel_files(package: Path) -> list[Path]:
     found = [source for source in sorted(package.rglob("*.py")) if "@compiled" in source.read_text("utf-8")]
-    return [source for source in found if source.name != "compiled.py"]
+    return [source for source in found if source.name != "jit.py"]
 
 
 @needs_compiler
@@ -201,16 +201,16 @@ def test_kernel_sources__are_found_behind_front_doors(copied):
     """A folder offers names of several files; only the files of the names that are taken count."""
     (copied / "physics" / "__init__.py").write_text(
         "if TYPE_CHECKING:\n"
-        "    from ethbrake_marl.physics.kernel import pool as pool\n"
-        "    from ethbrake_marl.physics.batch import (\n        advance as advance,\n    )\n"
-        "    from ethbrake_marl.physics.worlds import Worlds as Worlds\n"
+        "    from ethbrake_marl.physics.impact import pool as pool\n"
+        "    from ethbrake_marl.physics.advance import (\n        advance as advance,\n    )\n"
+        "    from ethbrake_marl.physics.state import Worlds as Worlds\n"
     )
     kernel = copied / "kernel_of_mine.py"
     kernel.write_text("from ethbrake_marl.physics import Worlds, pool\n\n@compiled\ndef mine(): ...\n")
     forget()
     found = {source.relative_to(copied).as_posix() for source in kernel_sources(kernel)}
-    assert {"kernel_of_mine.py", "physics/kernel.py"} <= found
-    assert not {"physics/batch.py", "physics/worlds.py", "physics/__init__.py"} & found
+    assert {"kernel_of_mine.py", "physics/impact.py"} <= found
+    assert not {"physics/advance.py", "physics/state.py", "physics/__init__.py"} & found
 
 
 # ---------------------------------------------------------------- processes
@@ -220,7 +220,8 @@ import os, time
 import numpy as np
 from pathlib import Path
 from numba.core import event
-from ethbrake_marl.physics.kernel import ROW, pool
+from ethbrake_marl.physics.impact import pool
+from ethbrake_marl.physics.rows import ROW
 
 class Count(event.Listener):
     names = []
@@ -301,7 +302,7 @@ def test_kernels__of_a_moved_package_are_at_hand_and_one_damaged_or_an_edited_ca
     for file in cache_folder().iterdir():
         file.write_bytes(file.read_bytes()[:-1])
     assert run(copied) == COMPILED
-    with (copied / "physics" / "kernel.py").open("a") as file:
+    with (copied / "physics" / "impact.py").open("a") as file:
         file.write("# a change\n")
     assert run(copied) == COMPILED
     assert run(PACKAGE) == SAME
@@ -320,7 +321,7 @@ def test_kernels__without_a_folder_to_write_to_are_compiled_in_each_process(monk
 
 INNER = """
 import sys
-from ethbrake_marl.physics.compiling import compiled
+from ethbrake_marl.physics.jit import compiled
 
 @compiled(apart=True)
 def checked(x):
@@ -359,13 +360,13 @@ def test_kernels__raise_and_print_inside_of_what_they_call_also_when_they_were_l
 def test_kernels__are_compiled_once_for_all_numbers_or_as_numba_does_where_it_is_not_known(
     monkeypatch, known, linked, overloads
 ):
-    monkeypatch.setattr(compiled, "_KNOWN", compiled._KNOWN and known)
+    monkeypatch.setattr(jit, "_KNOWN", jit._KNOWN and known)
 
-    @compiled.compiled(apart=True)
+    @jit.compiled(apart=True)
     def twice(k: int) -> int:
         return 2 * k
 
-    @compiled.compiled(apart=True)
+    @jit.compiled(apart=True)
     def outer(k: int) -> int:
         return twice(k) if not known else twice(1) + twice(2) + twice(k)
 

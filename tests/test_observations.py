@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl import observations
 from ethbrake_marl.errors import PhysicsError
-from ethbrake_marl.observations import FORECAST_S, GROUPS, ObservationSpec, choose_observation, observe
+from ethbrake_marl.game import observations
+from ethbrake_marl.game.contact_features import FORECAST_S
+from ethbrake_marl.game.features import GROUPS
+from ethbrake_marl.game.observations import ObservationSpec, choose_observation, observe
 from tests.fixtures.policies import make_policy
 from tests.physics.random_worlds import line
 
@@ -129,7 +131,7 @@ def test_contact__failed_forecast_names_its_world(monkeypatch):
     def fail(*arguments):
         arguments[-1][1] = True
 
-    monkeypatch.setattr(observations, "_observe_contacts", fail)
+    monkeypatch.setattr(observations, "observe_contacts", fail)
     worlds = SCENARIO.sample(3, 1).worlds
     with pytest.raises(PhysicsError, match="world 1: a forecast of contacts could not look 10 s ahead"):
         observe(worlds, 1, CONTACT)

@@ -19,9 +19,13 @@ from numpy.typing import NDArray
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
-from ethbrake_marl.learning.training import PpoRecipe, RunDirectory, Training, load_recipe
-from ethbrake_marl.policies import NetworkSpec, Policy
-from ethbrake_marl.scenario import observation_for
+from ethbrake_marl.game.observed import observation_for
+from ethbrake_marl.policies.network_spec import NetworkSpec
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.training.recipe import load_recipe
+from ethbrake_marl.training.recipes import PpoRecipe
+from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.training import Training
 
 
 def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> None:
@@ -41,7 +45,7 @@ def train_mappo(recipe: PpoRecipe, scenario: eb.Scenario, directory: Path, algor
     learning rate stays at its start, as BenchMARL has no schedule; there are no checkpoints and nothing is measured on
     the way.
     """
-    from ethbrake_marl.learning.runs import own_random_state
+    from ethbrake_marl.training.random_state import own_random_state
 
     recipe = recipe.replace(scheme="centralised")
     if recipe.observation is not None:
@@ -65,7 +69,7 @@ def make_experiment(recipe: PpoRecipe, scenario: eb.Scenario, scratch: str, algo
     from benchmarl.experiment import Experiment, ExperimentConfig
     from benchmarl.models.mlp import MlpConfig
 
-    from ethbrake_marl.learning.benchmarl import LineTask
+    from ethbrake_marl.extensions.benchmarl.task import LineTask
 
     learners = len(scenario.learners)
     config = ExperimentConfig.get_from_yaml()

@@ -1,6 +1,6 @@
 """Behaviour cloning: a network that does what an agent did, learnt from a dataset alone. Read it from top to bottom.
 
-    eb.write_dataset("runs/ppo.parquet", "ppo@shipped", scenario="paper-random", episodes=10_000, seed=1)  # in Python
+    write_dataset("runs/ppo.parquet", "ppo@shipped", scenario="paper-random", episodes=10_000, seed=1)  # in Python
     python train/clone.py runs/ppo.parquet --output runs/clone
     ethbrake evaluate --agents full_brake,ppo@shipped,train/clone.py:make_agent:runs/clone,best_harm --episodes 2000
 
@@ -25,7 +25,8 @@ from torch import Tensor, nn
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.files.store import new_folder
-from ethbrake_marl.policies import NetworkSpec, Policy
+from ethbrake_marl.policies.network_spec import NetworkSpec
+from ethbrake_marl.policies.policy import Policy
 
 HIDDEN = (128, 128)
 EPOCHS, BATCH, LEARNING_RATE = 20, 512, 1e-3
@@ -34,11 +35,11 @@ EPOCHS, BATCH, LEARNING_RATE = 20, 512, 1e-3
 
 
 def read_dataset(path: Path) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Observations [k, F], actions [k, 1] and the metadata of a Parquet file of `eb.write_dataset`."""
+    """Observations [k, F], actions [k, 1] and the metadata of a Parquet file of `write_dataset`."""
     try:
         told = json.loads(pyarrow.parquet.read_metadata(path).metadata[b"ethbrake_marl"])
     except (KeyError, TypeError, pyarrow.ArrowInvalid):
-        raise InvalidInput(f"{path}: is no dataset of `eb.write_dataset`") from None
+        raise InvalidInput(f"{path}: is no dataset of `write_dataset`") from None
     if len(told["learners"]) != 1:
         raise InvalidInput(f"{path}: holds {len(told['learners'])} learners, one is needed")
     number = told["learners"][0].removeprefix("vehicle_")
@@ -123,7 +124,7 @@ def make_agent(argument: str | None, settings: eb.AgentSettings) -> eb.Agent:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("dataset", type=Path, help="a Parquet file of `eb.write_dataset`")
+    parser.add_argument("dataset", type=Path, help="a Parquet file of `write_dataset`")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("runs/clone"), help="new folder")
     given = parser.parse_args()

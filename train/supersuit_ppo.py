@@ -24,10 +24,11 @@ from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.files.store import new_folder
-from ethbrake_marl.learning.algorithms import tensors_of
-from ethbrake_marl.learning.training import Training
-from ethbrake_marl.policies import NetworkSpec, Policy
-from ethbrake_marl.rewards import reward_params
+from ethbrake_marl.game.rewards import reward_params
+from ethbrake_marl.policies.network_spec import NetworkSpec
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.training.networks import tensors_of
+from ethbrake_marl.training.training import Training
 
 # 1. What to train: the same settings as train/ppo.yaml, in smaller networks.
 

@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 from markupsafe import Markup
 
-from ethbrake_marl.agents import make_agent
-from ethbrake_marl.evaluation import EpisodeMotion
-from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.pages.page import Part, Played, read_file
-from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.evaluation.motion import EpisodeMotion
+from ethbrake_marl.extensions.report.page import Part, read_file
+from ethbrake_marl.extensions.report.player import Played
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.scenario.catalogue import load_scenario
 
 SEED = 7
 WORLDS = (0, 1, 3, 5)  # the same lines of vehicles in each test

@@ -9,18 +9,22 @@ from pathlib import Path
 from typing import Any
 
 from ethbrake_marl import ethbrake_v0
-from ethbrake_marl.agents.registry import Source, agent_entries
-from ethbrake_marl.cli.app import whole_command
-from ethbrake_marl.evaluation.measures import measures
-from ethbrake_marl.harm import OBJECTIVES
-from ethbrake_marl.learning import TrainingRecipe
-from ethbrake_marl.learning.training import MEANINGS
-from ethbrake_marl.observations import Feature, ObservationSpec, choose_observation
-from ethbrake_marl.policies import load_shipped, shipped_policies
-from ethbrake_marl.rewards import REWARDS, TERMS, RewardParams
-from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario, scenario_json_schema, state_features
-from ethbrake_marl.scenario.sampling import QUANTITY
-from ethbrake_marl.scenario.v2x import CHANNELS, V2X
+from ethbrake_marl.agents.protocol import Source
+from ethbrake_marl.agents.registry import agent_entries
+from ethbrake_marl.cli.app import Installed, whole_command
+from ethbrake_marl.evaluation.measure_sets import measures
+from ethbrake_marl.game.features import Feature
+from ethbrake_marl.game.full_state import state_features
+from ethbrake_marl.game.measures import BUILT_IN
+from ethbrake_marl.game.objectives import OBJECTIVES
+from ethbrake_marl.game.observations import ObservationSpec, choose_observation
+from ethbrake_marl.game.rewards import REWARDS, RewardParams
+from ethbrake_marl.policies.shipped import load_shipped, shipped_policies
+from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
+from ethbrake_marl.scenario.channel import CHANNELS, V2X
+from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.schema import Scenario, scenario_json_schema
+from ethbrake_marl.training.recipe import TrainingRecipe
 
 CARDS = Path(__file__).resolve().parents[2] / "ethbrake_marl" / "_policies"
 ON_EVERY_COMMAND = ("--help",)
@@ -62,6 +66,7 @@ def command_line() -> str:
 def _commands(group: Any, context: Any, level: int) -> Iterator[str]:
     for name in group.list_commands(context):
         command = group.commands[name]
+        command = command.command() if isinstance(command, Installed) else command
         inside = command.context_class(command, info_name=name, parent=context)
         path = inside.command_path.removeprefix("ethbrake ")
         yield f"{'#' * level} {path}\n"
@@ -167,10 +172,22 @@ def recipe_keys() -> str:
             each = parts[title]["properties"][key]
             default = f"`{each['default']}`" if each.get("default") else ""
             default = "required" if key in parts[title]["required"] else default
-            rows.append((f"`{key}`", MEANINGS.get(key, ""), _range(each, schema), default))
+            rows.append((f"`{key}`", each.get("description", ""), _range(each, schema), default))
         tables[title] = table(("key", "meaning", "range", "default"), rows)
-    inside = [(f"`{key}`", text) for key, text in MEANINGS.items() if "." in key]
-    return sections(**tables, Inside_others=table(("key", "meaning"), inside))
+    inside: dict[str, list[str]] = {}  # key of a mapping inside a recipe -> its meanings, by algorithm
+    for part in parts.values():
+        for outer, each in part["properties"].items():
+            for key, inner in _inside(each, schema).items():
+                told = inside.setdefault(f"`{outer}.{key}`", [])
+                told += [inner["description"]] if inner.get("description", "") not in ("", *told) else []
+    rows = [(key, "; or ".join(texts)) for key, texts in inside.items() if texts]
+    return sections(**tables, Inside_others=table(("key", "meaning"), rows))
+
+
+def _inside(value: Mapping[str, Any], schema: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Properties of the mapping that a key holds; none where it holds another kind of value, or a reward."""
+    name = str(value.get("$ref", "")).rpartition("/")[2]
+    return {} if name == "RewardParams" else schema["$defs"].get(name, {}).get("properties", {})
 
 
 # What an environment shows.
@@ -222,7 +239,7 @@ def features() -> str:
 def rewards() -> str:
     """Terms, the named rewards, and objectives."""
     settings = {name: params.model_dump() for name, params in REWARDS.items()}
-    told = dict.fromkeys(TERMS, "weight of the term")
+    told = dict.fromkeys(BUILT_IN, "weight of the term")
     arguments = (inspect.getdoc(RewardParams) or "").partition("Args:\n")[2].partition("\n\n")[0].replace("``", "`")
     told |= dict(re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)\.$", arguments, re.MULTILINE))
     rows = [
@@ -231,7 +248,7 @@ def rewards() -> str:
         if field != "terms"
     ]
     return sections(
-        Terms=table(("term", "unit", "meaning"), [(f"`{t.name}`", t.unit, t.meaning) for t in TERMS.values()]),
+        Terms=table(("term", "unit", "meaning"), [(f"`{t.name}`", t.unit, t.meaning) for t in BUILT_IN.values()]),
         Named_rewards=table(("setting", "meaning", *(f"`{name}`" for name in settings)), rows),
         Objectives=table(("objective", "counts"), [(f"`{kind.form}`", kind.about) for kind in OBJECTIVES.values()]),
     )

@@ -19,25 +19,24 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents import split_specs
+from ethbrake_marl.agents.spec import split_specs
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation import load_runnable, make_agents, result_identity
-from ethbrake_marl.evaluation.measures import Between
+from ethbrake_marl.evaluation.identity import result_identity
+from ethbrake_marl.evaluation.lineup import make_agents
+from ethbrake_marl.evaluation.trial import load_runnable
+from ethbrake_marl.extensions.search.best_harm import fold_episodes, search_list, task_problem
+from ethbrake_marl.extensions.search.limits import Unproven, prove, unproven_because
+from ethbrake_marl.extensions.search.regret import Between
+from ethbrake_marl.extensions.search.shipped import shipped_tables
+from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.files.store import check_target
-from ethbrake_marl.harm import HARM_COUNTS
-from ethbrake_marl.learning import read_settings
-from ethbrake_marl.limits import (
-    BestHarmTable,
-    Unproven,
-    prove,
-    search_list,
-    shipped_tables,
-    task_problem,
-    unproven_because,
-)
-from ethbrake_marl.physics import Ints, Worlds, leaving_out_failed
-from ethbrake_marl.scenario import Task, load_scenario
+from ethbrake_marl.game.harm import HARM_COUNTS
+from ethbrake_marl.physics.left_out import leaving_out_failed
+from ethbrake_marl.physics.state import Ints, Worlds
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.training.settings import read_settings
 
 
 def main(words: list[str]) -> None:
@@ -96,7 +95,7 @@ def search(given: argparse.Namespace, command: str) -> tuple[BestHarmTable, dict
         known=None if given.start is None else BestHarmTable.load(given.start),
     )  # fmt: skip
     for name in lineups[counts[0]]:
-        table = table.folded(chosen, sample.worlds, name, {each: lineups[each][name] for each in counts})
+        table = fold_episodes(table, chosen, sample.worlds, name, {each: lineups[each][name] for each in counts})
     header = {**table.header, "episodes": given.episodes, "list_seed": given.seed, "command": command}
     table = replace(table, header=header)
     figures: dict[str, object] = {key: value for key, value in header.items() if key != "after"}

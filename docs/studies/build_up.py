@@ -10,9 +10,9 @@ import warnings
 import numpy as np
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import make_agent
-from ethbrake_marl.limits.lower_bound import lower_bound
-from ethbrake_marl.physics import advance
+from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
+from ethbrake_marl.physics.advance import advance
 
 WORLDS, SEARCHED, SEED = 1_000, 400, 7
 BASE = eb.load_scenario("paper-random")

@@ -17,12 +17,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation import interquartile_mean
-from ethbrake_marl.figures import GREY, Figure, finish, name_axes, new_panels, series_style, write_picture
-from ethbrake_marl.physics import Floats
+from ethbrake_marl.evaluation.seeds import interquartile_mean
+from ethbrake_marl.extensions.report.style import GREY, finish, name_axes, new_panels, series_style, write_picture
+from ethbrake_marl.physics.state import Floats
 from tests.docs.site import load
 
 METHODS = {

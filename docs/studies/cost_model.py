@@ -14,11 +14,11 @@ import tempfile
 import time
 from pathlib import Path
 
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.learning.runs import train
-from ethbrake_marl.learning.training import load_recipe
-from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.training.recipe import load_recipe
+from ethbrake_marl.training.session import train
 
 SCENARIO = "paper-random"
 UPDATES = {"ppo": 5, "counterfactual": 4, "quick": 4}  # of which the first does not count

@@ -13,12 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ethbrake_marl.figures import seed_curves, write_picture
-from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.learning import RunDirectory, TrainingRecipe, load_recipe
-from ethbrake_marl.limits.limits import best_harm
-from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.learning_curves import AXES, LearningCurves
+from ethbrake_marl.extensions.report.seed_curves import seed_curves
+from ethbrake_marl.extensions.report.style import write_picture
+from ethbrake_marl.extensions.reproduction.learning_curves import AXES, LearningCurves
+from ethbrake_marl.extensions.search.best_harm import best_harm
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.training.run_folder import RunDirectory
 
 TESTS: dict[str, HarmCount] = {
     "paper-random": "first",

@@ -15,13 +15,15 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ethbrake_marl.agents.registry import Driver
-from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.evaluation.measures import Outcome
+from ethbrake_marl.agents.protocol import Driver
+from ethbrake_marl.evaluation.lineup import make_lineup
+from ethbrake_marl.evaluation.outcome import Outcome
+from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import paired_difference
-from ethbrake_marl.scenario import Sample, Scenario, load_scenario
-from ethbrake_marl.studies.machine import this_machine
+from ethbrake_marl.extensions.studies.machine import this_machine
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.schema import Scenario
 
 AGENTS = (
     "ppo@shipped+search", "ppo@shipped", "universal@shipped", "full_brake+search", "e_v2x_bm",

@@ -11,10 +11,10 @@ import json
 import sys
 from pathlib import Path
 
-from ethbrake_marl.errors import Progress
-from ethbrake_marl.evaluation import load_runnable
-from ethbrake_marl.learning import read_settings
-from ethbrake_marl.studies.learning_curves import AXES, LearningCurves
+from ethbrake_marl.evaluation.trial import load_runnable
+from ethbrake_marl.extensions.reproduction.learning_curves import AXES, LearningCurves
+from ethbrake_marl.progress import Progress
+from ethbrake_marl.training.settings import read_settings
 
 
 def main(words: list[str]) -> int:

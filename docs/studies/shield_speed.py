@@ -11,27 +11,29 @@ import time
 
 import numpy as np
 
-from ethbrake_marl.agents.registry import episode_engine
-from ethbrake_marl.evaluation.inputs import make_agents
-from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.shield import ShieldedDriver
-from ethbrake_marl.shield.step_shield import StepShield, certify
-from ethbrake_marl.shield.uncertainty import parse_uncertainty
+from ethbrake_marl.agents.driving import episode_engine
+from ethbrake_marl.evaluation.lineup import make_agents
+from ethbrake_marl.extensions.certified.robust_step import RobustShield
+from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.shield.certify import certify
+from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shield.step import StepShield
 
 SCENARIO = load_scenario("paper-random")
 
 
 def batch_rate(intervals: str | None, n: int) -> tuple[float, int]:
     """Decisions per second of a batch under random proposals, and the members of each world."""
-    shield = StepShield(SCENARIO, 1, uncertainty=None if intervals is None else parse_uncertainty(intervals))
+    shield = RobustShield(SCENARIO, 1, uncertainty=None if intervals is None else parse_uncertainty(intervals))
     shield.begin(SCENARIO.sample(n, 3).worlds, np.arange(n))
     rng = np.random.default_rng(0)
     shield.decide(rng.uniform(-1.0, 1.0, n))
     done, begun = 0, time.process_time()
-    while not shield.running.finished.all():
-        done += int((~shield.running.finished).sum())
+    while not shield.memory.running.finished.all():
+        done += int((~shield.memory.running.finished).sum())
         shield.decide(rng.uniform(-1.0, 1.0, n))
-    return done / (time.process_time() - begun), shield.running.members
+    return done / (time.process_time() - begun), shield.memory.running.members
 
 
 def single_times(decisions: int) -> list[float]:
@@ -40,12 +42,12 @@ def single_times(decisions: int) -> list[float]:
     while len(took) < decisions:
         shield = StepShield(SCENARIO, 1)
         shield.begin(SCENARIO.sample(1, 3, first=len(took)).worlds, np.arange(1))
-        while not shield.running.finished.all():
+        while not shield.memory.running.finished.all():
             proposed = rng.uniform(-1.0, 1.0, 1)
             begun = time.perf_counter()
-            decision = certify(shield.running, proposed, shield.backup, shield.bound)
+            decision = certify(shield.memory.running, proposed, shield.memory.backup, shield.bound)
             took.append(time.perf_counter() - begun)
-            shield.running, shield.backup = decision.after, decision.backup
+            shield.memory = shield.memory._replace(running=decision.after, backup=decision.backup)
     return took
 
 

@@ -22,13 +22,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import optimise_coupled, optimise_pairwise
-from ethbrake_marl.envs import make_engine, parallel_env
+from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
+from ethbrake_marl.envs.making import make_engine
+from ethbrake_marl.envs.pettingzoo import parallel_env
+from ethbrake_marl.extensions.studies.machine import this_machine
 from ethbrake_marl.files.sheet import Column, Sheet
-from ethbrake_marl.harm import empty_ledger
-from ethbrake_marl.physics import Floats, Worlds, advance, compiled, forecast
-from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.machine import this_machine
+from ethbrake_marl.game.harm import empty_ledger
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.forecast import forecast
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Floats, Worlds
+from ethbrake_marl.scenario.catalogue import load_scenario
 
 SCENARIO = "paper-random"
 SEED = 7

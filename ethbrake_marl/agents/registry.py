@@ -1,616 +1,209 @@
-"""Agents: what one is and what it knows, the list of them by name, and the loop that lets them drive episodes.
+"""Registries of agents, of the shields and searches around them, of their variants, and of groups of agents.
 
-Names are those of entry points (``ethbrake_marl.registry``), which are loaded when they are first used: so policies,
-searches and shields, which stand above this folder, have names without being imported here.
+Names are entry points (``pyproject.toml``), loaded when they are first used (``ethbrake_marl.registry``). So policies,
+searches and shields, which belong to layers above this folder, have names without being imported here.
 """
 
 from __future__ import annotations
 
-import inspect
-import os
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
-from difflib import get_close_matches
-from enum import StrEnum
-from pathlib import Path
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
-import numpy as np
-
-from ethbrake_marl.engine import Engine, Guard, Memory, Script, ask_script, begin_script, is_state_free
-from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, PhysicsError, describe_error, unknown_name
-from ethbrake_marl.files.python_file import load_from_file
-from ethbrake_marl.harm import HarmCount, Ledger, check_harm_count
-from ethbrake_marl.physics import Bools, Floats, Worlds
+from ethbrake_marl.agents.protocol import Driver, Source
+from ethbrake_marl.agents.settings import AgentSettings, Factory, Variant, Wrapper
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.registry import Registry
-from ethbrake_marl.scenario import Scenario, ScriptSpec, load_scenario
-
-# The vocabulary in which every agent states what it knows of the line while it drives.
-#
-# An agent says it with an attribute ``knows``: one ``Source``, its name, or several where parts of it know different
-# things (a shield around a policy). A channel (``v2x``) hides things from the first three sources only.
-
-
-class Source(StrEnum):
-    """Where knowledge comes from, least first; each has what stands before it as well."""
-
-    SENSORS = "own sensors"  # its own vehicle, and the neighbours that its sensors see
-    MESSAGES = "messages"  # the messages that have reached it
-    BELIEFS = "believed model"  # also what the scenario says of all lines: ranges, scripts, physics; nothing hidden
-    STATE = "true state"  # the others' states, capacities and latencies as they are, received or not
-    MODEL = "true model"  # also masses, restitution, every script: enough to roll the line forward in the same physics
-    UNSTATED = "not stated"  # of an agent that does not say
-
-
-class Knowledge(tuple[Source, ...]):
-    """Sources in the order of the vocabulary, each once."""
-
-    @classmethod
-    def of(cls, *agents: object, also: Source | None = None) -> Knowledge:
-        """What agents or teams say they know between them, and what a wrapper around them knows ``also``.
-
-        ``UNSTATED`` of one that says nothing. Raises ``InvalidInput`` for a word that is not in the vocabulary.
-        """
-        known = set() if also is None else {also}
-        for agent in agents:
-            stated = getattr(agent, "knows", None)
-            words = (Source.UNSTATED,) if stated is None else (stated,) if isinstance(stated, str) else stated
-            try:
-                known |= {Source(word) for word in words}
-            except (TypeError, ValueError):
-                name = getattr(agent, "name", type(agent).__name__)
-                right = ", ".join(repr(source.value) for source in Source)
-                raise InvalidInput(
-                    f"agent {name!r}: knows = {stated!r:.200}: must be one or several of {right}"
-                ) from None
-        return cls(source for source in Source if source in known)
-
-    @property
-    def text(self) -> str:
-        """``messages + true model``; a dash for nothing, which is what a team of nobody knows."""
-        return " + ".join(self) or "–"
-
-    @property
-    def sees_through(self) -> bool:
-        """Whether it reads of the line what no channel brought."""
-        return Source.STATE in self or Source.MODEL in self
-
-
-@runtime_checkable
-class Agent(Script, Protocol):
-    """A ``Script`` with a name: it drives one vehicle in every world of a batch of ``n``.
-
-    It says with ``knows`` what it knows of the line (``agents.registry.Source``); without it tables say "not stated".
-    One that remembers nothing has ``act(worlds, vehicle)`` alone:
-
-    >>> import ethbrake_marl as eb
-    >>> class HalfBrake:
-    ...     name = "half_brake"
-    ...     def act(self, worlds, vehicle):
-    ...         return -0.5 * worlds.vehicles.braking_capacity_mps2[:, vehicle]
-    >>> isinstance(HalfBrake(), eb.Agent)
-    True
-
-    What one remembers of its episodes is a value that it is given and gives back, never an attribute:
-
-    >>> class OnceHit:
-    ...     name = "once_hit"
-    ...     def begin(self, alert, vehicle, scripts):
-    ...         return alert.pair_hit.any(axis=1)
-    ...     def act(self, worlds, memory, vehicle):
-    ...         memory = memory | worlds.pair_hit.any(axis=1)
-    ...         return -1.0 * memory * worlds.vehicles.braking_capacity_mps2[:, vehicle], memory
-    >>> scenario = eb.load_scenario("paper-random")
-    >>> eb.evaluate(scenario.sample(5, 7), {"hit": OnceHit()}, scenario=scenario).worlds.n
-    5
-
-    """
-
-    name: str
-
-
-def check_agent(agent: object, where: str, *, alone: bool = True) -> None:
-    """Raise ``InvalidInput`` for what is not an agent; unless ``alone``, what drives several vehicles will do, too."""
-    if not isinstance(agent, Agent) and (alone or not isinstance(agent, Team | Shielding)):
-        missing = [what for what in ("name", "act") if not hasattr(agent, what)]
-        raise InvalidInput(
-            f"{where}: {type(agent).__name__!r} is no agent: it has no {' and no '.join(missing)};"
-            " make_agent(name) makes one, policy_agent(policy) one of a function or a model, and"
-            " LearnedAgent(load_policy(path)) one of a policy bundle"
-        )
-
-
-ADVICE = "; looking ahead needs full_brake, coast or constant:a"
-
-
-def fixed_commands(
-    scripts: Mapping[int, Script],
-    worlds: Worlds,
-    who: str,
-    *,
-    vehicle: int | None = None,
-    is_fixed: Callable[[Script], bool] = is_state_free,
-    advice: str = ADVICE,
-) -> Floats:
-    """The command of every vehicle from the alert on, [n, N] m/s2; those without an entry in ``scripts`` brake fully.
-
-    ``worlds`` are at the alert. ``who`` looks ahead and drives ``vehicle``, which is left out. Raises ``InvalidInput``
-    (first ``who``, at its end ``advice``) for a script whose command is not fixed at the alert, as ``is_fixed`` says.
-    """
-    command = -worlds.vehicles.braking_capacity_mps2
-    for i, script in scripts.items():
-        if i == vehicle:
-            continue
-        if not is_fixed(script):
-            name = getattr(script, "name", type(script).__name__)
-            raise InvalidInput(
-                f"{who}: vehicle_{i + 1} is driven by {name!r}, whose command is not fixed at the alert{advice}"
-            )
-        command[:, i], _ = ask_script(script, worlds, begin_script(script, worlds, i, scripts), i)
-    told = {i: getattr(script, "braking_pieces", ()) for i, script in scripts.items() if i != vehicle}
-    if not np.array_equal(worlds.play_pieces(told).vehicles.pieces, worlds.vehicles.pieces):
-        raise InvalidInput(
-            f"{who}: a profile: the pieces in which vehicles brake in these worlds are not those of its scripts; draw"
-            " or read the worlds with the same scenario"
-        )
-    return command
-
-
-class AgentAround:
-    """Base of agents that are put around a ``policy``, which is any agent: each says only what it does differently.
-
-    ``adds`` is what it knows beside what the policy knows. Without a memory of its own it has that of the policy.
-    """
-
-    adds: ClassVar[Source | None] = None
-
-    def __init__(self, policy: Agent, name: str | None = None) -> None:
-        self.policy = policy
-        self.name = policy.name if name is None else name
-
-    @property
-    def knows(self) -> Knowledge:
-        """What the policy knows, and what this adds."""
-        return Knowledge.of(self.policy, also=self.adds)
-
-    @property
-    def time_step_s(self) -> float | None:
-        """The policy's, s; None: it goes by any."""
-        return getattr(self.policy, "time_step_s", None)
-
-    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """As the policy."""
-        return begin_script(self.policy, alert, vehicle, scripts)
-
-    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """As the policy, [n] m/s2."""
-        return ask_script(self.policy, worlds, memory, vehicle)
-
-
-# Teams: one agent for each of several vehicles.
-
-
-@runtime_checkable
-class Shielding(Protocol):
-    """A driver behind a shield, on no vehicle yet."""
-
-    name: str
-
-    @property
-    def knows(self) -> Knowledge:
-        """What it knows, the shield included."""
-
-    def on(self, vehicles: Collection[int]) -> Team:
-        """The team that drives these vehicles."""
-
-    def guard(self, engine: Engine, policies: Mapping[int, Agent]) -> Guard:
-        """The shield in an engine in which these vehicles learn, who proposes for them, by vehicle."""
-
-
-class Team:
-    """One agent for each driven vehicle (index, 0 = front). Each decides for its own vehicle, from what that one knows.
-
-    Behind a ``shield`` they only propose. One agent may drive several vehicles: what it remembers of each is apart.
-    Raises ``InvalidInput`` for what is not an agent, or an index that is no whole number from 0.
-
-    >>> import ethbrake_marl as eb
-    >>> team = eb.Team({1: eb.make_agent("full_brake"), 2: eb.make_agent("coast")}, "mixed")
-    >>> sorted(team.drivers)
-    [1, 2]
-
-    """
-
-    def __init__(self, drivers: Mapping[int, Agent], name: str, shield: Shielding | None = None) -> None:
-        for vehicle, agent in drivers.items():
-            if isinstance(vehicle, bool) or not isinstance(vehicle, int | np.integer) or not vehicle >= 0:
-                raise InvalidInput(f"team {name!r}: {vehicle!r}: must be the index of a vehicle, 0 or more")
-            if not isinstance(agent, Agent):
-                raise InvalidInput(f"team {name!r}: vehicle_{vehicle + 1} is driven by {agent!r}, which is no agent")
-        self.drivers = {int(vehicle): drivers[vehicle] for vehicle in sorted(drivers)}
-        self.name, self.shield = name, shield
-
-    @property
-    def knows(self) -> Knowledge:
-        """What its drivers know between them, behind its shield; nothing where nobody is driven."""
-        return Knowledge.of(*self.drivers.values(), *(() if self.shield is None else (self.shield,)))
-
-    @staticmethod
-    def of(driver: Driver, vehicles: Collection[int]) -> Team:
-        """Who drives each of the ``vehicles``, an agent alone all of them; raises ``InvalidInput`` for another team."""
-        if isinstance(driver, Shielding):
-            return driver.on(vehicles)
-        if not isinstance(driver, Team):
-            return Team(dict.fromkeys(vehicles, driver), driver.name)
-        if set(driver.drivers) != set(vehicles):
-            theirs, wanted = (
-                ", ".join(f"vehicle_{i + 1}" for i in sorted(each)) or "none" for each in (driver.drivers, vehicles)
-            )
-            raise InvalidInput(f"team {driver.name!r} drives {theirs}; the vehicles to drive are {wanted}")
-        return driver
-
-
-Driver = Team | Agent | Shielding  # an agent alone drives every learner
-
-
-# The grammar of agents: ``name[:argument][@policy]``, and behind it what is put around that agent.
-#
-# ``+search`` comes first, then one shield: ``+episode``, ``+episode:pairwise``, ``+step`` or ``+robust``, each also
-# with ``:believed`` behind it. A name may be a function of a Python file, ``my_file.py:make_agent``.
-#
-# Each of ``, + @ :`` may stand in a path, too. A path that exists wins: what stands in it separates nothing.
-
-_IN_FILE = re.compile(r":(?P<function>[A-Za-z_]\w*)(:(?P<argument>[^\s@]+))?(@(?P<policy>.+))?")
-_BEGINS_WITH_FILE = re.compile(r"[^:@]+\.py(:.*)?")
-
-
-@dataclass(frozen=True, slots=True)
-class AgentSpec:
-    """An agent as it is written, in its parts."""
-
-    name: str  # or FILE.py:FUNCTION
-    argument: str | None  # after the colon
-    policy: str | None  # after the @: a path, or "shipped"
-    around: tuple[str, ...]  # names with their arguments, innermost first
-
-    @property
-    def core(self) -> str:
-        """The agent without what is around it."""
-        argument = "" if self.argument is None else f":{self.argument}"
-        return f"{self.name}{argument}" + ("" if self.policy is None else f"@{self.policy}")
-
-    @property
-    def file(self) -> tuple[str, str] | None:
-        """The Python file and its function that makes the agent, where the name is one of those."""
-        file, _, function = self.name.rpartition(":")
-        return (file, function) if file else None
-
-    @property
-    def shield(self) -> str | None:
-        """The shield around it, if there is one."""
-        return self.around[-1] if self.around and not _around(self.around[-1]).inner else None
-
-    def __str__(self) -> str:
-        return "".join([self.core, *(f"+{each}" for each in self.around)])
-
-
-def parse_spec(spec: str) -> AgentSpec:
-    """The parts of a spec. A path may hold any character.
-
-    ``ppo@c+step`` is the folder ``c+step`` where that exists, and else the folder ``c`` behind the shield;
-    ``ppo@c/+step`` is always the latter. Raises ``InvalidInput`` for what is not written so, and for two shields or
-    another order; ``UnknownName`` for something else behind a ``+``.
-    """
-    core, around = _split_around(spec)
-    if file := _python_file(core):
-        match = _IN_FILE.fullmatch(core, len(file))
-        if match is None:
-            raise InvalidInput(
-                f"agent {spec!r}: one from a file is FILE.py:FUNCTION, FILE.py:FUNCTION:ARGUMENT or"
-                " FILE.py:FUNCTION@POLICY, for instance my_file.py:make_agent"
-            )
-        return AgentSpec(f"{file}:{match['function']}", match["argument"], match["policy"], around)
-    head, at, path = core.partition("@")
-    name, argument = ScriptSpec.parse(head if at else core)
-    if at and not path:
-        raise InvalidInput(f"agent {spec!r}: a path is needed after '@'")
-    return AgentSpec(name, argument, path if at else None, around)
-
-
-def split_names(text: str, is_one: Callable[[str], bool] = os.path.lexists) -> list[str]:
-    """The names in a list with commas between them: as many parts as possible are one name where ``is_one`` says so."""
-    parts, names = text.split(","), list[str]()
-    while parts:
-        joined = (k for k in range(len(parts), 1, -1) if is_one(",".join(parts[:k])))
-        count = next(joined, 1)
-        names.append(",".join(parts[:count]))
-        parts = parts[count:]
-    return names
-
-
-def split_specs(text: str) -> list[str]:
-    """The specs in a list with commas between them, which may stand in paths that exist."""
-    return split_names(text, _is_one_spec)
-
-
-def _is_one_spec(text: str) -> bool:
-    core, around = _strip_around(text)
-    head, _, path = core[len(_existing_file(core)) :].partition("@")
-    return "," not in "".join([head, *around]) and ("," not in path or os.path.lexists(path))
-
-
-def _existing_file(core: str) -> str:
-    """The longest Python file that exists and with which a spec begins; empty without one."""
-    ends = (match.start() for match in re.finditer(r"(?<=\.py):", core))
-    return max((core[:end] for end in ends if os.path.isfile(core[:end])), key=len, default="")
-
-
-def _python_file(core: str) -> str:
-    """The Python file with which a spec begins, whether it exists or not; empty without one."""
-    return _existing_file(core) or (core.partition(":")[0] if _BEGINS_WITH_FILE.fullmatch(core) else "")
-
-
-def _policy_path(core: str) -> str:
-    return core[len(_python_file(core)) :].partition("@")[2]
-
-
-def _strip_around(spec: str) -> tuple[str, list[str]]:
-    """What stands before all that is around it, and that; the path of an existing policy is left whole."""
-    core, around = spec, list[str]()
-    while True:
-        before, plus, last = core.rpartition("+")
-        if not (plus and last.partition(":")[0] in _SHIELDS) or os.path.lexists(_policy_path(core)):
-            return core, around
-        core, around = before, [last, *around]
-
-
-def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
-    core, around = _strip_around(spec if isinstance(spec, str) else "")
-    if not core:
-        ScriptSpec.parse(spec)  # says what is right
-    before, plus, last = core.rpartition("+")
-    if plus and _is_meant_around(before, core, last):
-        raise unknown_name("shield or search", last, around_forms())
-    for each in around:
-        if not _around(each).takes(each.partition(":")[2]):
-            raise unknown_name("shield or search", each, around_forms())
-    shields = [each for each in around if not _around(each).inner]
-    if len(shields) > 1 or any(each not in shields for each in around[1:]):
-        searches = [each for each in around_forms() if _around(each).inner]
-        raise InvalidInput(
-            f"agent {spec!r}: +{', +'.join(searches)} comes first and once, then one shield of"
-            f" +{', +'.join(shield_forms())}; for instance ppo@shipped+search+step"
-        )
-    return core, tuple(around)
-
-
-def _is_meant_around(before: str, core: str, last: str) -> bool:
-    """Whether a word behind a ``+`` that is no name of ``_SHIELDS`` is no part of an argument or path either."""
-    file = _python_file(core)
-    if ".py" in last or (file and _IN_FILE.fullmatch(core, len(file))):
-        return False  # the + is part of a file's path, or of its argument
-    if ":" not in before and "@" not in before:
-        return True
-    if "/" in last or "\\" in last:
-        return False  # the last part of a path
-    return not os.path.lexists(_policy_path(core)) and bool(get_close_matches(last.partition(":")[0], _SHIELDS))
-
-
-HORIZON_S = 8.0  # until when an agent looks ahead that knows no scenario
-
-
-@dataclass(frozen=True, slots=True)
-class AgentSettings:
-    """What an agent may need beyond its own argument.
-
-    >>> import ethbrake_marl as eb
-    >>> eb.AgentSettings("planner:64", scenario=eb.load_scenario("paper-random")).needed_scenario().name
-    'paper-random'
-
-    """
-
-    spec: str  # as it is written, with what is around it so far
-    policy: str | None = None  # what stands after the @
-    scenario: Scenario | None = None  # in which it drives, where that is known
-    harm_count: HarmCount = "first"  # which harm an optimising agent minimises
-    horizon_s: float = HORIZON_S  # until when it looks ahead
-    most_candidates: int | None = None  # of a search, whatever its argument says; None: what that says
-    uncertainty: object = None  # what a robust shield does not know, as ``shield.uncertainty`` reads it
-    time_step_s: float = 0.1  # between two decisions
-    believes: bool = False  # ``:believed`` stood behind the argument: it decides on what was received
-    role: int | None = None  # index of the vehicle whose role it is; None: a driver, whichever vehicles it drives
-
-    def needed_scenario(self) -> Scenario:
-        """The scenario, for an agent that cannot do without. Raises ``InvalidInput`` if there is none."""
-        if self.scenario is None:
-            raise InvalidInput(
-                f"agent {self.spec!r}: needs a scenario: make_agent({self.spec!r}, scenario='paper-random')"
-            )
-        return self.scenario
-
-
-Factory = Callable[[str | None, AgentSettings], Driver]
-"""Makes the agent of an argument (what stands after the colon, or None)."""
-
-Wrapper = Callable[[Any, str | None, AgentSettings], Driver]
-"""Makes the agent around an agent."""
+from ethbrake_marl.scenario.roles import ScriptSpec
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One line of the registry."""
+    """Entry of the registry: an agent, or a wrapper, which is a shield or a search that goes around an agent.
 
-    form: str  # how it is written; without ":" it takes no argument, without "@" no policy
-    about: str  # one line
-    knows: Source | Sequence[Source]  # while it drives; of what goes around an agent: what is added
-    make: Factory | Wrapper
-    inner: bool = False  # of what goes around an agent: directly, inside a shield
-    teams: bool = False  # likewise: around a team, too
+    A wrapper is written after a ``+``: ``ppo+step`` is the agent ``ppo`` inside the shield ``step``.
+    """
+
+    name: str  # plain name, without argument
+    form: str  # how it is written, as "name[:ARGUMENT][@POLICY]"; without ":" no argument, without "@" no policy
+    about: str  # description in one line
+    knows: Source | Sequence[Source]  # knowledge of the agent while it drives; for a wrapper: knowledge that it adds
+    make: Factory | Wrapper  # function that makes the agent, or makes the wrapper around an agent
+    inner: bool = False  # whether a wrapper goes directly around the agent, inside a shield
+    teams: bool = False  # whether a wrapper can go around a team too
+    needs: Mapping[str, object] = field(default_factory=dict)  # name of a required ``AgentSettings`` -> an example
+    options: type | None = None  # settings class of a shield that can also go around an environment
 
     @property
     def is_ours(self) -> bool:
-        """Whether this package makes it; of others' errors are told as such."""
-        return str(getattr(self.make, "__module__", "")).startswith("ethbrake_marl.") and self.make != make_from_file
+        """Whether this package makes the agent; an error in someone else's agent is reported with the agent's name."""
+        is_from_file = ":" in self.name
+        return str(getattr(self.make, "__module__", "")).startswith("ethbrake_marl.") and not is_from_file
+
+    @property
+    def whole_form(self) -> str:
+        """``form`` followed by each registered variant in brackets, for example ``e_v2x_bm[:pairwise][:believed]``.
+
+        A variant is a last word that selects another function to make the agent or wrapper.
+        """
+        return self.form + "".join(f"[:{variant}]" for variant in variants_of(self.name))
 
     @property
     def words(self) -> tuple[str, ...]:
-        """How what goes around an agent may be written behind the ``+``, where that is a list of words."""
-        name, *options = re.findall(r"[^\[\]+]+", self.form)
+        """Every way to write a wrapper after the ``+`` of a specification, for example ``("step", "step:believed")``.
+
+        Only for a wrapper whose ``form`` lists all arguments that it takes.
+        """
+        name, *options = re.findall(r"[^\[\]+]+", self.whole_form)
         found = [name]
         for option in options:
             found += [f"{each}{option}" for each in found]
         return tuple(found)
 
     def takes(self, argument: str) -> bool:
-        """Whether what goes around an agent takes this argument; empty for none."""
+        """Return whether a wrapper takes this argument, the text after the colon; an empty text means no argument."""
         name = self.words[0]
         return "[:ARGUMENT]" in self.form or (f"{name}:{argument}" if argument else name) in self.words
 
     def call(self, argument: str | None, settings: AgentSettings, *inside: Driver) -> Driver:
-        """What its function makes, of a wrapper around what is ``inside``."""
-        if "[:believed]" in self.form and argument is not None and f":{argument}".endswith(":believed"):
-            argument, settings = argument[: -len(":believed")] or None, replace(settings, believes=True)
+        """Make the agent or wrapper.
+
+        Args:
+            argument: text after the first colon, such as ``pairwise``; if its last word is a registered variant
+                (``pairwise:believed``), the variant's function is called. None: no argument.
+            settings: passed on to the function that makes it.
+            inside: for a wrapper, the one agent or team that it goes around.
+
+        """
         make: Any = self.make
+        before, _, last = (argument or "").rpartition(":")
+        if last in variants_of(self.name):
+            argument, make = before or None, VARIANTS[f"{self.name}.{last}"].make
         made: Driver = make(*inside, argument, settings)
         return made
 
 
-def make_agent(
-    spec: str,
-    *,
-    scenario: Scenario | str | Path | None = None,
-    harm_count: HarmCount = "first",
-    horizon_s: float | None = None,
-    most_candidates: int | None = None,
-    uncertainty: object = None,
-    time_step_s: float | None = None,
-) -> Driver:
-    """A fresh agent for one vehicle in one batch, or the team of a run.
+def around_entry(each: str) -> Entry:
+    """Return the entry of a shield or search; ``each`` is its text in a specification, such as ``episode:pairwise``.
 
-    Args:
-        spec: ``name[:argument][@policy]`` and what is put around it, for instance ``constant:3.5``, ``planner:64``,
-            ``ppo@shipped+search+step``; ``ethbrake agent list`` has all. ``my_file.py:make_agent`` runs that file,
-            which can do whatever you can: its function gets what a factory of ``register_agent`` gets, or nothing.
-        scenario: also its name or the path of its file; needed by teams, by what is put around an agent, and to find
-            the shipped policy of this scenario.
-        harm_count: which harm an optimising agent minimises, ``first`` or ``total``.
-        horizon_s: until when it looks ahead, s; None: the scenario's horizon, or 8 s.
-        most_candidates: for trying an agent out: no search of it takes more.
-        uncertainty: what a robust shield does not know, such as ``"gaps_m=0.5"``.
-        time_step_s: between two decisions of what searches or follows a law; None: the scenario's, or 0.1 s.
-
-    Raises ``UnknownName`` with a suggestion for an unknown name, ``InvalidInput`` for a bad argument, harm count or
-    horizon, and for a scenario that is missing.
-
-    >>> import ethbrake_marl as eb
-    >>> eb.make_agent("ppo@shipped+step", scenario="paper-random").name
-    'ppo@shipped+step'
-
+    In ``ppo+episode:pairwise`` this is the text after the ``+``.
     """
-    check_harm_count(harm_count)
-    scenario = None if scenario is None else load_scenario(scenario)
-    if horizon_s is None:
-        horizon_s = HORIZON_S if scenario is None else scenario.horizon_s
-    if not isinstance(horizon_s, int | float | np.number) or not 0.0 < horizon_s < float("inf"):
-        raise InvalidInput(f"horizon_s {horizon_s!r}: must be a positive number of seconds")
-    written = parse_spec(spec)
-    if written.name == _PROFILE:
-        raise InvalidInput(f"agent {spec!r}: a profile is a role of a scenario, fixed at the alert; it is no agent")
-    settings = AgentSettings(
-        written.core, written.policy, scenario, harm_count, float(horizon_s), most_candidates, uncertainty,
-        time_step_s or (0.1 if scenario is None else scenario.time_step_s),
-    )  # fmt: skip
-    return _make_driver(written, settings)
-
-
-def _make_driver(written: AgentSpec, settings: AgentSettings) -> Driver:
-    driver = _make(find_entry(written), written.argument, settings)
-    for each in written.around:
-        settings, entry = replace(settings, spec=f"{settings.spec}+{each}"), _around(each)
-        if isinstance(driver, Team) and not entry.teams:
-            raise InvalidInput(
-                f"agent {settings.spec!r}: is a team, and +{each} is for one driven vehicle, the others following"
-                " scripts (--set roles.vehicle_3=full_brake); +step goes around a team; else name one policy of the"
-                " team (ppo@RUN/policy/vehicle_2)"
-            )
-        driver = _make(entry, each.partition(":")[2] or None, settings, driver)
-    return driver
-
-
-def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None = None) -> Agent:
-    """The agent that ``vehicle`` follows as its role: the one that would drive it, made for first-impact harm.
-
-    ``most_candidates`` is as in ``make_agent``. Raises what that raises, and ``InvalidInput`` for what goes around an
-    agent, and for a team without this vehicle.
-    """
-    spec = scenario.scripts[vehicle]
-    name, _, argument = spec.partition(":")
-    written = AgentSpec(_PROFILE, argument, None, ()) if name == _PROFILE else parse_spec(spec)
-    settings = AgentSettings(
-        written.core, written.policy, scenario, horizon_s=scenario.horizon_s, most_candidates=most_candidates,
-        time_step_s=scenario.time_step_s, role=vehicle,
-    )  # fmt: skip
-    team = None if written.around else Team.of(_make_driver(written, settings), (vehicle,))
-    if team is None or team.shield is not None:
-        raise InvalidInput(
-            f"agent {spec!r}: a search or a shield goes around a driver, never around a role; let"
-            f" {scenario.vehicle_names[vehicle]} follow {written.core}, or drive it"
-        )
-    return team.drivers[vehicle]
-
-
-def find_entry(spec: AgentSpec | str) -> Entry:
-    """The registry's entry of an agent.
-
-    Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for an argument or a policy that it does not take.
-    """
-    written = parse_spec(spec) if isinstance(spec, str) else spec
-    if written.file is not None:
-        return Entry(f"{written.name}[:ARGUMENT][@POLICY]", "your own", Source.UNSTATED, make_from_file)
-    if written.name not in _AGENTS:
-        if written.name in _SEVERAL:
-            raise InvalidInput(f"agent {written.core!r}: stands for several agents in --agents; here one is needed")
-        raise _AGENTS.unknown(written.name, {*agent_names(), *_SEVERAL})
-    entry = _AGENTS[written.name]
-    if written.argument is not None and ":" not in entry.form:
-        raise InvalidInput(f"agent {written.core!r}: {written.name} takes no argument")
-    if written.policy is not None and "@" not in entry.form:
-        own = "" if entry.is_ours else "; register_agent(..., takes_policy=True) says that it does"
-        raise InvalidInput(f"agent {written.core!r}: {written.name} takes no policy{own}")
-    return entry
-
-
-def _around(each: str) -> Entry:
-    """The entry of what is written behind a ``+``."""
-    return _SHIELDS[each.partition(":")[0]]
+    return SHIELDS[each.partition(":")[0]]
 
 
 def agent_names() -> tuple[str, ...]:
-    """Names that ``make_agent`` knows, in alphabetical order."""
-    return tuple(sorted({*_AGENTS} - {_PROFILE}))
+    """Return the names that ``make_agent`` knows, in alphabetical order."""
+    return tuple(sorted({*AGENTS} - {PROFILE}))
 
 
 def agent_entries() -> tuple[Entry, ...]:
-    """All agents, and then all that can be put around one: those that can be loaded, which is done."""
-    agents = (entry for name, entry in _AGENTS.usable().items() if name != _PROFILE)
-    return (*agents, *_SHIELDS.usable().values())
+    """Return the entries of all agents, then of all shields and searches, that can be loaded.
+
+    The form and description of an entry include its variants.
+    """
+    agents = [entry for name, entry in AGENTS.usable().items() if name != PROFILE]
+    return tuple(_with_variants(entry) for entry in (*agents, *SHIELDS.usable().values()))
+
+
+def _with_variants(entry: Entry) -> Entry:
+    """Return ``entry`` with its variants added to ``form`` and ``about``, as far as they can be loaded.
+
+    A variant is a last word that selects another function: ``e_v2x_bm`` becomes ``e_v2x_bm[:believed]``, with the
+    variant's description.
+    """
+    usable = VARIANTS.usable()
+    for word in variants_of(entry.name):
+        if variant := usable.get(f"{entry.name}.{word}"):
+            entry = replace(entry, form=f"{entry.form}[:{word}]", about=f"{entry.about}; {word}: {variant.about}")
+    return entry
 
 
 def agents_refused() -> list[str]:
-    """Why some of the installed agents and shields cannot be loaded."""
-    found = [each.why_not(name) for each in (_AGENTS, _SHIELDS) for name in each]
+    """Return one sentence for each registered agent, shield or variant of one that cannot be loaded, with the reason.
+
+    The list is empty if everything can be loaded.
+    """
+    found = [each.why_not(name) for each in (AGENTS, SHIELDS, VARIANTS) for name in each]
     return [reason for reason in found if reason is not None]
 
 
 def around_forms() -> tuple[str, ...]:
-    """All that may stand behind a ``+``."""
-    return tuple(word for entry in _SHIELDS.usable().values() for word in entry.words)
+    """Return every shield and search as it is written in a specification, after the ``+`` of ``ppo+episode``.
+
+    For example ``("search", "episode", "episode:pairwise")``: with each argument and variant that it takes.
+    """
+    return tuple(word for entry in SHIELDS.usable().values() for word in entry.words)
 
 
 def shield_forms() -> tuple[str, ...]:
-    """The shields among that, without those that decide on what was received."""
-    return tuple(each for each in around_forms() if not (_around(each).inner or each.endswith(":believed")))
+    """Return every shield as it is written after the ``+`` of a specification: ``("episode", "robust:interior", ...)``.
+
+    Arguments are included, variants (last words that select another function) and searches are not.
+    """
+    return tuple(each for each in around_forms() if not (around_entry(each).inner or is_variant(each)))
+
+
+def around_one_vehicle() -> list[str]:
+    """Return the names of the shields and searches that cannot go around a team, searches first."""
+    return [entry.name for inner in (True, False) for entry in SHIELDS.usable().values()
+            if entry.inner is inner and not entry.teams]  # fmt: skip
+
+
+def shield_settings(name: object) -> Any:
+    """Return the settings class of the shield called ``name`` if it can also go around environments; otherwise None."""
+    return SHIELDS[name].options if isinstance(name, str) and name in SHIELDS else None
+
+
+def shield_modes() -> dict[str, Any]:
+    """Return, for every loadable shield that can also go around environments, its name -> its settings class."""
+    return {name: entry.options for name, entry in SHIELDS.usable().items() if entry.options is not None}
+
+
+def variants_of(name: str) -> tuple[str, ...]:
+    """Return the variants of the agent or shield called ``name``, for example ``("believed",)``.
+
+    A variant is a last word after a further colon, as in ``episode:pairwise:believed``, that selects another function
+    to make the agent or shield.
+    """
+    keys = (key.rpartition(".") for key in VARIANTS)
+    return tuple(variant for of, _, variant in keys if of == name)
+
+
+def is_variant(form: str) -> bool:
+    """Return whether the last word of ``form`` is a registered variant, as in ``step:believed``.
+
+    ``form``: an agent or shield with its argument, without ``+``.
+    """
+    return form.rpartition(":")[2] in variants_of(form.partition(":")[0])
+
+
+def settings_needed(shield: str | None) -> Mapping[str, object]:
+    """Return the settings that a shield requires, each with an example: ``{"uncertainty": "gaps_m=0.5"}``.
+
+    ``shield`` is a shield with its argument, such as ``robust`` or ``episode:pairwise``. The result is empty for None
+    and for a variant, such as ``robust:believed``.
+    """
+    return {} if shield is None or is_variant(shield) else around_entry(shield).needs
+
+
+def shields_with(setting: str) -> tuple[str, ...]:
+    """Return the names of the installed shields that require ``setting``, a name such as ``uncertainty``."""
+    return tuple(entry.words[0] for entry in SHIELDS.usable().values() if setting in entry.needs)
+
+
+def group_names() -> tuple[str, ...]:
+    """Return the names that stand for several agents in the command option ``--agents``, such as ``ladder``."""
+    return tuple(dict.fromkeys(name.partition(".")[0] for name in GROUPS))
+
+
+def agents_of_group(group: str) -> tuple[str, ...]:
+    """Return the specifications of all agents in ``group``, a name from ``group_names``.
+
+    The group ``ladder`` also contains the agents registered under ``ladder.search``, or any other ``ladder.WORD``: its
+    own come first, then these, sorted by name.
+    """
+    return tuple(spec for name in sorted(GROUPS) if name.partition(".")[0] == group for spec in GROUPS[name])
 
 
 def register_agent(
@@ -622,30 +215,31 @@ def register_agent(
     form: str | None = None,
     takes_policy: bool = False,
 ) -> None:
-    """Make ``name`` and ``name:argument`` known to ``make_agent``, and so to every command.
+    """Register an agent, so that ``make_agent`` and every command know ``name`` and ``name:argument``.
 
-    An installed package does the same with an entry point of the group ``ethbrake_marl.agents``: its factory, or a
-    ``Part`` of it.
+    An installed package registers an agent with an entry point of the group ``ethbrake_marl.agents``: its factory, or
+    ``Part(factory, about=...)`` with arguments of this function.
 
     Args:
-        name: plain, without argument.
-        factory: makes the agent, from what stands after the colon (or None) and ``AgentSettings``. The same one again
-            changes nothing.
-        about: one line for ``ethbrake agent list``.
-        knows: of the line while it drives, for ``ethbrake agent list`` too.
-        form: how it is written, for ``ethbrake agent list`` too; without ``:`` in it, it takes no argument, without
-            ``@`` no policy. None: ``name[:ARGUMENT]``.
-        takes_policy: whether ``name@policy`` is known, too; the factory finds it in ``AgentSettings.policy``.
+        name: plain name without argument.
+        factory: ``factory(argument, settings)`` makes the agent; ``argument`` is the text after the colon, or None, and
+            ``settings`` an ``AgentSettings``.
+        about: description in one line, for ``ethbrake agent list``.
+        knows: what the agent knows about the line while it drives, for ``ethbrake agent list``.
+        form: how the agent is written, for ``ethbrake agent list``. Without ``:`` it takes no argument, without ``@``
+            no policy. None: ``name[:ARGUMENT]``.
+        takes_policy: whether ``name@policy`` is allowed; the factory finds the policy in ``AgentSettings.policy``.
 
-    Raises ``AlreadyExists`` for a name that another factory has, ``InvalidInput`` for one that is not plain.
+    Registering the same factory again changes nothing. Raises ``AlreadyExists`` if the name belongs to another factory,
+    ``InvalidInput`` for a name that is not plain.
 
     """
-    if parse_spec(name) != AgentSpec(name, None, None, ()):
+    if ScriptSpec.parse(name) != ScriptSpec(name, None) or "@" in name:
         raise InvalidInput(f"agent name {name!r}: must be a plain name without argument")
-    if name in _SEVERAL:
+    if name in group_names():
         raise AlreadyExists(f"agent {name!r}: stands for several agents in --agents; give another name")
     form = f"{name}[:ARGUMENT]{'[@POLICY]' * takes_policy}" if form is None else form
-    _AGENTS.add(name, Entry(form, about, knows, factory), lambda entry: entry.make is factory)
+    AGENTS.add(name, Entry(name, form, about, knows, factory), lambda entry: entry.make is factory)
 
 
 def register_shield(
@@ -657,202 +251,68 @@ def register_shield(
     form: str | None = None,
     inner: bool = False,
     teams: bool = False,
+    needs: Mapping[str, object] | None = None,
+    options: type | None = None,
 ) -> None:
-    """Make ``+name`` known behind every agent.
+    """Register a shield or another wrapper, so that ``+name`` may follow every agent.
 
-    An installed package does the same with an entry point of the group ``ethbrake_marl.shields``: its wrapper, or a
-    ``Part`` of it.
+    An installed package registers a shield with an entry point of the group ``ethbrake_marl.shields``: its wrapper, or
+    ``Part(wrapper, about=...)`` with arguments of this function.
 
     Args:
-        name: plain, without argument.
-        wrapper: makes the agent around an agent, from that, what stands after the colon (or None) and
-            ``AgentSettings``. The same one again changes nothing.
-        about: one line for ``ethbrake agent list``.
-        knows: what it adds to what the agent knows.
-        form: how it is written, ``+name[:WORD]`` with every word that it takes; None: with any argument.
-        inner: it is no shield, and goes around the agent before one.
-        teams: it also goes around a team.
+        name: plain name without argument.
+        wrapper: ``wrapper(agent, argument, settings)`` makes the agent around ``agent``; ``argument`` is the text after
+            the colon, or None, and ``settings`` an ``AgentSettings``.
+        about: description in one line, for ``ethbrake agent list``.
+        knows: knowledge that the wrapper adds to the agent's.
+        form: how it is written, ``+name[:WORD]`` with every word that it takes; None: any argument.
+        inner: whether it is no shield and goes directly around the agent, inside a shield.
+        teams: whether it can also go around a team.
+        needs: name of each required setting of ``AgentSettings`` -> an example; None: none.
+        options: settings class of a shield, ``shield.options.ShieldOptions`` or a subclass, with which
+            ``eb.shield(env, mode=name)`` knows it too; None: it cannot go around environments.
 
-    Raises ``AlreadyExists`` for a name that another one has, ``InvalidInput`` for one that is not plain.
+    Registering the same wrapper again changes nothing. Raises ``AlreadyExists`` if the name belongs to another wrapper,
+    ``InvalidInput`` for a name that is not plain.
 
     """
     if not isinstance(name, str) or not _PLAIN.fullmatch(name):
         raise InvalidInput(f"shield name {name!r}: must be a plain name without argument")
-    entry = Entry(f"+{name}[:ARGUMENT]" if form is None else form, about, knows, wrapper, inner, teams)
-    _SHIELDS.add(name, entry, lambda entry: entry.make is wrapper)
+    form = f"+{name}[:ARGUMENT]" if form is None else form
+    entry = Entry(name, form, about, knows, wrapper, inner, teams, needs or {}, options)
+    SHIELDS.add(name, entry, lambda entry: entry.make is wrapper)
+
+
+def register_variant(key: str, make: Factory | Wrapper, *, about: str = "a variant of your own") -> None:
+    """Register a variant of an agent or a shield: ``name:variant`` and ``name:argument:variant``.
+
+    An installed package registers a variant with an entry point of the group ``ethbrake_marl.variants``.
+
+    Args:
+        key: ``name.variant``: ``step.mine`` registers ``step:mine``, a variant of the shield ``step``.
+        make: replaces the factory or wrapper of that name, with the same arguments; the argument does not contain the
+            variant.
+        about: description in one line, for ``ethbrake agent list``.
+
+    Raises ``AlreadyExists`` if the key belongs to another variant.
+
+    """
+    VARIANTS.add(key, Variant(make, about), lambda variant: variant.make is make)
 
 
 _PLAIN = re.compile(r"[a-z][a-z0-9_.-]*")
-_PROFILE = "profile"  # a role of scenarios alone
-_SEVERAL = ("ladder", "field")  # stand for several agents in ``--agents``
-_AGENTS: Registry[Entry] = Registry("agent", "agents", register_agent)
-_SHIELDS: Registry[Entry] = Registry("shield or search", "shields", register_shield)
+
+PROFILE = "profile"  # allowed only as a role in a scenario
+
+AGENTS: Registry[Entry] = Registry("agent", "agents", register_agent)
+
+SHIELDS: Registry[Entry] = Registry("shield or search", "shields", register_shield)
+
+VARIANTS: Registry[Variant] = Registry("variant of an agent", "variants", register_variant)
 
 
-def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: Driver) -> Driver:
-    """The driver of an entry; of one that is not ours, what it raises becomes ``InvalidInput``, and it is looked at."""
-    try:
-        driver = entry.call(argument, settings, *inside)
-    except Exception as error:
-        if entry.is_ours or isinstance(error, EthBrakeError):
-            raise
-        raise InvalidInput(f"agent {settings.spec!r}: {describe_error(error)}") from error
-    if not isinstance(driver, Team):
-        check_agent(driver, f"agent {settings.spec!r}", alone=not inside)
-    return driver
+def _register_group(name: str, specs: tuple[str, ...]) -> None:
+    GROUPS.add(name, specs, lambda other: other == specs)
 
 
-# An agent from a Python file of the user's: ``my_file.py:make_agent``, loaded only where a person names it.
-
-
-def make_from_file(argument: str | None, settings: AgentSettings) -> Driver:
-    """What the function of the file makes, from the argument (or None) and the settings, or from nothing.
-
-    A function without parameters takes neither argument nor policy: ``InvalidInput`` says so, and what is wrong with
-    the file.
-    """
-    named = parse_spec(settings.spec).file
-    assert named is not None
-    function = load_from_file(*named, reads=settings.policy)
-    if not callable(function):
-        raise InvalidInput(f"file {named[0]!r}: {named[1]!r} is no function; name the one that makes the agent")
-    given: tuple[Any, ...] = (argument, settings)
-    with suppress(TypeError, ValueError):  # of something built in there is no signature
-        if not inspect.signature(function).parameters:
-            given = ()
-    if not given and (argument, settings.policy) != (None, None):
-        raise InvalidInput(f"agent {settings.spec!r}: {named[1]} has no parameters, so it takes no argument")
-    made: Driver = function(*given)
-    return made
-
-
-# Letting agents drive through whole episodes: the loop of every evaluation and of every prediction.
-
-
-@dataclass(frozen=True, slots=True)
-class Episodes:
-    """How the episodes of a batch went."""
-
-    ledger: Ledger
-    final: Worlds  # each world as its episode left it
-    at_rest: Bools  # [n] the line came to rest; else the horizon cut the episode off
-    guarded: Any  # what the shield remembers at their end; None without one
-    memories: Mapping[int, Memory]  # by driven vehicle, what its agent remembers at their end
-
-    @classmethod
-    def of(cls, engine: Engine, worlds: Worlds, watched_by: Sequence[Watch] = ()) -> Episodes:
-        """Those of an ``episode_engine``, still at the first decision in ``worlds``; raises ``PhysicsError``."""
-        at_rest = np.zeros(worlds.n, np.bool_)
-        now = _show(watched_by, worlds, engine, engine.worlds.command_mps2)
-        while not engine.ended.all():
-            at_rest |= engine.step({}).terminated
-            now = _show(watched_by, now, engine, engine.wanted_mps2.copy())
-        if engine.roster.failed:
-            raise PhysicsError(engine.roster.failed)
-        memories = {i: memory for i, memory in engine.memories.items() if i in engine.deciders}
-        return cls(engine.ledger, engine.worlds, at_rest, engine.guarded, memories)
-
-
-class Watch(Protocol):
-    """Sees every step of a batch of episodes."""
-
-    def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """``before`` moved to the times ``until_s`` [n] under ``command_mps2`` [n, N]; ended worlds stay at theirs.
-
-        The first step is from the alert to the first decision; where a script decides on the way, a step is seen in
-        parts. Nothing of what is given may be changed.
-        """
-        ...
-
-
-def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | None = None) -> dict[int, Agent]:
-    """Agents for the scenario's scripts, by vehicle."""
-    left_out = (except_for,) if isinstance(except_for, int) else except_for or ()
-    return {i: make_role(scenario, i) for i in scenario.scripts if i not in left_out}
-
-
-def episode_engine(worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None) -> Engine:
-    """An engine over ``worlds`` in which ``agent`` drives ``vehicle``, or a team its vehicles; the others are scripted.
-
-    They decide when their first vehicle's latency has elapsed and every time step from then on, as learners do; their
-    commands are applied unrounded. Behind a shield they propose, and learn as far as the engine knows. One that looks
-    ahead knows the scripts, and takes the other driven vehicles to
-    brake fully. Raises ``InvalidInput`` for a learner that nobody drives.
-    """
-    team = agent if isinstance(agent, Team) else Team.of(agent, () if vehicle is None else (vehicle,))
-    drivers = team.drivers
-    undriven = [scenario.vehicle_names[i] for i in scenario.learners if i not in drivers]
-    if undriven:
-        raise InvalidInput(
-            f"agent {team.name!r} drives {', '.join(scenario.vehicle_names[i] for i in drivers) or 'nobody'}, but"
-            f" {', '.join(undriven)} of scenario {scenario.name!r} must be driven too. An agent that rolls itself out"
-            " (+search, +episode, +robust) can drive one learner, the others need scripts"
-        )
-    scripts = script_agents(scenario, except_for=drivers)
-    shield = team.shield
-    if shield is None:
-        engine = Engine(
-            scenario, worlds.n, learners=(), scripts={**scripts, **drivers}, deciders=tuple(drivers), worlds=worlds
-        )
-    else:
-        engine = Engine(
-            scenario, worlds.n, learners=tuple(drivers), scripts=scripts, worlds=worlds,
-            guard=lambda engine: shield.guard(engine, drivers),
-        )  # fmt: skip
-        engine.check_time_step(drivers)
-    engine.roster.warns = False  # who drives looks
-    return engine
-
-
-def drive(
-    worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None, *, watched_by: Sequence[Watch] = ()
-) -> Episodes:
-    """Let ``agent`` drive ``vehicle``, or a team its vehicles, through every world (at t = 0) to its episode's end.
-
-    Raises ``PhysicsError`` naming all worlds that could not be advanced; the others are well without them.
-    """
-    engine = episode_engine(worlds, agent, scenario, vehicle)
-    return Episodes.of(engine, scenario.play_pieces(worlds, engine.deciders), watched_by)
-
-
-def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_mps2: Floats) -> Worlds:
-    """Show the step that the engine has just made; gives the worlds as they are now."""
-    if not watched_by:
-        return before
-    now = engine.packed.worlds(before.vehicles)  # the episodes are the same, and so are their vehicles
-    for part in engine.segments(before, command_mps2):
-        for watch in watched_by:
-            watch.see(*part)
-    return now
-
-
-# What a driver does in each step of its episodes, written down.
-
-
-def record_commands(agent: Driver, worlds: Worlds, scenario: Scenario, vehicle: int, steps: int) -> Floats:
-    """The commands that ``agent`` gives ``vehicle`` in the first ``steps`` decisions of its episodes, [n, steps] m/s2.
-
-    ``worlds`` are at the alert. After an episode's end its last command goes on. Raises ``PhysicsError`` naming the
-    worlds that it cannot drive to the end.
-    """
-    engine = episode_engine(worlds, agent, scenario, vehicle)
-    commands = write_down(engine, steps, lambda: engine.wanted_mps2[:, [vehicle]])[:, :, 0]
-    latest = np.maximum.accumulate(np.where(np.isnan(commands), 0, np.arange(steps)), axis=1)
-    filled: Floats = np.take_along_axis(commands, latest, axis=1)
-    return filled
-
-
-def write_down(engine: Engine, steps: int, column: Callable[[], Floats]) -> Floats:
-    """Play such an engine to the end; the ``column`` [n, K] after each of the first steps, [n, steps, K].
-
-    NaN after an episode's end. Raises ``PhysicsError``.
-    """
-    columns = np.full((steps, *column().shape), np.nan)
-    while not engine.ended.all():
-        rows = np.flatnonzero(engine.steps < steps)
-        at = engine.steps[rows]
-        engine.step({})
-        columns[at, rows] = column()[rows]
-    if engine.roster.failed:
-        raise PhysicsError(engine.roster.failed)
-    return columns.swapaxes(0, 1)
+GROUPS: Registry[tuple[str, ...]] = Registry("group of agents", "agent_groups", _register_group)

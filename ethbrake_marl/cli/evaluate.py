@@ -1,17 +1,16 @@
-"""The commands that measure: ``evaluate``, ``compare`` and ``shield``."""
+"""The commands that measure agents: ``evaluate``, ``compare`` and ``shield``."""
 
 from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from ethbrake_marl import evaluation, learning, scenario as scenarios
+from ethbrake_marl import evaluation, scenario as scenarios, training
 from ethbrake_marl.cli.command import (
     AgentsOption,
     ForceOption,
@@ -23,38 +22,58 @@ from ethbrake_marl.cli.command import (
     SettingsOption,
     say,
 )
+from ethbrake_marl.cli.pages import page_of
 from ethbrake_marl.errors import InvalidInput, need
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.files.store import check_folder, write_output
 
 if TYPE_CHECKING:
-    from ethbrake_marl.agents import Driver
-    from ethbrake_marl.harm import HarmCount
-    from ethbrake_marl.learning import Settings
-    from ethbrake_marl.physics import LeftOutRows
-    from ethbrake_marl.scenario import Sample, Task
+    from ethbrake_marl.agents.protocol import Driver
+    from ethbrake_marl.physics.left_out import LeftOutRows
+    from ethbrake_marl.scenario.sample import Sample
+    from ethbrake_marl.scenario.task import Task
+    from ethbrake_marl.training.settings import Settings
 
-GROUP_EPISODES = 400  # of each scenario of a group; the tables of best known harm of `benchmark` hold them
-RESULTS, WORLDS, REPORT = "results.json", "worlds", "report.html"  # in the folder of an evaluation
+GROUP_EPISODES = 400  # worlds of each scenario of a group; the tables of best known harm of `benchmark` contain them
+
+RESULTS, WORLDS, REPORT = "results.json", "worlds", "report.html"  # names of files in the folder of an evaluation
+
 _FILES = (RESULTS, f"{WORLDS}.csv", f"{WORLDS}.parquet", REPORT)
+
 _HARMS = {"first_impact_harm": "First-impact harm", "total_harm": "Total harm", "harm": "Harm"}
+
 _POLICIES = {"same": "the same", "other": "another", "none": ""}
 
 
 def read_task(scenario: str, settings: Sequence[str] | None) -> Task:
-    """The scenario that is named, with its settings, its learners, and the harm that ``harm_count`` among them says."""
-    return _task_of(scenario, learning.read_settings(settings, of_agents=("harm_count",)))
+    """Load a scenario with settings, and return the task of controlling its learners.
+
+    Args:
+        scenario: name or path.
+        settings: ``KEY=VALUE`` overrides of the scenario, and ``harm_count=total``; None: none.
+
+    Raises ``InvalidInput`` for a scenario without a learner.
+
+    """
+    return _task_of(scenario, training.read_settings(settings, of_agents=("harm_count",)))
 
 
 def _task_of(scenario: str, given: Settings) -> Task:
-    from ethbrake_marl.scenario import Task
+    from ethbrake_marl.scenario.task import Task
 
     chosen = evaluation.load_runnable(scenario, given.scenario, drives="some")
     return Task(chosen, chosen.learners, given.harm_count)
 
 
 def make_drivers(agents: str | Sequence[str], task: Task, *, bare: bool = False) -> dict[str, Any]:
-    """Who is named on the command line, as ``make_lineup`` makes them; tells which policies ``@shipped`` stands for."""
+    """Return the agents of a command line by spec (``make_lineup``), and print which policy ``@shipped`` stands for.
+
+    Args:
+        agents: specs, as a list or with commas between them.
+        task: the scenario, and the harm that the agents minimise.
+        bare: refuse agents with a shield, because the command adds its own.
+
+    """
     lineup = evaluation.make_lineup(agents, task.scenario, harm_count=task.harm_count, bare=bare)
     _tell_shipped(lineup)
     return lineup
@@ -92,17 +111,18 @@ def evaluate_command(
 ) -> None:
     """Compare agents on the same fixed list of worlds.
 
-    `ethbrake agent list` says who can drive; ladder stands for all of them from coast to best_harm. Behind any agent:
+    `ethbrake agent list` shows all agents; ladder stands for all of them from coast to best_harm. Behind any agent:
     +search, then one shield, +episode or +step; for instance full_brake+step or ppo@PATH+search+episode.
     PATH is a run or a policy bundle, or shipped. +robust needs an uncertainty, which is given in Python;
-    +robust:believed needs none. With --set harm_count=total agents minimise the harm of all impacts, not that of first
-    impacts only. --set measures=injury,my_file.py:worst shows these beside the usual ones.
+    +robust:believed needs none. With --set harm_count=total agents minimise the harm of all impacts, not only of first
+    impacts. --set measures=injury,my_file.py:worst adds these measures to the usual ones.
     """
-    from ethbrake_marl.agents import split_specs
+    from ethbrake_marl.agents.spec import split_specs
 
     with Out(as_json=as_json, force=force) as out:
         _check_outputs(out, output, per_world, report=report)
-        given = learning.read_settings(settings, of_agents=("harm_count", "measures"))
+        write_page = page_of("evaluation", "--report") if report else None
+        given = training.read_settings(settings, of_agents=("harm_count", "measures"))
         if group := scenarios.group_of_scenarios(scenario):
             other = {"--per-world": per_world, "--report": report, "--jobs": jobs, "--ray": ray}
             for option in (name for name, value in other.items() if value):
@@ -130,9 +150,13 @@ def evaluate_command(
             summary = evaluation.summarise(found)
             beside_it = _write_worlds(out, output, found, per_world)
             results = evaluation.results_to_json(summary, per_world=beside_it, settings=used)
-            if report and output is not None:
+            if write_page is not None and output is not None:
                 output.mkdir(parents=True, exist_ok=True)
-                _write_report(out, output / REPORT, found, summary, lineup.make(), task.harm_count)
+                write_page(
+                    output / REPORT, found, summary, lineup.make(), harm_count=task.harm_count, force=out.force,
+                    tell=lambda done, total: out.progress("report: episodes", done, total),
+                )  # fmt: skip
+                out.note(f"report: {output / REPORT}")
         _write_results(out, output, results, f"{WORLDS}.{per_world}", REPORT if report else "")
         out.result(results, *summary.tables())
         _tell_horizon(out, _moving(summary), summary[0].episodes, task.scenario.horizon_s)
@@ -141,7 +165,10 @@ def evaluate_command(
 def _evaluate_long_list(
     out: Out, lineup: evaluation.Lineup, episodes: int, seed: int, jobs: int | None, ray: str | None
 ) -> evaluation.SummaryTable:
-    """The agents in a list of which no world is held in memory."""
+    """Evaluate the agents on a list that is too long to hold in memory, and return the results table.
+
+    The list is ``episodes`` worlds of ``seed``; ``jobs`` processes or the Ray cluster ``ray`` do the work.
+    """
     scenario = lineup.scenario
     evaluation.check_agents(lineup.make(), scenario.sample(1_000, seed).worlds, scenario, warn=True)
     tally = evaluation.tally_list(lineup, episodes, seed, jobs=jobs, ray=ray, on_done=_tell_worlds(out, episodes))
@@ -158,10 +185,23 @@ def _tell_worlds(out: Out, worlds: int) -> Callable[[int], None]:
 def _evaluate_group(
     out: Out, output: Path | None, group: Sequence[Task], agents: str, episodes: int | None, seed: int | None
 ) -> None:
-    """Each agent in each scenario: whether anybody collides, how hard the hardest pair does, and what is left to do."""
+    """Evaluate each agent in each scenario of a group, and print one table with a row for each of them.
+
+    It shows whether vehicles collide, how hard the worst impact is, and harm.
+
+    Args:
+        out: output of the command.
+        output: folder that also gets the results as JSON; None: no folder.
+        group: the scenarios, each with its controlled vehicles.
+        agents: specs with commas between them.
+        episodes: number of worlds of each scenario; None: 400.
+        seed: seed of the worlds; None: the standard seed.
+
+    """
     told: list[dict[str, Any]] = []
     rows: list[Any] = []
     seed = evaluation.LIST_SEED if seed is None else seed
+    more = [each.group_column for each in evaluation.MEASURE_SETS.values() if each.group_column]
     for task in group:
         chosen = task.scenario
         sample = chosen.sample(GROUP_EPISODES if episodes is None else episodes, seed)
@@ -170,7 +210,7 @@ def _evaluate_group(
         found = evaluation.evaluate(sample, lineup, scenario=chosen, seed=seed)
         rows.append(chosen.name)
         for row in evaluation.summarise(found):
-            outcome, share = found.outcome(row.agent), row[f"share_of_possible_reduction_{task.harm_count}"]
+            outcome, shares = found.outcome(row.agent), [row[each.measures[task.harm_count]] for each in more]
             hardest = 3.6 * math.sqrt(outcome.ledger.pair_harm("first").max(initial=0.0))
             each: dict[str, Any] = {
                 "passed": not outcome.collided.any(),
@@ -180,8 +220,9 @@ def _evaluate_group(
                 "total_harm": float(outcome.total_harm.mean()),
             }
             shown = f"{each['collision_rate']:.1%}", f"{hardest:.1f}", *(f"{each[key]:.2f}" for key in list(each)[3:])
-            rows.append((row.agent, "passed" if each["passed"] else "failed", *shown, share))
-            each["share_of_possible_reduction"] = None if share is None else share.to_json()
+            rows.append((row.agent, "passed" if each["passed"] else "failed", *shown, *shares))
+            for head, share in zip(more, shares, strict=True):
+                each[head.column.name] = None if share is None else share.to_json()
             told.append({"scenario": chosen.name, "agent": row.agent, "worlds": found.worlds.n, **each})
     columns: list[Column | str] = [
         "Agent",
@@ -190,28 +231,23 @@ def _evaluate_group(
         Column("Hardest, km/h", short="Hardest,\nkm/h"),
         Column("First-impact harm", short="First-impact\nharm"),
         Column("Total harm", short="Total\nharm"),
-        Column(
-            "Share of the possible reduction",
-            digits=1,
-            scale=100.0,
-            unit=" %",
-            short="Share of\npossible",
-            interval="hidden",
-        ),
+        *(each.column for each in more),
     ]
     counted = "first-impact" if group[0].harm_count == "first" else "total"
     note = (
         f"{found.worlds.n:,} worlds of each, seed {seed}; `ethbrake scenario explain` tells their parameters."
         " Passed: nobody collides, in no world. Harms: means per world in m²/s². Hardest: the closing speed of a pair."
-        f" Share of the possible reduction of {counted} harm: 0 % for full braking,"
-        " 100 % for the best known harm; none where that is not known of every world."
+        + "".join(f" {each.note.format(harm=counted)}" for each in more)
     )
     _write_results(out, output, told)
     out.result(told, Sheet("", columns, rows, note))
 
 
 def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, report: bool) -> None:
-    """Refuse, before any work, a folder that cannot be written to, or that holds other results."""
+    """Raise ``InvalidInput``, before any work, if the folder ``output`` cannot be written or holds other files.
+
+    ``per_world`` (``csv``, ``parquet`` or None) and ``report`` say which files are requested; they need a folder.
+    """
     if output is None:
         for option in (name for name, given in (("--per-world", per_world), ("--report", report)) if given):
             raise InvalidInput(f"{option}: needs a folder for it: --output FOLDER")
@@ -222,7 +258,10 @@ def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, repo
 
 
 def _write_worlds(out: Out, output: Path | None, found: evaluation.Evaluation, per_world: str | None) -> Path | None:
-    """The file with one row per world and agent, where it is asked for."""
+    """Write the file with one row per world and agent into the folder ``output``, and return its path.
+
+    ``per_world`` is the format, ``csv`` or ``parquet``. If it or ``output`` is None, return None.
+    """
     if output is None or per_world is None:
         return None
     file = output / f"{WORLDS}.{per_world}"
@@ -233,7 +272,10 @@ def _write_worlds(out: Out, output: Path | None, found: evaluation.Evaluation, p
 
 
 def _write_results(out: Out, output: Path | None, results: object, *beside: str) -> None:
-    """``results.json``, with the files ``beside`` it; those of earlier results go."""
+    """Write ``results.json`` into the folder ``output``, and delete files of earlier results except ``beside``.
+
+    ``output`` None: write nothing.
+    """
     if output is None:
         return
     output.mkdir(parents=True, exist_ok=True)
@@ -248,7 +290,15 @@ def _json_text(content: object) -> str:
 
 
 def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: float) -> None:
-    """Say of shielded drivers in how many worlds, by driver, something still ``moving`` was cut off, if in any."""
+    """Print in how many worlds something still moved at the horizon, if there are any.
+
+    Args:
+        out: output of the command.
+        moving: name of an agent with a shield -> number of such worlds.
+        worlds: number of all worlds.
+        horizon_s: time of the horizon (s).
+
+    """
     found = ", ".join(f"{name} {count}" for name, count in moving.items() if count)
     if found:
         out.note(
@@ -258,49 +308,11 @@ def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: f
 
 
 def _moving(rows: Sequence[evaluation.SummaryRow]) -> dict[str, int]:
-    """In how many worlds something still moves at the horizon, by shielded driver."""
+    """Return name of each agent behind a shield -> number of worlds in which something still moves at the horizon.
+
+    ``rows`` is the results table.
+    """
     return {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
-
-
-def _write_report(
-    out: Out,
-    path: Path,
-    found: evaluation.Evaluation,
-    rows: Sequence[evaluation.SummaryRow],
-    agents: Mapping[str, Driver],
-    harm_count: HarmCount,
-) -> None:
-    """Write the page of an evaluation that has just been made."""
-    # matplotlib takes a second to load, and most evaluations draw nothing
-    from ethbrake_marl.pages.report import Report
-
-    done: list[str] = []
-
-    def tell(agent: str) -> None:
-        done.append(agent)
-        out.progress("report: episodes", len(done), len(agents))
-
-    scenario, names, asked = found.scenario, ", ".join(row.agent for row in rows), rows[0].parameters
-    scripts = ", ".join(f"{vehicle} by {script}" for vehicle, script in asked["scripts"].items())
-    report = Report(
-        f"{scenario.name}: {names}" if len(names) <= 60 else f"{scenario.name}: {len(rows)} agents compared",
-        rows,
-        found,
-        harm_count=harm_count,
-        summary=scenario.title or "Agents on the same worlds.",
-        settings={
-            "Command": "ethbrake " + " ".join(sys.argv[1:]),
-            "Agents": names,
-            "Harm that agents minimise": "first impacts only" if harm_count == "first" else "every impact",
-            "Worlds": asked.line,
-            "Driven by the agents": asked.get("controlled_vehicle") or ", ".join(asked["controlled_vehicles"]),
-            "Driven by scripts": scripts or "none",
-            "Time step, horizon": f"{asked['time_step_s']:g} s, {asked['horizon_s']:g} s",
-        },
-        versions=rows[0].versions,
-    )
-    report.driven(agents, on_agent=tell).write(path, force=out.force)
-    out.note(f"report: {path}")
 
 
 _FILE = typer.Argument(
@@ -311,8 +323,8 @@ _FILE = typer.Argument(
 def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE], as_json: JsonOption = False) -> None:
     """Show how harm differs between two results.
 
-    The second minus the first, for agents of the same name. Both must be of one command, and about the same worlds of
-    the same scenario. Intervals are paired by world where the files of --per-world lie beside both results.
+    The second minus the first, for agents of the same name. Both must come from one command, and from the same worlds
+    of the same scenario. Intervals are paired by world if the files of --per-world lie beside both results.
     """
     with Out(as_json=as_json) as out:
         found = evaluation.compare_results(evaluation.read_result(first), evaluation.read_result(second))
@@ -328,7 +340,7 @@ def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE
             if agents:
                 out.note(f"in the {which} only: {', '.join(agents)}")
         for name, both in {**found.other_settings, **found.other_versions}.items():
-            if "SHA-256 " in f"{both[0]}{both[1]}":  # of a file; --json has the hashes
+            if "SHA-256 " in f"{both[0]}{both[1]}":  # the hash of a file, which only --json shows
                 out.note(f"note: {name} {'was read for one of the two' if None in both else 'changed between the two'}")
             else:
                 out.note(f"note: {name} {both[0]} in the first, {both[1]} in the second")
@@ -344,9 +356,9 @@ def shield_command(
     """Compare agents without and behind the shield.
 
     They drive the same worlds without a shield, in episode mode and in step mode; name them without a shield. The
-    shield bounds first-impact harm; with --set harm_count=total, total harm. Where several vehicles learn: no shield,
+    shield bounds first-impact harm; with --set harm_count=total, total harm. If several vehicles learn: no shield,
     step mode, and step mode with caps, for the whole team. Each decision that step mode replaced is simulated
-    again without it: needed (harm would have been higher), harmless (the same), costly (lower).
+    again without the shield: needed (harm would have been higher), harmless (the same), costly (lower).
     """
     with Out(as_json=as_json) as out:
         task = read_task(scenario, settings)
@@ -359,7 +371,10 @@ def shield_command(
 
 
 def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> evaluation.ShieldModes:
-    """The rows of these agents, with progress on stderr."""
+    """Compare ``agents`` (specs with commas between them) without and behind the shield in the worlds of ``sample``.
+
+    The progress is shown on stderr.
+    """
     lineup = make_drivers(agents, task, bare=True)
     n = sample.worlds.n
     return evaluation.compare_modes(
@@ -368,7 +383,7 @@ def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> evaluat
 
 
 def _tell_left_out(out: Out, left_out: LeftOutRows, whole: int) -> None:
-    """Name the worlds that count in no figure, of ``whole``, in a line on stderr; none where every world counts."""
+    """Print in one line on stderr which of ``whole`` worlds were left out, if there are any."""
     if left_out:
         told = [f"world {world} of seed {evaluation.LIST_SEED} ({reason})" for world, reason in left_out]
         out.note(evaluation.LeftOut.line(told, whole))

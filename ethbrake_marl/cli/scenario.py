@@ -1,4 +1,4 @@
-"""The commands about what there is: ``scenario`` and ``agent``."""
+"""The commands that list and show what exists: ``scenario`` and ``agent``."""
 
 from __future__ import annotations
 
@@ -6,21 +6,25 @@ import textwrap
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
-from ethbrake_marl import evaluation, learning, scenario as scenarios
+from ethbrake_marl import evaluation, scenario as scenarios, training
 from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, SeedOption, SettingsOption, example
+from ethbrake_marl.cli.pages import page_of
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.sheet import Sheet
-from ethbrake_marl.files.store import new_file, read_plain
 from ethbrake_marl.files.yaml import flow_text
 
-TRIED_WORLDS = 200  # by `scenario validate`
-MOST_RANGES = 8  # that it tells apart
-SCREEN = 24  # lines
-TABLE_WORLDS, PICTURE_WORLDS = 10, 1000  # by `scenario sample`
+TRIED_WORLDS = 200  # number of worlds that `scenario validate` tries
+
+MOST_RANGES = 8  # largest number of ranges that `scenario validate` shows separately
+
+SCREEN = 24  # lines of a screen
+
+TABLE_WORLDS, PICTURE_WORLDS = 10, 1000  # default number of worlds of `scenario sample`
 
 NameArgument = Annotated[
     str, typer.Argument(metavar="NAME|PATH", help="A shipped or registered scenario, or a path to a YAML file.")
@@ -36,7 +40,7 @@ scenario_group = typer.Typer(
 def scenario_list(as_json: JsonOption = False) -> None:
     """List the scenarios that have a name.
 
-    Name and title, and the folder of those that a program registers.
+    Shows name and title, and the folder of scenarios that a program registers.
     """
     with Out(as_json=as_json) as out:
         entries = scenarios.list_scenarios()
@@ -62,7 +66,7 @@ def scenario_show(scenario: NameArgument) -> None:
 def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
     """Check a scenario, and try it in 200 worlds.
 
-    Says what is drawn and what may be a mistake, or what is wrong. The first worlds of its list are drawn, the
+    Shows what is drawn and what may be a mistake, or what is wrong. The first worlds of its list are drawn, the
     scripts drive, and learners brake fully.
     """
     with Out(as_json=as_json) as out:
@@ -106,7 +110,11 @@ def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
 
 
 def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tuple[list[str], str, dict[str, Any]]:
-    """The range of each quantity that varies, a line each below a head; what is fixed; all of them by column."""
+    """Return three descriptions of the quantities of the worlds in ``sample``: (lines, text, columns).
+
+    ``lines`` are a table with the range of each varying quantity; ``text`` lists the fixed ones. ``columns`` is for
+    JSON: ``{"gap_1_m": {"least": 5.0, "median": 7.0, "largest": 9.0}}``.
+    """
     import numpy as np
 
     worlds, varying = sample.worlds, evaluation.drawn_alike(sample.worlds, scenario)
@@ -133,7 +141,7 @@ def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tupl
 
 
 def _folded(text: str, most: int, width: int = 80) -> list[str]:
-    """The lines of a text, at most so many."""
+    """Return the text as at most ``most`` lines of ``width`` characters; what does not fit becomes ``...``."""
     return textwrap.wrap(text, width, max_lines=most, placeholder=" ...", break_on_hyphens=False)
 
 
@@ -145,7 +153,7 @@ def _share(part: int, whole: int, things: str = "worlds") -> str:
 def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> None:
     """Describe a scenario in plain sentences.
 
-    Who stands in line, how each quantity is drawn, who knows what when, and whose harm counts.
+    Describes the line, how each quantity is drawn, who knows what when, and whose harm counts.
     """
     with Out(as_json=as_json) as out:
         chosen = evaluation.load_runnable(scenario)
@@ -154,9 +162,9 @@ def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> Non
 
 
 def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
-    """What is declared, piece by piece; empty where there is nothing to say."""
-    from ethbrake_marl.agents import find_entry
-    from ethbrake_marl.harm import OBJECTIVES
+    """Yield a sentence about each part of the scenario; an empty text if there is nothing to say about a part."""
+    from ethbrake_marl.agents.making import find_entry
+    from ethbrake_marl.game.objectives import OBJECTIVES
 
     yield f"{scenario.name}: {scenario.title or 'no title'}. {scenario.description}".rstrip()
     learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners) or "nobody"
@@ -183,7 +191,7 @@ def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
     for key, rule in scenarios.QUANTITY.declared.items():
         told = _declared_in_words(scenario, key)
         yield f"{rule.label[0].upper()}{rule.label[1:]}: {told}; {rule.meaning}." if told else ""
-    common = scenario.model_fields_set if scenario.members else type(scenario).model_fields  # to a whole mixture
+    common = scenario.model_fields_set if scenario.members else type(scenario).model_fields  # same for all members
     yield _news_in_words(scenario) if "v2x" in common else "Who knows what when (V2X) differs between these scenarios."
     early = "stays in the list" if scenario.early_impacts == "keep" else "is drawn again"
     yield (
@@ -201,7 +209,7 @@ def _obstacle_in_words(scenario: scenarios.Scenario) -> str:
 
 
 def _declared_in_words(scenario: scenarios.Scenario, key: str) -> str:
-    """How a quantity is drawn; empty where it is not declared, or by each type."""
+    """Describe how the quantity ``key`` is drawn; empty if the scenario does not declare it."""
     if scenario.members:
         told = key in scenarios.QUANTITY.usual or (
             key == "friction" and all(each.declares(key) for each in scenario.members)
@@ -218,7 +226,7 @@ def _declared_in_words(scenario: scenarios.Scenario, key: str) -> str:
 
 
 def _in_words(quantity: Any) -> str:
-    """A number or a distribution."""
+    """Describe ``quantity``, a number or a distribution of a scenario, in words: ``5 to 9 (uniform)``."""
     if isinstance(quantity, float):
         return f"{quantity:g}"
     (kind, shape), *more = quantity.model_dump(exclude_none=True).items()
@@ -229,7 +237,7 @@ def _in_words(quantity: Any) -> str:
 
 
 def _news_in_words(scenario: scenarios.Scenario) -> str:
-    """Who knows what, and when."""
+    """Return a sentence about the scenario's V2X channel: which vehicle knows what, and when."""
     channel, about = scenario.v2x.channel._asdict(), type(scenario.v2x).model_fields
     usual = scenarios.CHANNELS["paper"]._asdict()
     other = {key: value for key, value in channel.items() if key in about and value != usual[key]}
@@ -256,71 +264,28 @@ def scenario_new(
 
 @scenario_group.command("parts", epilog=example("scenario parts"))
 def scenario_parts(as_json: JsonOption = False) -> None:
-    """List what scenarios and recipes may name.
+    """List the names that scenarios and recipes may use.
 
-    Reward terms, features of observations, V2X presets, objectives, training algorithms, recipes and measures.
+    Features of observations, V2X presets, objectives, training algorithms, recipes and measures, which rewards weigh.
     """
-    from ethbrake_marl.harm import OBJECTIVES
-    from ethbrake_marl.observations import FEATURES
-    from ethbrake_marl.rewards import TERMS
+    from ethbrake_marl.game.features import FEATURES
+    from ethbrake_marl.game.measures import MEASURES
+    from ethbrake_marl.game.objectives import OBJECTIVES
 
     features = FEATURES.usable().items()
     own = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in features]
     parts = {
-        "Reward terms": [*TERMS],
         "Observation": ["own", "front_K", "rear_K", "role", "obstacle", *own],
         "V2X presets": [*scenarios.CHANNELS],
         "Objectives": [kind.form for kind in OBJECTIVES.usable().values()],
-        "Algorithms": [*learning.algorithm_names()],
-        "Recipes": [*learning.TrainingRecipe.shipped()],
-        "Measures": [*evaluation.MEASURES],
+        "Algorithms": [*training.algorithm_names()],
+        "Recipes": [*training.TrainingRecipe.usable()],
+        "Measures": [*MEASURES],
     }
     with Out(as_json=as_json) as out:
         out.result(
             parts, Sheet("", ("What", "Names"), [(what, ", ".join(names)) for what, names in parts.items()], gap=2)
         )
-
-
-@scenario_group.command(
-    "from-data", epilog=example("scenario from-data highd/data --format highd --output my-motorway.yaml")
-)
-def scenario_from_data(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the recordings.")],
-    format: Annotated[Literal["highd", "ngsim", "openacc"], typer.Option(help="Format of the recordings.")],
-    output: Annotated[
-        Path, typer.Option(metavar="FILE", help="The .yaml to write; its rows stand in the .csv beside.")
-    ],
-    based_on: Annotated[
-        str,
-        typer.Option(metavar="NAME|PATH", help="Scenario for what is not recorded, and for the number of vehicles."),
-    ] = "realistic-motorway",
-    every: Annotated[float, typer.Option(help="Seconds between two moments that become rows.")] = 1.0,
-    draw: Annotated[
-        Literal["rows", "normal", "lognormal", "quantiles"],
-        typer.Option(help="Draw whole rows, or each quantity from a fit to it."),
-    ] = "rows",
-    force: ForceOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Make a scenario of recorded traffic: highD, NGSIM, OpenACC.
-
-    Vehicles that follow each other in a lane become rows: speeds, and gaps from bumper to bumper.
-    """
-    with Out(as_json=as_json, force=force) as out:
-        rows = output.with_suffix(".csv")
-        out.check(output, ".yaml", what="the scenario")
-        out.check(rows)
-        text, table, told = scenarios.scenario_from_data(
-            output.stem, folder, format, based_on=based_on, every_s=every, draw=draw, progress=out.progress
-        )
-        with new_file(output) as partial:
-            partial.write_text(text, "utf-8")
-            if draw == "rows":
-                out.write(rows, table, what="rows")
-            else:  # those of before would be left behind, unnamed
-                rows.unlink(missing_ok=True)
-        out.note(f"written: {output}; try it: ethbrake scenario validate {output}")
-        out.result({"scenario": str(output), "rows": str(rows) if draw == "rows" else None, "found": told}, *told)
 
 
 @scenario_group.command("schema", epilog=example("scenario schema > scenario.schema.json"))
@@ -350,13 +315,13 @@ def scenario_sample(
 ) -> None:
     """Draw worlds of a list, as a table or a picture.
 
-    The table has a column for each quantity that the scenario does not fix; `Scenario.read_worlds` reads it. The
-    picture shows distributions, pairs of quantities, and three worlds. The same list, seed and number are the same
+    The table has a column for each quantity that the scenario does not fix; `eb.read_worlds` reads it. The
+    picture shows distributions, pairs of quantities, and three worlds. The same list, seed and number give the same
     worlds on every machine.
     """
     with Out(as_json=as_json, force=force) as out:
         out.check(output, ".csv", ".png", ".svg", ".pdf", what="worlds")
-        chosen = evaluation.load_runnable(scenario, learning.read_settings(settings).scenario)
+        chosen = evaluation.load_runnable(scenario, training.read_settings(settings).scenario)
         pictured = None if output is None or output.suffix.lower() == ".csv" else output
         usual = TABLE_WORLDS if pictured is None else PICTURE_WORLDS
         sample = chosen.sample(usual if episodes is None else episodes, seed)
@@ -366,9 +331,7 @@ def scenario_sample(
             *(",".join("" if each is None else repr(each) for each in state.values()) for state in states),
         ]
         if pictured is not None:
-            from ethbrake_marl.figures import worlds_figure, write_picture
-
-            write_picture(pictured, worlds_figure(chosen, sample, seed=seed), force=out.force)
+            page_of("worlds", f"--output {pictured.name}")(pictured, chosen, sample, seed=seed, force=out.force)
             out.note(f"picture: {pictured}")
         elif output is not None:
             out.write(output, "\n".join([*lines, ""]), what="worlds")
@@ -386,10 +349,11 @@ agent_group = typer.Typer(
 def agent_list(as_json: JsonOption = False) -> None:
     """List all agents: how each is written, what it does, what it knows.
 
-    What begins with + goes behind any agent, for instance full_brake+step: +search first, then one shield.
+    Names with + go behind any agent, for instance full_brake+step: +search first, then one shield.
     """
     with Out(as_json=as_json) as out:
-        from ethbrake_marl.agents import Knowledge, agent_entries, agents_refused
+        from ethbrake_marl.agents.protocol import Knowledge
+        from ethbrake_marl.agents.registry import agent_entries, agents_refused
 
         told, rows = [], []
         for entry in agent_entries():
@@ -416,10 +380,10 @@ def agent_export(
 ) -> None:
     """Write a policy as an ONNX model: observation in, acceleration out.
 
-    Needs the package onnx, which the extra `export` brings.
+    Needs the package onnx, which the extra `export` installs.
     """
     with Out(force=force) as out:
-        from ethbrake_marl.policies import load_named_policy
+        from ethbrake_marl.policies.shipped import load_named_policy
 
         out.check(onnx)
         out.write(onnx, load_named_policy(policy).to_onnx(), what="written")

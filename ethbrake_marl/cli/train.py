@@ -8,31 +8,39 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
-from ethbrake_marl import evaluation, learning, scenario as scenarios
+from ethbrake_marl import evaluation, scenario as scenarios, training
 from ethbrake_marl.cli.command import (
     ForceOption,
     JsonOption,
     Out,
-    RecipeOption,
     ScenarioOption,
     SettingsOption,
     StepsOption,
     schema_option,
 )
-from ethbrake_marl.errors import InvalidInput, Progress
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.progress import Progress
 
 KEPT = (
     "if the training had begun, the run's folder keeps the last good policy, and ethbrake train --resume FOLDER goes on"
 )
+
 RUNS = Path("runs")
+
+QUICKEST = ("quick", "ppo")  # what `ethbrake run` trains: the first whose algorithm is installed
+
 TrainingSeedOption = Annotated[int | None, typer.Option(help="Seed of the training.", show_default="the recipe's")]
+
 OutputOption = Annotated[
     Path | None, typer.Option(metavar="FOLDER", help="Folder of the run.", show_default="runs/SCENARIO-RECIPE-seedSEED")
 ]
 
 
-def run_folder(scenario: scenarios.Scenario, recipe: learning.TrainingRecipe, seed: int | None) -> Path:
-    """Where a run goes if nothing else is said; the scheme stands behind the recipe where the recipe names one."""
+def run_folder(scenario: scenarios.Scenario, recipe: training.TrainingRecipe, seed: int | None) -> Path:
+    """Return the default folder of a run: ``runs/SCENARIO-RECIPE-seedSEED``.
+
+    If the recipe names a scheme for several learners, it follows the recipe's name. ``seed`` None: the recipe's seed.
+    """
     plan = recipe.name if recipe.scheme is None else f"{recipe.name}-{recipe.scheme}"
     return RUNS / f"{scenario.name}-{plan}-seed{recipe.seed if seed is None else seed}"
 
@@ -43,7 +51,14 @@ def run_command(
     seed: TrainingSeedOption = None,
     episodes: Annotated[int, typer.Option(help="Worlds of the evaluation list.")] = 10_000,
     list_seed: Annotated[int, typer.Option(help="Seed of the evaluation list.")] = 7,
-    recipe: RecipeOption = "quick",
+    recipe: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME|PATH",
+            help="A shipped recipe, or a path to a YAML file.",
+            show_default=f"{QUICKEST[0]}, or {QUICKEST[1]} where no extension gives its algorithm",
+        ),
+    ] = None,
     settings: SettingsOption = None,
     output: OutputOption = None,
     force: ForceOption = False,
@@ -51,16 +66,16 @@ def run_command(
 ) -> None:
     """Train a policy, shield it, compare with the baselines, report.
 
-    Writes the run's folder: the policy, results as CSV and JSON, every world, three figures, and report.html. After
-    one of the three tests (paper-random, -brake-only, -obstacle) the policy also drives the other two.
-    Ctrl-C ends the training early, and what it has is evaluated; a second Ctrl-C stops at once.
+    Writes the run's folder: the policy, results as CSV and JSON, every world, and the installed reports: three
+    figures and report.html; for one of the three tests (paper-random, -brake-only, -obstacle) also the other two.
+    Ctrl-C ends the training early, and the policy so far is evaluated; a second Ctrl-C stops at once.
     """
     with Out(as_json=as_json, force=force, kept=KEPT) as out:
         # torch takes seconds to load, here and in the other commands that learn
-        from ethbrake_marl.studies.experiment import run_experiment
+        from ethbrake_marl.training.experiment import run_experiment
 
-        plan = learning.load_recipe(recipe)
-        given = learning.read_settings(settings, [plan])
+        plan = training.load_recipe(recipe or quickest())
+        given = training.read_settings(settings, [plan])
         chosen = evaluation.load_runnable(scenario, given.scenario, drives="one")
         plan = given.change(plan, out.note)
         result = run_experiment(
@@ -82,9 +97,16 @@ def run_command(
             f" {trained.wall_s:.0f} s ({trained.status}). hybrid is the trained policy behind its shield. All minimise"
             f" {count} harm.\n"
         )
-        out.result(result.results, Text(told), result.rows.brief(result.beside), *result.rows.tables()[1:])
-        out.note(f"report, with every measure and the paper's rows: {result.report}")
+        out.result(result.results, Text(told), *result.tables)
+        for note in result.notes:
+            out.note(note)
         _end(out, result.trained)
+
+
+def quickest() -> str:
+    """Return the name of the recipe that `ethbrake run` trains by default."""
+    usable = training.TrainingRecipe.usable()
+    return next(name for name in QUICKEST if name in usable)
 
 
 def train_command(
@@ -113,16 +135,15 @@ def train_command(
             "--other-versions", help="With --resume: go on although other versions trained it; numbers may differ."
         ),
     ] = False,
-    schema: schema_option("ethbrake_marl.learning", "TrainingRecipe", "recipe") = False,  # type: ignore[valid-type]  # made here
+    schema: schema_option("ethbrake_marl.training", "TrainingRecipe", "recipe") = False,  # type: ignore[valid-type]  # made here
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Train a policy, or those of several learners.
+    """Train a policy, or the policies of several learners.
 
     Writes a run's folder. Afterwards: `ethbrake evaluate --agents full_brake,ppo@FOLDER,ppo@FOLDER+episode`;
-    of several: `team@FOLDER`. Ctrl-C ends the training after the update in progress and keeps the policy; `ethbrake
-    train --resume FOLDER` goes on: the policy is the one that the training would have come to without the stop, bit
-    for bit.
+    for several learners: `team@FOLDER`. Ctrl-C ends the training after the current update and keeps the policy;
+    `ethbrake train --resume FOLDER` continues: the final policy is the same, bit for bit, as without the stop.
     """
     with Out(as_json=as_json, force=force, kept=KEPT) as out:
         if resume is not None:
@@ -137,30 +158,30 @@ def train_command(
                 name for name, value in {**asked, "--seed": seed, "--force": force or None}.items() if value is not None
             ):
                 raise InvalidInput(f"{option}: --resume goes on with what the folder says; leave one of the two out")
-            _tell(out, learning.resume(resume, on_progress=out.show_progress, other_versions=other_versions))
+            _tell(out, training.resume(resume, on_progress=out.show_progress, other_versions=other_versions))
             return
         if other_versions:
             raise InvalidInput("--other-versions: a new training has the versions of now; give it with --resume FOLDER")
-        plan = learning.load_recipe(recipe or "ppo")
-        given = learning.read_settings(settings, [plan])
+        plan = training.load_recipe(recipe or "ppo")
+        given = training.read_settings(settings, [plan])
         chosen = evaluation.load_runnable(scenario or "paper-random", given.scenario)
         plan = given.change(plan, out.note)
-        begun = [learning.Training.of(plan, chosen).who_drives()]
+        begun = [training.Training.of(plan, chosen).who_drives()]
 
         def tell(progress: Progress) -> None:
-            if begun:  # all input is known to be good
+            if begun:  # all input has been checked by now
                 out.note(begun.pop())
             out.show_progress(progress)
 
         folder = output or run_folder(chosen, plan, seed)
-        result = learning.train(
+        result = training.train(
             plan, chosen, folder, steps=steps, seed=seed, force=force, on_progress=tell, settings=given.texts
         )
         _tell(out, result)
 
 
-def _tell(out: Out, result: learning.TrainResult) -> None:
-    """What a training came to."""
+def _tell(out: Out, result: training.TrainResult) -> None:
+    """Print the result of a training as JSON on stdout, and how it ended on stderr."""
     out.result({
         "directory": str(result.directory),
         "status": result.status,
@@ -174,8 +195,8 @@ def _tell(out: Out, result: learning.TrainResult) -> None:
     _end(out, result)
 
 
-def _end(out: Out, result: learning.TrainResult) -> None:
-    """Say what a training left; an interrupted one ends with that status."""
+def _end(out: Out, result: training.TrainResult) -> None:
+    """Print how the training of ``result`` ended and where it is; if it was interrupted, exit with status 130."""
     if result.status == "interrupted":
         left = f"go on with: ethbrake train --resume {result.directory} (its policy is there)"
         out.interrupted(f"interrupted after {result.steps:,} training steps; {left}")

@@ -1,87 +1,74 @@
-"""Measuring agents on fixed lists of worlds: inputs, rollouts, measures, statistics, tables, results, episodes."""
+"""Evaluation of agents on fixed lists of worlds: rollouts, measures, statistics, tables, results files, episodes."""
 
 from typing import TYPE_CHECKING
 
 from ethbrake_marl.doors import front_door
 
 if TYPE_CHECKING:
+    from ethbrake_marl.agents.protocol import policy_sha256 as policy_sha256
     from ethbrake_marl.evaluation.chunks import (
         Lineup as Lineup,
         evaluate_held as evaluate_held,
         summarise_tally as summarise_tally,
         tally_list as tally_list,
     )
-    from ethbrake_marl.evaluation.curves import (
-        DecelerationCurve as DecelerationCurve,
-        deceleration_curve as deceleration_curve,
-    )
-    from ethbrake_marl.evaluation.episodes import (
-        EpisodeMotion as EpisodeMotion,
-        EpisodeRecord as EpisodeRecord,
-        check_dataset as check_dataset,
-        check_film as check_film,
-        film as film,
-        follow_episodes as follow_episodes,
-        record_episode as record_episode,
-        write_dataset as write_dataset,
-    )
-    from ethbrake_marl.evaluation.inputs import (
+    from ethbrake_marl.evaluation.comparison import compare_results as compare_results
+    from ethbrake_marl.evaluation.conditions import Conditions as Conditions
+    from ethbrake_marl.evaluation.evaluation import Evaluation as Evaluation
+    from ethbrake_marl.evaluation.exploits import Exploits as Exploits
+    from ethbrake_marl.evaluation.groups import summarise_by as summarise_by
+    from ethbrake_marl.evaluation.identity import (
         EPISODES as EPISODES,
         HELD as HELD,
         LIST_SEED as LIST_SEED,
-        NamedWorld as NamedWorld,
-        NamedWorlds as NamedWorlds,
-        check_agents as check_agents,
-        drawn_alike as drawn_alike,
-        load_runnable as load_runnable,
-        make_agents as make_agents,
-        make_lineup as make_lineup,
-        policy_sha256 as policy_sha256,
         result_identity as result_identity,
         result_versions as result_versions,
-        states_of as states_of,
-        try_scenario as try_scenario,
         worlds_sha256 as worlds_sha256,
     )
-    from ethbrake_marl.evaluation.measures import (
-        MEASURES as MEASURES,
-        PAPER_ROWS as PAPER_ROWS,
-        REGISTERED as REGISTERED,
-        TESTS as TESTS,
-        Conditions as Conditions,
-        Evaluation as Evaluation,
-        Exploits as Exploits,
-        LeftOut as LeftOut,
-        Outcome as Outcome,
-        PaperRow as PaperRow,
-        Rescores as Rescores,
-        SummaryRow as SummaryRow,
-        SummaryTable as SummaryTable,
-        Tally as Tally,
-        is_papers_test as is_papers_test,
-        load_measures as load_measures,
-        other_tests as other_tests,
-        register_measure as register_measure,
-        summarise as summarise,
-        summarise_by as summarise_by,
+    from ethbrake_marl.evaluation.lineup import (
+        check_agents as check_agents,
+        make_agents as make_agents,
+        make_lineup as make_lineup,
     )
-    from ethbrake_marl.evaluation.results import (
-        compare_results as compare_results,
+    from ethbrake_marl.evaluation.measure_sets import (
+        MEASURE_SETS as MEASURE_SETS,
+        Measure as Measure,
+        MeasureSet as MeasureSet,
+        Silent as Silent,
+        register_measure_set as register_measure_set,
+    )
+    from ethbrake_marl.evaluation.motion import EpisodeMotion as EpisodeMotion, follow_episodes as follow_episodes
+    from ethbrake_marl.evaluation.outcome import LeftOut as LeftOut, Outcome as Outcome
+    from ethbrake_marl.evaluation.own_measures import load_measures as load_measures
+    from ethbrake_marl.evaluation.per_world import (
         read_result as read_result,
         results_to_json as results_to_json,
         write_per_world as write_per_world,
     )
+    from ethbrake_marl.evaluation.record import EpisodeRecord as EpisodeRecord, record_episode as record_episode
+    from ethbrake_marl.evaluation.rescores import Rescores as Rescores
     from ethbrake_marl.evaluation.rollout import evaluate as evaluate, outcome_of as outcome_of
+    from ethbrake_marl.evaluation.seeds import (
+        interquartile_mean as interquartile_mean,
+        mean_over_seeds as mean_over_seeds,
+        share_over_seeds as share_over_seeds,
+    )
     from ethbrake_marl.evaluation.shield_modes import ShieldModes as ShieldModes, compare_modes as compare_modes
     from ethbrake_marl.evaluation.statistics import (
-        interquartile_mean as interquartile_mean,
         mean as mean,
-        mean_over_seeds as mean_over_seeds,
         paired_difference as paired_difference,
         rate as rate,
         relative_decrease as relative_decrease,
-        share_over_seeds as share_over_seeds,
         unpaired_difference as unpaired_difference,
     )
+    from ethbrake_marl.evaluation.summary import (
+        RowsBeside as RowsBeside,
+        SummaryTable as SummaryTable,
+        summarise as summarise,
+    )
+    from ethbrake_marl.evaluation.summary_row import SummaryRow as SummaryRow
+    from ethbrake_marl.evaluation.tally import Tally as Tally
+    from ethbrake_marl.evaluation.trial import load_runnable as load_runnable, try_scenario as try_scenario
+    from ethbrake_marl.evaluation.varying import drawn_alike as drawn_alike, states_of as states_of
 else:
     __getattr__ = front_door(__name__, __file__)

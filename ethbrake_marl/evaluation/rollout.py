@@ -1,6 +1,6 @@
-"""The evaluation of every agent on the same fixed list of worlds, each world once.
+"""Evaluate agents: draw a fixed list of worlds, let every agent drive each world once, and measure the results.
 
-Counting "the first episodes that finish" instead would over-count short ones, and crashes end early.
+The list is fixed because "the first episodes that finish" would contain too many short episodes, and crashes end early.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents import Driver, Episodes, Knowledge, Team, check_agent, drive, script_agents
-from ethbrake_marl.engine import check_alert, is_state_free
+from ethbrake_marl.agents.driving import Episodes, drive, script_agents
+from ethbrake_marl.agents.protocol import Driver, Knowledge, Team, check_agent
+from ethbrake_marl.engine.stream import check_alert
 from ethbrake_marl.errors import (
     AgentFailed,
     InvalidInput,
@@ -24,121 +25,23 @@ from ethbrake_marl.errors import (
     renumbered,
     unknown_name,
 )
-from ethbrake_marl.evaluation.inputs import CHUNK, EPISODES, LIST_SEED, make_lineup, policies_of, warn_unfamiliar
-from ethbrake_marl.evaluation.measures import REGISTERED, Evaluation, LeftOut, Outcome, Tape
-from ethbrake_marl.physics import (
-    Decisions,
-    Floats,
-    Ints,
-    Worlds,
-    advance,
-    leaving_out_failed,
-    move_on,
-    sample_on,
-    sum_rows,
-)
-from ethbrake_marl.scenario import Sample, Scenario, ScriptSpec, Task, load_scenario
+from ethbrake_marl.evaluation.aftermath import SampledHarm, ShovedFront
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.familiar import warn_unfamiliar
+from ethbrake_marl.evaluation.identity import CHUNK, EPISODES, LIST_SEED, policies_of
+from ethbrake_marl.evaluation.lineup import make_lineup
+from ethbrake_marl.evaluation.outcome import LeftOut, Outcome
+from ethbrake_marl.evaluation.own_measures import measure_columns
+from ethbrake_marl.evaluation.tape import Tape
+from ethbrake_marl.game.measures import REPORTED
+from ethbrake_marl.physics.left_out import leaving_out_failed
+from ethbrake_marl.physics.state import Ints, Worlds
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.task import Task
 
-# The aftermath of a line: where Vehicle 1 ends, and how much of that others pushed it.
-#
-# Worlds know gaps and speeds, no places: a post ahead (``with_post_ahead``) makes the way of Vehicle 1 one more gap.
-
-
-class ShovedFront:
-    """Watches episodes: how far Vehicle 1 ends beyond where it would by itself, following its script undisturbed.
-
-    ``shoved = way - solo way to the horizon``. At rest, that is the distance from its own stopping point; where the
-    horizon cuts an episode off, from where it would be by then. Negative where Vehicle 1 ends short of it, as by an
-    obstacle that throws it back. See ``of`` for whom it exists.
-    """
-
-    def __init__(self, worlds: Worlds, own_way_m: Floats) -> None:
-        self._own_way_m = own_way_m
-        self._way_m = np.zeros(worlds.n)
-
-    @classmethod
-    def of(cls, worlds: Worlds, task: Task) -> ShovedFront | None:
-        """What watches these worlds (at the alert).
-
-        None where Vehicle 1 is driven, its script needs the state, or brakes build up.
-        """
-        script = None if 0 in task.vehicles else task.scenario.scripts.get(0)
-        vehicles = worlds.vehicles
-        command = None if script is None else ScriptSpec.parse(script).command(vehicles.braking_capacity_mps2[:, 0])
-        if command is None or vehicles.build_up.any():
-            return None
-        columns = (worlds.speeds_mps[:, 0], command, vehicles.latency_s[:, 0], vehicles.speed_limit_mps[:, 0])
-        speed, command, latency, limit = (np.array(column, np.float64)[:, np.newaxis] for column in columns)
-        _, way = move_on(speed, command, latency, limit, np.full(speed.shape, task.scenario.horizon_s))
-        return cls(worlds, way[:, 0])
-
-    def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Add the way of one step, by a post ahead: the world's own obstacle, or one out of reach."""
-        post = before.with_post_ahead(until_s - before.time_s)
-        after, _ = advance(post, command_mps2, until_s=until_s)
-        self._way_m += post.obstacle_gap_m - after.obstacle_gap_m
-
-    @property
-    def metres(self) -> Floats:
-        """How far Vehicle 1 was shoved in each world so far, [n]."""
-        shoved: Floats = self._way_m - self._own_way_m
-        return shoved
-
-
-VEHICLE_2 = 1  # the map's samples begin with its latency
-
-
-class SampledHarm:
-    """Watches episodes and replays their commands, step by step, through the map of ``advance_sampled``.
-
-    Each world goes to the horizon; after the end of its exact episode the last commands are held. The agent decided on
-    the exact motion; nobody decides anew. See ``of`` for whom it exists.
-    """
-
-    def __init__(self, worlds: Worlds, scenario: Scenario) -> None:
-        self._worlds = worlds.copy()
-        self._command = np.zeros(worlds.speeds_mps.shape)
-        self._harm = np.zeros(worlds.n)
-        self._start_s = worlds.first_decision_s([VEHICLE_2])
-        self._step_s, self._horizon_s = scenario.time_step_s, scenario.horizon_s
-        self._samples = -1  # steps of the map so far; the time before its first sample is the first
-
-    @classmethod
-    def of(cls, worlds: Worlds, task: Task) -> SampledHarm | None:
-        """What watches these worlds (at the alert).
-
-        None with an obstacle or brakes that build up, which the map does not know, or if others decide than Vehicle 2,
-        whose decisions are its samples.
-        """
-        obstacle = task.scenario.has_obstacle or worlds.obstacle_ahead.any()
-        if task.vehicles != (VEHICLE_2,) or obstacle or worlds.vehicles.build_up.any():
-            return None
-        if not all(map(is_state_free, script_agents(task.scenario, except_for=VEHICLE_2).values())):
-            return None
-        return cls(worlds, task.scenario)
-
-    def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Replay one step; the commands of a world whose episode has ended stay what they were."""
-        running = until_s > before.time_s
-        self._command = np.where(running[:, np.newaxis] | (self._samples < 0), command_mps2, self._command)
-        self._move()
-
-    def _move(self) -> None:
-        """Go on by one step: every world to its next sample, none beyond its first one at or after the horizon."""
-        self._samples += 1
-        next_s = np.minimum(Decisions(self._start_s, self._step_s).at(self._samples), self._horizon_s)
-        until_s = np.maximum(next_s, self._worlds.time_s)
-        impacts = sample_on(self._worlds, self._command, until_s, self._step_s)
-        self._harm += sum_rows(impacts.total_harm)
-
-    def finish(self) -> Floats:
-        """Go on to the horizon; gives the sum of each world, [n] m2/s2."""
-        while (self._worlds.time_s < self._horizon_s - 1e-6 * self._step_s).any():
-            self._move()
-        return self._harm
-
-
-OnWorlds = Callable[[str, int], None]  # agent, worlds done so far
+OnWorlds = Callable[[str, int], None]  # callback with an agent's name and its number of worlds done so far
 
 
 def evaluate(
@@ -155,26 +58,26 @@ def evaluate(
 ) -> Evaluation:
     """Let each agent drive every world once, from the alert to the episode's end.
 
-    Vehicles that are not driven follow the scenario's scripts. A world's outcome depends neither on ``chunk`` nor
-    on the other worlds. One that cannot be advanced (a defect of the physics) is left out for all agents, and stands
-    in ``left_out``.
+    The other vehicles follow the scenario's scripts. A world's outcome depends neither on ``chunk`` nor on the other
+    worlds. A world that cannot be advanced (a defect of the physics) is left out for all agents; ``left_out`` lists it.
 
     Args:
-        worlds: at the alert, or a sample of the scenario's list; None: its first ``episodes`` of ``seed``.
-        agents: specs as on the command line (``"full_brake,ppo@shipped"``, or a list), made for first-impact harm; or
-            name -> agent, of which each driven vehicle gets its own copy, or ``Team``; they are left as they are.
-        scenario: of the worlds, also by name or path.
-        vehicle: the one that is driven, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
-        episodes: worlds of the list, 10,000 where neither they nor their number is given.
-        seed: of the list, 7 where none is given; noted, not used, where worlds are given.
-        chunk: worlds advanced together; None: 2,500.
-        on_progress: is called with an agent's name and its worlds done so far, chunk by chunk.
-        aftermath: look how far Vehicle 1 is shoved, what the paper's sum over samples is, and what registered harm
-            metrics are; costs time.
+        worlds: worlds at the alert, or a sample that ``scenario.sample`` drew; None: draw ``episodes`` worlds from
+            ``seed``.
+        agents: specs as on the command line (``"full_brake,ppo@shipped"``, or a list), which minimise first-impact
+            harm; or a mapping from name to agent or ``Team``. Each controlled vehicle gets a copy of its agent; the
+            originals do not change.
+        scenario: scenario of the worlds, also by name or path.
+        vehicle: the controlled vehicle, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
+        episodes: number of worlds to draw; None: 10,000.
+        seed: seed of the list; None: 7. With ``worlds``, it is only recorded in the result.
+        chunk: number of worlds advanced together; None: 2,500.
+        on_progress: called after each chunk with an agent's name and the number of its worlds done.
+        aftermath: also measure how far Vehicle 1 is shoved, the paper's sampled harm, and measures that the user
+            registered; takes longer.
 
-    Warns (``Unfamiliar``) of policies beyond their training. Raises ``PhysicsError`` if no world is left;
-    ``InvalidInput`` for worlds that do not fit the scenario or are not at the alert, no agents, nobody to drive, a
-    team of other vehicles, or a learner that nobody drives.
+    Warns (``Unfamiliar``) about policies in worlds unlike those of their training. Raises ``PhysicsError`` if no world
+    is left; ``InvalidInput`` for worlds of another scenario or after the alert, and if agents and vehicles do not fit.
 
     """
     scenario = load_scenario(scenario)
@@ -190,10 +93,11 @@ def evaluate(
     if not sample.worlds.n:
         raise InvalidInput("evaluate: worlds: there are none; at least one is needed")
     check_alert(sample.worlds, sample.worlds.n, scenario.vehicles)
-    driven, parts = driven_vehicles(scenario, vehicle, agents), []
-    warn_unfamiliar(agents, sample.worlds, scenario, driven)
+    vehicles = driven_vehicles(scenario, vehicle, agents)
+    warn_unfamiliar(agents, sample.worlds, scenario, vehicles)
+    parts = []
     for first, part in chunks_of(sample, chunk or CHUNK):
-        parts.append(drive_chunk(part, agents, scenario, seed, driven, first, aftermath))
+        parts.append(drive_chunk(part, agents, scenario, seed, vehicles, first, aftermath))
         if on_progress is not None:
             for name in agents:
                 on_progress(name, first + part.worlds.n)
@@ -201,7 +105,7 @@ def evaluate(
 
 
 def chunks_of(sample: Sample, size: int = CHUNK) -> Iterator[tuple[int, Sample]]:
-    """The worlds in parts of this size, each with the row of its first."""
+    """Yield consecutive parts of at most ``size`` worlds, each as (row of its first world in the sample, part)."""
     for first in range(0, sample.worlds.n, size):
         yield first, sample.take(np.arange(first, min(first + size, sample.worlds.n)))
 
@@ -211,38 +115,47 @@ def drive_chunk(
     agents: Mapping[str, Driver],
     scenario: Scenario,
     seed: int | None,
-    driven: tuple[int, ...],
+    vehicles: tuple[int, ...],
     first: int = 0,
     aftermath: bool = True,
 ) -> Evaluation:
-    """Let each agent drive all of these worlds at the alert together; ``first``: row of the first one, for messages.
+    """Let each agent drive all of these worlds together, from the alert to the end of their episodes.
 
-    The evaluation has no worlds where each was left out.
+    If every world fails, the evaluation is empty.
+
+    Args:
+        sample: the worlds, a part of a list.
+        agents: agents or teams by name.
+        scenario: scenario of the worlds.
+        seed: seed of the list, which is recorded in the result.
+        vehicles: indices (0 = front) of the controlled vehicles.
+        first: row of the part's first world in the list, for error messages.
+        aftermath: also measure how far Vehicle 1 is shoved, sampled harm, and measures that the user registered.
+
     """
-    n, others = sample.worlds.n, [script.name for script in script_agents(scenario, except_for=driven).values()]
-    found: dict[str, tuple[Outcome | None, Ints]] = {}
+    n, others = sample.worlds.n, [script.name for script in script_agents(scenario, except_for=vehicles).values()]
+    outcomes: dict[str, Outcome] = {}
+    advanced: dict[str, Ints] = {}  # rows of the worlds in each outcome
     lost: dict[int, LeftOut] = {}
     for name, agent in agents.items():
-        roll_out = partial(_roll_out, sample.worlds, agent, driven, scenario, aftermath)
+        roll_out = partial(_roll_out, sample.worlds, agent, vehicles, scenario, aftermath)
         with AgentFailed.naming(name, others), renumbered(range(first, first + n)):
-            outcome, rows, failed = leaving_out_failed(roll_out, np.arange(n))
-        found[name] = outcome, rows
+            outcome, advanced[name], failed = leaving_out_failed(roll_out, np.arange(n))
+        if outcome is not None:
+            outcomes[name] = outcome
         lost = {row: LeftOut(int(sample.index[row]), seed, name, why) for row, why in failed.items()} | lost
-    left_out = tuple(lost[row] for row in sorted(lost))
-    outcomes = {name: outcome for name, (outcome, _) in found.items() if outcome is not None}
     if lost:
         good = np.setdiff1d(np.arange(n), list(lost))
-        sample, outcomes = (
-            sample.take(good),
-            {name: outcome.take(np.isin(found[name][1], good)) for name, outcome in outcomes.items()},
-        )
+        sample = sample.take(good)
+        outcomes = {name: outcome.take(np.isin(advanced[name], good)) for name, outcome in outcomes.items()}
+    left_out = tuple(lost[row] for row in sorted(lost))
     return Evaluation(
-        scenario, driven, sample.worlds, sample.index, seed, outcomes, left_out=left_out, kinds=sample.kinds
+        scenario, vehicles, sample.worlds, sample.index, seed, outcomes, left_out=left_out, kinds=sample.kinds
     )
 
 
 def _check_request(worlds: object, agents: object, chunk: object) -> None:
-    """Refuse arguments of ``evaluate`` that are not what they must be."""
+    """Raise ``InvalidInput`` if one of these arguments of ``evaluate`` has a wrong type or value."""
     if not isinstance(worlds, Worlds | Sample):
         raise InvalidInput(
             f"evaluate: worlds = {worlds!r}: must be worlds or a sample, as scenario.sample(n, seed) gives"
@@ -255,20 +168,28 @@ def _check_request(worlds: object, agents: object, chunk: object) -> None:
         raise InvalidInput("evaluate: no agents given; at least one is needed, for instance full_brake")
     for name, agent in agents.items():
         check_agent(agent, f"evaluate: agent {name!r}", alone=False)
-        Knowledge.of(agent)  # refuses what is no statement
+        Knowledge.of(agent)  # raises for an invalid ``knows``
     if chunk is not None:
         check_whole_number("evaluate: chunk", chunk, 1)
 
 
 def driven_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mapping[str, Driver]) -> tuple[int, ...]:
-    """Indices of the vehicles to drive: the given one, or all learners; nobody, if the agents are teams of nobody."""
+    """Return the indices (0 = front) of the vehicles that the agents are to control.
+
+    This is ``vehicle`` (name or index), or all learners of the scenario if ``vehicle`` is None. Without learners the
+    result is empty if all agents are teams; otherwise raises ``InvalidInput``.
+    """
     if vehicle is not None or (not scenario.learners and any(not isinstance(a, Team) for a in agents.values())):
         return (controlled_vehicle(scenario, vehicle),)
     return scenario.learners
 
 
 def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
-    """Index of the vehicle to drive: the given one, or the scenario's only learner; raises ``InvalidInput``."""
+    """Return the index (0 = front) of the single controlled vehicle.
+
+    This is ``vehicle`` (name or index), or the scenario's only learner if ``vehicle`` is None. Raises ``InvalidInput``
+    if there is not exactly one learner, or another learner than ``vehicle``.
+    """
     learners = scenario.learners
     names = [scenario.vehicle_names[i] for i in learners]
     if vehicle is None:
@@ -289,32 +210,42 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
 
 
 def _roll_out(
-    whole: Worlds, agent: Driver, driven: tuple[int, ...], scenario: Scenario, aftermath: bool, rows: Ints
+    whole: Worlds, agent: Driver, vehicles: tuple[int, ...], scenario: Scenario, aftermath: bool, rows: Ints
 ) -> Outcome:
-    """Outcome of a fresh team in these worlds; what an agent says about a world counts where it drives alone."""
-    team = Team.of(agent, driven)
+    """Let a new team of copies of ``agent`` drive the worlds with the row numbers ``rows`` of ``whole``.
+
+    ``vehicles`` are the indices of the controlled vehicles. With ``aftermath``, also measure how far Vehicle 1 is
+    shoved, sampled harm, and measures that the user registered.
+    """
+    team = Team.of(agent, vehicles)
     worlds = scenario.play_pieces(whole.take(rows), tuple(team.drivers))
     task = Task(scenario, tuple(team.drivers))
     shoved = ShovedFront.of(worlds, task) if aftermath else None
     sampled = SampledHarm.of(worlds, task) if aftermath else None
-    impacts = Tape(worlds, steps=False) if aftermath and REGISTERED else None
-    episodes = drive(worlds, team, scenario, watched_by=[w for w in (shoved, sampled, impacts) if w is not None])
+    by_step = [measure.name for measure in REPORTED.values() if measure.by == "step" and aftermath]
+    impacts = Tape(worlds, steps=False) if aftermath and len(REPORTED) > len(by_step) else None
+    watches = [w for w in (shoved, sampled, impacts) if w is not None]
+    episodes = drive(worlds, team, scenario, watched_by=watches, summed=by_step)
     outcome = outcome_of(team, episodes)
     return replace(
         outcome,
         shoved_m=None if shoved is None else shoved.metres,
         sampled_harm=None if sampled is None else sampled.finish(),
-        metrics={} if impacts is None else impacts.measured(),
+        metrics=measure_columns(episodes.terms, None if impacts is None else impacts.episodes()) if aftermath else {},
     )
 
 
 def outcome_of(team: Team, episodes: Episodes) -> Outcome:
-    """What a team achieved in its episodes, without their aftermath."""
-    told: Any = next(iter(episodes.memories.values()), None) if len(team.drivers) == 1 else None
+    """Return the ``Outcome`` of the episodes that a team has driven.
+
+    It lacks what watchers measure during the episodes: ``shoved_m``, ``sampled_harm`` and ``metrics``. The fields
+    ``predicted_harm`` and ``chosen_policy`` come from the memory of an agent that drives alone, or from a shield.
+    """
+    memory: Any = next(iter(episodes.memories.values()), None) if len(team.drivers) == 1 else None
     if episodes.guarded is not None:
-        told = episodes.guarded.told
+        memory = episodes.guarded.told
     predicted, chosen = (
-        _read_column(team, told, what, episodes.final.n) for what in ("predicted_harm", "chosen_policy")
+        _read_column(team, memory, what, episodes.final.n) for what in ("predicted_harm", "chosen_policy")
     )
     return Outcome(
         episodes.ledger,
@@ -328,7 +259,10 @@ def outcome_of(team: Team, episodes: Episodes) -> Outcome:
 
 
 def _read_column(team: Team, memory: Any, what: str, n: int) -> NDArray[np.generic] | None:
-    """What the memory of who drives holds about each world of the batch, or None when it holds nothing."""
+    """Return the entry ``what`` of an agent's memory, one number per world [n]; None if there is no such entry.
+
+    ``team`` is named in errors.
+    """
     value = memory.get(what) if isinstance(memory, Mapping) else None
     if value is None:
         return None

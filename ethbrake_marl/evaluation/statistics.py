@@ -1,15 +1,14 @@
 """Estimates with 95 % intervals, from one number per world.
 
-The worlds of a list are independent draws, and every agent is measured on the same ones: rates get Wilson's score
-interval, means the t interval of the mean, and comparisons with a baseline are paired
-by world, so that the spread between easy and hard worlds cancels. Means and their errors come from exact sums: the
-order of the worlds changes no bit of them.
+The worlds of a list are independent draws, and every agent is measured on the same worlds. Rates have Wilson's score
+interval, means have the t interval, and comparisons with a baseline are paired by world, so that the spread between
+easy and hard worlds cancels. Means and their errors come from exact sums, so the order of the worlds does not change a
+bit.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 
@@ -19,15 +18,15 @@ from scipy.special import ndtri, stdtrit
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.physics import Floats, Ints
+from ethbrake_marl.physics.state import Floats, Ints
 
 
 def exact_sum(values: Floats, others: Floats | None = None) -> Fraction:
-    """Sum of ``values`` [n], or of their products with ``others`` [n], without any rounding.
+    """Return the exact sum of ``values`` [n], or of their products with ``others`` [n], without rounding.
 
-    A float64 is a whole number of 53 bits times a power of two. The whole numbers of each power are added as Python's
-    own, which have no largest one. So no order of the worlds, and no division into parts, changes a bit. ``math.fsum``
-    rounds the sum of each part, and a sum of parts once more. Raises ``InvalidInput`` for what is not finite.
+    A float64 is a whole number of 53 bits times a power of two. The whole numbers of each power are added as Python
+    integers, which never overflow. So neither the order of the worlds nor a division into parts changes a bit. By
+    contrast, ``math.fsum`` rounds the sum of each part. Raises ``InvalidInput`` unless all numbers are finite.
     """
     wholes, powers = _in_wholes(values)
     if others is not None:
@@ -38,7 +37,7 @@ def exact_sum(values: Floats, others: Floats | None = None) -> Fraction:
 
 
 def _in_wholes(values: Floats) -> tuple[NDArray[np.object_], Ints]:
-    """Whole numbers and powers, [n] each: ``values = whole * 2 ** power``."""
+    """Return integers and powers of two, [n] each, such that ``values = integer * 2 ** power`` exactly."""
     data = np.asarray(values, np.float64)
     if data.ndim != 1 or not np.isfinite(data).all():
         raise InvalidInput(f"exact sum: shape {data.shape}; finite numbers, as [n], are needed")
@@ -47,12 +46,13 @@ def _in_wholes(values: Floats) -> tuple[NDArray[np.object_], Ints]:
 
 
 CONFIDENCE = 0.95
-_UPPER = 0.5 + 0.5 * CONFIDENCE  # the quantile at the upper end of an interval
+
+_UPPER = 0.5 + 0.5 * CONFIDENCE  # quantile at the upper end of an interval
 
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Number, sum and sum of squares of some values, exact: they are added in any order.
+    """Number, exact sum and exact sum of squares of some values; moments of parts can be added in any order.
 
     >>> import numpy as np
     >>> from ethbrake_marl.evaluation.statistics import Moments
@@ -61,14 +61,19 @@ class Moments:
 
     """
 
-    count: int = 0
-    total: Fraction = Fraction()
-    squares: Fraction = Fraction()
-    negative: int = field(default=0, compare=False)  # number of values that are, or may be, below 0
+    count: int = 0  # number of values
+    total: Fraction = Fraction()  # sum of the values
+    squares: Fraction = Fraction()  # sum of their squares
+    # Number of negative values. If it is 0, intervals do not reach below 0. For differences (``minus``), whose signs
+    # are not known, it is the number of all values.
+    negative: int = field(default=0, compare=False)
 
     @classmethod
     def of(cls, values: Floats) -> Moments:
-        """Those of ``values`` [n]; raises as ``exact_sum``."""
+        """Return the moments (number, sum and sum of squares) of ``values`` [n].
+
+        Raises ``InvalidInput`` unless all values are finite.
+        """
         return cls(len(values), exact_sum(values), exact_sum(values, values), int(np.count_nonzero(values < 0.0)))
 
     def __add__(self, other: Moments) -> Moments:
@@ -76,56 +81,83 @@ class Moments:
         return Moments(self.count + other.count, self.total + other.total, self.squares + other.squares, negative)
 
     def minus(self, other: Moments, products: Fraction) -> Moments:
-        """The moments of the differences pair by pair; ``products``: the exact sum of the products."""
+        """Return the moments of the differences ``value - other``, paired by world.
+
+        ``products`` is the exact sum over all pairs of ``value * other`` (``exact_sum``).
+        """
         return Moments(self.count, self.total - other.total, self.squares - 2 * products + other.squares, self.count)
 
     @property
     def mean(self) -> float:
-        """The mean, rounded once; raises ``ZeroDivisionError`` without a value."""
+        """Mean of the values: exact, then rounded to a float; raises ``ZeroDivisionError`` without values."""
         return float(self.total / self.count)
 
     @property
     def standard_error(self) -> float:
-        """``s / sqrt(n)`` with n - 1 degrees of freedom; raises ``ZeroDivisionError`` for fewer than two values."""
+        """Standard error of the mean, ``s / sqrt(n)`` with n - 1 degrees of freedom.
+
+        Raises ``ZeroDivisionError`` for fewer than two values.
+        """
         n = self.count
         return root((n * self.squares - self.total**2) / (n * n * (n - 1)))
 
     @property
     def estimate(self) -> Estimate:
-        """The mean of at least one value, with the interval ``mean -+ t s / sqrt(n)``; see ``mean``."""
+        """Mean with the interval ``mean -+ t s / sqrt(n)``, as the function ``mean`` returns it.
+
+        Raises ``ZeroDivisionError`` without values.
+        """
         found = self._around(self.mean, self.standard_error if self.count > 1 else 0.0)
-        return found if self.negative else _of_amounts(found, nothing=not self.squares)
+        return found if self.negative else of_amounts(found, nothing=not self.squares)
 
     def ratio_error(self, others: Moments, products: Fraction) -> float:
-        """Standard error of the ratio ``r`` of two paired means, by the delta method.
+        """Return the standard error of ``r = mean(values) / mean(others)``, paired by world, by the delta method.
 
-        The residuals ``values - r others`` have mean 0: ``s(residuals) / (sqrt(n) |mean(others)|)``. With sums S and
-        sums of products Q, ``n (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / (n - 1) / Sy^4`` is its square.
+        The residuals ``values - r * others`` have mean 0, so the error is
+        ``std(residuals) / (sqrt(n) * abs(mean(others)))``. With x the values, y the others, sums S and sums of products
+        Q, its square is ``n * (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / ((n - 1) * Sy^4)``.
+
+        Args:
+            others: moments of the denominator, in the same worlds.
+            products: exact sum over all pairs of ``value * other``.
+
         """
         n, x, y = self.count, self.total, others.total
         residuals = self.squares * y * y - 2 * x * y * products + x * x * others.squares
         return root(n * residuals / ((n - 1) * y**4))
 
     def decrease(self, baseline: Moments, products: Fraction) -> Estimate | None:
-        """``relative_decrease`` from exact moments and the exact sum of the products."""
+        """Return ``1 - mean(values) / mean(baseline)`` with its interval; None if the baseline's mean is 0.
+
+        Args:
+            baseline: moments of the baseline, in the same worlds.
+            products: exact sum over all pairs of ``value * baseline``.
+
+        """
         if baseline.total == 0:
             return None
         error = self.ratio_error(baseline, products) if self.count > 1 else 0.0
         return self._around(1.0 - float(self.total / baseline.total), error)
 
     def _around(self, value: float, error: float) -> Estimate:
-        """``value`` with the half-width ``t error`` of n - 1 degrees of freedom."""
+        """Return the estimate ``value`` with the interval ``value -+ t error``; no interval for a single value.
+
+        ``error`` is the standard error; t has n - 1 degrees of freedom.
+        """
         if self.count < 2:
             return Estimate(value, None)
         half = float(stdtrit(self.count - 1, _UPPER)) * error
         return Estimate(value, (value - half, value + half))
 
 
-def _of_amounts(found: Estimate, *, nothing: bool) -> Estimate:
-    """The estimate where no value is below 0: its interval is not either, and there is none where all values are 0.
+def of_amounts(found: Estimate, *, nothing: bool) -> Estimate:
+    """Return an estimate of a mean of non-negative values, with its interval cut off below 0.
 
-    Then nothing was seen of what may happen in other worlds: a bound of its share is that of ``rate``, a bound of the
-    mean there is not.
+    Args:
+        found: the estimate with the usual interval.
+        nothing: whether all values are 0. Then there is no interval, because such a sample bounds the share of worlds
+            with other values (see ``rate``), but not their mean.
+
     """
     if nothing or found.interval is None:
         return Estimate(found.value, None)
@@ -133,13 +165,13 @@ def _of_amounts(found: Estimate, *, nothing: bool) -> Estimate:
 
 
 def root(number: Fraction) -> float:
-    """Square root of a fraction of any size, at least 0; no step of it overflows."""
+    """Return the square root of ``number`` >= 0 as a float, even if ``number`` itself is too large for a float."""
     shift = (number.numerator.bit_length() - number.denominator.bit_length()) // 2
     return math.ldexp(math.sqrt(number / Fraction(4) ** shift), shift)
 
 
 def rate(successes: int, count: int) -> Estimate:
-    """Share ``p = successes / count`` with Wilson's score interval, which stays inside [0, 1].
+    """Return the share ``p = successes / count`` with Wilson's score interval, which stays inside [0, 1].
 
     With z the normal quantile: centre ``(p + z^2/2n) / (1 + z^2/n)``, half-width
     ``z / (1 + z^2/n) sqrt(p (1 - p) / n + z^2/4n^2)``. Raises ``InvalidInput`` unless 0 <= successes <= count >= 1.
@@ -150,7 +182,13 @@ def rate(successes: int, count: int) -> Estimate:
 
 
 def wilson(p: float, count: int) -> tuple[float, float]:
-    """Wilson's score interval of a share ``p`` of ``count`` draws, which need not be a whole number of them."""
+    """Return the ends (low, high) of Wilson's 95 % score interval of a share.
+
+    Args:
+        p: observed share, 0 to 1; ``p * count`` need not be a whole number.
+        count: number of draws.
+
+    """
     z = float(ndtri(_UPPER))
     shrink = 1.0 + z * z / count
     centre = (p + z * z / (2.0 * count)) / shrink
@@ -161,26 +199,38 @@ def wilson(p: float, count: int) -> tuple[float, float]:
 
 
 def mean(values: Floats) -> Estimate:
-    """Mean of ``values`` [n] with the interval ``mean -+ t s / sqrt(n)``; t with n - 1 degrees of freedom.
+    """Return the mean of ``values`` [n] with the interval ``mean -+ t s / sqrt(n)``; t has n - 1 degrees of freedom.
 
-    At thousands of worlds the mean is normal whatever the harm's own distribution, and the interval equals the
-    bootstrap's. Where no value is below 0 the interval ends at 0; where all are 0 there is none. Raises
+    With thousands of worlds, the mean is nearly normal whatever the distribution of harm, and the interval equals the
+    bootstrap's. If no value is negative, the interval starts at 0 or above; if all are 0, there is no interval. Raises
     ``InvalidInput`` when ``values`` is empty or not finite.
     """
-    return Moments.of(_check(values)).estimate
+    return Moments.of(check(values)).estimate
 
 
 def paired_difference(values: Floats, baseline: Floats) -> Estimate:
-    """Mean of ``values - baseline`` world by world, with the t interval of that mean."""
+    """Return the mean of ``values - baseline`` with its t interval.
+
+    ``values`` and ``baseline`` are [n] each, in the same worlds. Raises ``InvalidInput`` if their lengths differ, or if
+    they are empty or not finite.
+    """
     data, reference, products = _check_pair(values, baseline)
     return data.minus(reference, products).estimate
 
 
 def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> Estimate:
-    """``value - baseline`` of two means over n and m worlds that are taken as independent, from their t intervals.
+    """Return ``value - baseline`` of two means over n and m independent worlds, with Welch's interval.
 
-    With half-widths ``h = t_(n-1) s``, Welch: ``s^2 = s_1^2 + s_2^2``, and degrees of freedom
-    ``s^4 / (s_1^4 / (n - 1) + s_2^4 / (m - 1))``. No interval where one of the two has none.
+    The half-width of each mean's t interval, divided by its t quantile, is its standard error (``s1``, ``s2``). The
+    difference has the standard error ``s = sqrt(s1^2 + s2^2)``, with ``s^4 / (s1^4 / (n - 1) + s2^4 / (m - 1))``
+    degrees of freedom. There is no interval if one of the two means has none.
+
+    Args:
+        value: first mean with its interval.
+        n: number of its worlds.
+        baseline: second mean with its interval.
+        m: number of its worlds.
+
     """
     difference = value.value - baseline.value
     if value.interval is None or baseline.interval is None:
@@ -199,16 +249,25 @@ def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> 
 
 
 def relative_decrease(values: Floats, baseline: Floats) -> Estimate | None:
-    """``1 - mean(values) / mean(baseline)``, paired by world; None when the baseline's mean is 0.
+    """Return ``1 - mean(values) / mean(baseline)`` of two arrays [n] in the same worlds, with its interval.
 
-    Interval by the delta method: with ``r`` the ratio of the means, the residuals ``values - r baseline`` have mean 0
-    and the standard error of r is ``s_residual / (sqrt(n) mean(baseline))``.
+    Returns None if the baseline's mean is 0. Interval by the delta method: with ``r`` the ratio of the means, the
+    residuals ``values - r baseline`` have mean 0 and the standard error of r is
+    ``s_residual / (sqrt(n) mean(baseline))``.
     """
     data, reference, products = _check_pair(values, baseline)
     return data.decrease(reference, products)
 
 
-def _check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Floats:
+def check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Floats:
+    """Return ``values`` as a float array [n]; raise ``InvalidInput`` unless it is one-dimensional, not empty, finite.
+
+    Args:
+        values: the numbers.
+        who: name of the caller, for the message.
+        each: what each number belongs to, for the message: ``world`` or ``seed``.
+
+    """
     data = np.asarray(values, np.float64)
     if data.ndim != 1 or len(data) < 1 or not np.isfinite(data).all():
         raise InvalidInput(f"{who}: shape {data.shape}; at least one finite number per {each} is needed, as [n]")
@@ -216,136 +275,8 @@ def _check(values: ArrayLike, who: str = "statistics", each: str = "world") -> F
 
 
 def _check_pair(values: Floats, baseline: Floats) -> tuple[Moments, Moments, Fraction]:
-    """The moments of both, and the exact sum of their products."""
-    data, reference = _check(values), _check(baseline)
+    """Return the moments of ``values`` and of ``baseline``, and the exact sum of their products."""
+    data, reference = check(values), check(baseline)
     if data.shape != reference.shape:
         raise InvalidInput(f"statistics: {len(data)} values cannot be paired with {len(reference)} of the baseline")
     return Moments.of(data), Moments.of(reference), exact_sum(data, reference)
-
-
-# Statistics over trainings: a figure per seed, and what they say about the next seed.
-#
-# Few seeds are the rule, and one bad one moves a mean a lot. The interquartile mean leaves out the best and the worst
-# quarter; the bootstrap says how far it may be off, drawing seeds anew within each task (stratified), since tasks are
-# chosen and not drawn.
-
-RESAMPLES = 10_000  # of seeds
-_RESAMPLES = 2_000  # of seeds and worlds
-_CUT = 0.25
-_AT_ONCE = 1 << 20  # drawn worlds in memory: 8 MB
-
-
-def interquartile_mean(tasks: Sequence[ArrayLike], *, resamples: int = RESAMPLES, seed: int = 0) -> Estimate:
-    """Mean of the middle half of all figures, with its stratified bootstrap interval (percentiles).
-
-    ``tasks`` holds one list of figures, one per seed, for each task (scenario); floor(n / 4) of all n figures are left
-    out at either end. The interval is None when no task has two seeds. Raises ``InvalidInput`` for a task without
-    figures, or with one that is not finite.
-    """
-    from scipy.stats import bootstrap, trim_mean  # a second to load, and no table of an evaluation needs it
-
-    strata = [_check(figures, f"interquartile_mean: task {k}", "seed") for k, figures in enumerate(tasks)]
-    if not strata:
-        raise InvalidInput("interquartile_mean: no tasks; at least one list of figures is needed")
-
-    def statistic(*drawn: Floats, axis: int) -> Floats:
-        middle: Floats = trim_mean(np.concatenate(drawn, axis=axis), _CUT, axis=axis)
-        return middle
-
-    value = float(statistic(*strata, axis=0))
-    again = [figures for figures in strata if len(figures) > 1]
-    if not again:
-        return Estimate(value, None)
-    fixed = [figures for figures in strata if len(figures) == 1]
-
-    def resample(*drawn: Floats, axis: int) -> Floats:
-        shape = drawn[0].shape[:-1]
-        return statistic(*drawn, *(np.broadcast_to(one, (*shape, 1)) for one in fixed), axis=axis)
-
-    found = bootstrap(
-        again, resample, n_resamples=resamples, confidence_level=CONFIDENCE, method="percentile", rng=seed,
-        vectorized=True,
-    )  # fmt: skip
-    return Estimate(value, (float(found.confidence_interval.low), float(found.confidence_interval.high)))
-
-
-def mean_over_seeds(values: ArrayLike, baseline: ArrayLike | None = None, *, seed: int = 0) -> Estimate:
-    """Mean of ``values``, or of ``values - baseline`` on the same worlds, [seeds, worlds] each.
-
-    Numbers of seeds may differ. The bootstrap interval draws the seeds of either side and the worlds, which both sides
-    share, anew: an interval of differences that leaves out 0 holds for other seeds *and* other worlds. None with a
-    single world, and where all values are 0 and have no baseline. That is no interval of truths that hold nearly
-    always or never: draws of such worlds are all alike. So that of truths without a baseline reaches at least as far
-    as Wilson's of their share over the worlds. Raises ``InvalidInput`` for arrays that cannot be paired or are not
-    finite.
-    """
-    given = np.atleast_2d(np.asarray(values))
-    sides = _pair_sides("mean_over_seeds", given, np.zeros((1, given.shape[-1])) if baseline is None else baseline)
-    value = float((sides[0].mean(axis=0) - sides[1].mean(axis=0)).mean())
-    found = _resampled(value, sides, lambda means: means[:, 0] - means[:, 1], seed)
-    if baseline is not None or (given < 0).any():
-        return found
-    if given.dtype != np.bool_:
-        return _of_amounts(found, nothing=not given.any())
-    share = min(value, 1.0)  # a mean of ones may be rounded up
-    low, high = wilson(share, given.shape[1])
-    ends = found.interval or (low, high)
-    return Estimate(share, (max(min(low, ends[0]), 0.0), min(max(high, ends[1]), 1.0)))
-
-
-def share_over_seeds(values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, seed: int = 0) -> Estimate | None:
-    """``(mean(worst) - mean(values)) / (mean(worst) - mean(best))`` on the same worlds, [seeds, worlds] each.
-
-    Which part of the way from ``worst`` to ``best`` the values are; the interval is as in ``mean_over_seeds``. None
-    where ``best`` is not below ``worst``.
-    """
-    sides = _pair_sides("share_over_seeds", values, worst, best)
-    reached, high, low = (float(side.mean(axis=0).mean()) for side in sides)
-    if not high > low:
-        return None
-
-    def shares(means: Floats) -> Floats:
-        means = means[means[:, 1] > means[:, 2]]
-        share: Floats = (means[:, 1] - means[:, 0]) / (means[:, 1] - means[:, 2])
-        return share
-
-    return _resampled((high - reached) / (high - low), sides, shares, seed)
-
-
-def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
-    """The sides as [seeds, worlds], all with the same worlds; raises ``InvalidInput``."""
-    arrays = tuple(np.atleast_2d(np.asarray(given, np.float64)) for given in sides)
-    if any(side.ndim != 2 or not side.size or side.shape[1] != arrays[0].shape[-1] for side in arrays):
-        shapes = " and ".join(str(side.shape) for side in arrays)
-        raise InvalidInput(f"{who}: shapes {shapes}: must be [seeds, worlds] with the same worlds")
-    if not all(np.isfinite(side).all() for side in arrays):
-        raise InvalidInput(f"{who}: every harm must be finite")
-    return arrays
-
-
-def _resampled(value: float, sides: Sequence[Floats], of: Callable[[Floats], Floats], seed: int) -> Estimate:
-    """``value`` with the percentiles of what it is in means drawn anew; no interval with a single world."""
-    if sides[0].shape[1] < 2:
-        return Estimate(value, None)
-    tail = 50.0 * (1.0 - CONFIDENCE)
-    low, high = np.percentile(of(_resample_means(sides, _RESAMPLES, seed)), [tail, 100.0 - tail])
-    return Estimate(value, (float(low), float(high)))
-
-
-def _resample_means(sides: Sequence[Floats], resamples: int, seed: int) -> Floats:
-    """Means [resamples, sides] over seeds of each side and over worlds, which all sides share, drawn anew."""
-    worlds = sides[0].shape[1]
-    rng = np.random.default_rng(seed)
-    parts: list[Floats] = []
-    chunk = max(1, _AT_ONCE // worlds)
-    for size in (min(chunk, resamples - begin) for begin in range(0, resamples, chunk)):
-        drawn = rng.integers(worlds, size=(size, worlds)) + worlds * np.arange(size)[:, np.newaxis]
-        weights = np.bincount(drawn.ravel(), minlength=size * worlds).reshape(size, worlds) / worlds
-        means = np.empty((size, len(sides)))
-        for column, side in enumerate(sides):
-            seeds = rng.integers(len(side), size=(size, len(side)))
-            # Not a matrix product: its order of adding depends on the machine.
-            of_seeds = np.stack([(weights * row).sum(axis=1) for row in side], axis=1)
-            means[:, column] = np.take_along_axis(of_seeds, seeds, axis=1).mean(axis=1)
-        parts.append(means)
-    return np.concatenate(parts)

@@ -1,43 +1,39 @@
-"""Strict YAML: every value with its line, and one way to write a number."""
+"""Strict YAML: every value has its line number, and one rule says what is a number."""
 
 from __future__ import annotations
 
-import copy
 import json
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn, TypeVar, get_args
+from typing import Any, NoReturn
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
-from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
-from pydantic_core import ErrorDetails, PydanticCustomError
-from pydantic_core.core_schema import NullableSchema, WithDefaultSchema
+from pydantic import BaseModel
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.store import parse_strict_json, read_plain
+from ethbrake_marl.files.plain import read_plain
 
 _NUMERAL = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 
 
 def parse_numeral(text: str) -> float | None:
-    """The number that ``text`` writes, infinite when it is too large; None when it writes none."""
+    """Return the number that ``text`` represents, infinite if it is too large; None if it is not a number."""
     return float(text) if _NUMERAL.fullmatch(text) else None
 
 
 _PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_@./-]*(:[A-Za-z0-9_@./+-]+)*")
+
 _RESERVED = {"null", "true", "false"}
 
 
 def flow_text(value: Any, longest: int | None = None) -> str:
-    """Write ``value`` in YAML's flow style; reading it back gives an equal value
-    (of printable text, lists, mappings with text keys, finite or infinite numbers, true, false, null).
+    """Write ``value`` in YAML's flow style, so that reading it back gives an equal value.
 
-    A text longer than ``longest`` characters is cut (for messages only).
+    Supports printable text, lists, mappings with text keys, finite or infinite numbers, true, false and null.
+    ``longest``: number of characters after which the text is cut off, for messages only; None: never.
     """
     text = _flow(value)
     return text if longest is None or len(text) <= longest else f"{text[: longest - 3]}..."
@@ -67,8 +63,9 @@ def _number(value: int | float) -> str:
     return {"nan": ".nan", "inf": ".inf", "-inf": "-.inf"}.get(text, text)
 
 
-SIZE_LIMIT = 64 * 1024  # bytes
-DEPTH_LIMIT = 16  # mappings and lists inside each other
+SIZE_LIMIT = 64 * 1024  # largest size of a file in bytes
+
+DEPTH_LIMIT = 16  # largest depth of nested mappings and lists
 
 YamlPath = tuple[str | int, ...]
 
@@ -77,58 +74,56 @@ _PLAIN_VALUES: dict[str, bool | None] = {
     **dict.fromkeys(("true", "True", "TRUE"), True),
     **dict.fromkeys(("false", "False", "FALSE"), False),
 }
+
 _INTEGER = re.compile(r"(?P<decimal>[-+]?[0-9]+)|0o(?P<octal>[0-7]+)|0x(?P<hexadecimal>[0-9a-fA-F]+)")
+
 _BASES = {"decimal": 10, "octal": 8, "hexadecimal": 16}
+
 _NOT_FINITE = re.compile(r"(?P<sign>[-+]?)\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
+
 _LARGEST_INTEGER = 2**63
 
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """What a file says, and on which line each of its values stands."""
+    """Content of a YAML file, and the line of each value.
 
-    file: str
+    A *path* is the keys and indices that lead to a value: ``("roles", "vehicle_2")``; ``()`` is the whole content.
+    """
+
+    file: str  # path or name of the file, for messages
     content: Any  # dict, list, str, int, float, bool or None, nested
-    lines: Mapping[YamlPath, int]  # from 1
+    lines: Mapping[YamlPath, int]  # path of a value -> its line, from 1
 
     def line_of(self, path: YamlPath) -> int | None:
-        """Line of the value at ``path``, or of the innermost value around it that the file has."""
+        """Return the line (from 1) of the value at ``path``; None if it is unknown.
+
+        ``path``: keys and indices that lead to the value. If there is no such value, the line of the innermost value
+        around it is returned.
+        """
         for length in range(len(path), -1, -1):
             if path[:length] in self.lines:
                 return self.lines[path[:length]]
         return None
 
     def where(self, path: YamlPath) -> str:
-        """The file, and the line of ``line_of`` where there is one: how a message about ``path`` begins."""
+        """Return file and line of the value at ``path`` (keys and indices), as the beginning of a message.
+
+        For example ``my.yaml, line 7``.
+        """
         line = self.line_of(path)
         return self.file if line is None else f"{self.file}, line {line}"
 
     @contextmanager
     def refusing_at(self, path: YamlPath) -> Iterator[None]:
-        """Begin the message of an ``InvalidInput`` from inside with where ``path`` stands."""
+        """Context manager: an ``InvalidInput`` raised in the block is raised again, beginning with file and line.
+
+        The line is that of the value at ``path``: keys and indices that lead to it.
+        """
         try:
             yield
         except InvalidInput as error:
             raise type(error)(f"{self.where(path)}: {error}") from None
-
-    def explain(self, error: ValidationError, wording: Wording) -> InvalidInput:
-        """The error where it does not fit its schema.
-
-        The first is shown, unknown keys before all others, and "(and k more mistakes)" tells the rest. A missing
-        key that an unknown one was probably meant to be is not counted.
-        """
-        # A default that needs another field is not made after an error elsewhere: no defect of its own.
-        details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
-        unknown = [d for d in details if d["type"] == "extra_forbidden"]
-        meant = " ".join(suggestion(str(d["loc"][-1]), wording.known(_path(d))) for d in unknown)
-        rest = [d for d in details if d not in unknown and not (d["type"] == "missing" and f" {_path(d)[-1]}" in meant)]
-        shown = (unknown + rest)[0]
-        more = len(unknown) + len(rest) - 1
-        path = _path(shown)
-        absent = shown["type"] == "missing" and len(path) == 1
-        where = self.file if absent else self.where(path)
-        told = f" (and {more} more mistake{'s' * (more > 1)})" if more else ""
-        return InvalidInput(f"{where}: {_describe(shown, path, wording)}{told}")
 
 
 def read_yaml(path: str | Path, limit: int = SIZE_LIMIT) -> Document:
@@ -140,7 +135,16 @@ def read_yaml(path: str | Path, limit: int = SIZE_LIMIT) -> Document:
 
 
 def parse_yaml(text: str | bytes, file: str = "<text>", limit: int = SIZE_LIMIT) -> Document:
-    """Parse one YAML document; ``file`` is how messages call it. Raises as ``read_yaml``."""
+    """Parse one YAML document.
+
+    Args:
+        text: the document, text or UTF-8 bytes.
+        file: name of the document in messages.
+        limit: largest accepted size in bytes.
+
+    Raises ``InvalidInput`` with file, line, column and reason for every defect.
+
+    """
     data = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
     if len(data) > limit:
         _fail(file, None, f"larger than {limit // 1024} KiB, the limit for these files")
@@ -178,14 +182,14 @@ def _fail(file: str, at: tuple[int, int] | None, reason: str) -> NoReturn:
 
 
 class _Reader:
-    """Reads the content of one document from its events."""
+    """Reader of one document's content from YAML events."""
 
     def __init__(self, file: str, text: str) -> None:
-        self.file, self.lines, self.at = file, dict[YamlPath, int](), (0, 0)  # line and column of the event in hand
+        self.file, self.lines, self.at = file, dict[YamlPath, int](), (0, 0)  # line and column of the current event
         self._events = yaml.parse(text, Loader=yaml.SafeLoader)
 
     def read(self) -> Any:
-        """The value of the whole document; None where there is nothing."""
+        """Return the value of the whole document; None if it is empty."""
         content, documents = None, 0
         for event in iter(self._next, None):
             if isinstance(event, yaml.DocumentStartEvent):
@@ -208,7 +212,7 @@ class _Reader:
         _fail(self.file, self.at, reason)
 
     def _value(self, event: Any, path: YamlPath) -> Any:
-        """What begins with this event, at this path."""
+        """Return the value that begins with the YAML event ``event`` and belongs at ``path``."""
         self._check_plain(event)
         self.lines.setdefault(path, self.at[0] + 1)
         if isinstance(event, yaml.ScalarEvent):
@@ -249,7 +253,10 @@ class _Reader:
         return key
 
     def _scalar(self, event: yaml.ScalarEvent) -> str | int | float | bool | None:
-        """Core schema of YAML 1.2; a quoted or block scalar is always text."""
+        """Convert the scalar of a YAML event by the core schema of YAML 1.2.
+
+        A quoted or block scalar is always text.
+        """
         text = str(event.value)
         if not event.implicit[0]:
             return text
@@ -271,315 +278,3 @@ class _Reader:
         if not -_LARGEST_INTEGER < value < _LARGEST_INTEGER:
             self._fail(f"integer {digits[:24]}{'...' if len(digits) > 24 else ''} does not fit into 64 bits")
         return value
-
-
-# One clear message for whatever pydantic found: where, value, what would be right. No other file words its errors.
-
-# Ending of a key -> the unit in words.
-UNITS = {
-    "s": "seconds",
-    "m": "metres",
-    "mps": "metres per second",
-    "mps2": "metres per second squared",
-    "mps3": "metres per second cubed",
-    "t": "tonnes",
-}
-_RIGHT = {
-    "finite_number": "must be a finite number",
-    "int_type": "must be a whole number, written without a decimal point or an exponent",
-    "string_type": "must be text",
-    "dict_type": "must be a mapping",
-    "model_type": "must be a mapping",
-    "model_attributes_type": "must be a mapping",
-    "tuple_type": "must be a list",
-}
-NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
-
-
-class FileModel(BaseModel):
-    """What a file may say: unknown keys, other types and later changes are refused."""
-
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
-
-
-Model = TypeVar("Model", bound=BaseModel)
-
-
-UNSHOWN = object()  # a value that the message does not show
-
-
-def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
-    """Raise the error for ``value`` at ``at`` (inside the field being checked): ``right`` says what would do."""
-    shown = "" if value is UNSHOWN else flow_text(value, 60)
-    raise PydanticCustomError("refused", "{right}", {"right": right, "value": shown, "at": at})
-
-
-def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
-    """``refuse`` the value unless ``holds``."""
-    if not holds:
-        refuse(at, value, right)
-
-
-class Wording:
-    """What messages know of one kind of file: its keys by the fields of its model, and what a missing one needs."""
-
-    def __init__(self, model: type[BaseModel], needed: str = "") -> None:
-        self.model, self._needed = model, needed
-
-    def known(self, path: YamlPath) -> list[str]:
-        """The keys that may stand where ``path`` ends."""
-        models = [self.model]
-        for key in path[:-1]:
-            inside = [model.model_fields[key].annotation for model in models if key in model.model_fields]
-            models = [found for annotation in inside for found in _models_in(annotation)] or models
-        return list(dict.fromkeys(f.alias or name for model in models for name, f in model.model_fields.items()))
-
-    def needed(self, path: YamlPath) -> str:
-        """What is needed at ``path``, where it is missing."""
-        return self._needed
-
-    def instead(self, key: str) -> str:
-        """What there is in place of a key that such files do not have; empty where nothing is known of it."""
-        return ""
-
-    def owner(self, path: YamlPath) -> str:
-        """Whose value stands at ``path``, in words; empty where that needs no saying."""
-        return ""
-
-    def right(self, detail: ErrorDetails) -> str:
-        """What would be right, where only this kind of file knows; empty where the error says it itself."""
-        return ""
-
-
-def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-    for inner in get_args(annotation):
-        yield from _models_in(inner)
-
-
-def read_model(source: str | Path | Document, model: type[Model], wording: Wording, advice: str) -> Model:
-    """What a file, or a document, says; raises ``InvalidInput`` with file, line, key, value and what would be right.
-
-    ``advice`` says what must be there where it holds no mapping of keys to values.
-    """
-    document = source if isinstance(source, Document) else read_yaml(source)
-    if not isinstance(document.content, dict):
-        raise InvalidInput(f"{document.file}: must be a mapping {advice}")
-    try:
-        return model.model_validate(document.content)
-    except ValidationError as error:
-        raise document.explain(error, wording) from None
-
-
-def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
-    """The plain content of a JSON file that a program wrote, and what it says; raises ``ValueError`` in one line."""
-    content = parse_strict_json(data)  # no key twice, no NaN
-    try:
-        return content, model.model_validate_json(data)
-    except ValidationError as error:
-        raise ValueError(str(first_mistake(error))) from None
-
-
-class Mistake(NamedTuple):
-    """The first defect that pydantic found in what no person wrote: as text ``place: right``."""
-
-    place: str  # keys with dots between them; empty for the whole
-    given: Any
-    right: str
-
-    def __str__(self) -> str:
-        return f"{self.place}: {self.right}" if self.place else self.right
-
-
-def first_mistake(error: ValidationError) -> Mistake:
-    """Where the first mistake is, and what would be right: for files that programs write, and for settings in code."""
-    detail = error.errors(include_url=False)[0]
-    right = {"missing": "is missing", "extra_forbidden": "unknown key"}.get(detail["type"])
-    return Mistake(".".join(str(key) for key in _path(detail)), detail["input"], right or _right(detail))
-
-
-def _path(detail: ErrorDetails) -> YamlPath:
-    """The path inside the file: without pydantic's tags, with the path inside the field that a check gave."""
-    keys = tuple(key for key in detail["loc"] if not (isinstance(key, str) and key.startswith("#")))
-    return (*keys, *detail.get("ctx", {}).get("at", ()))
-
-
-def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
-    place = _place(path, wording)
-    if detail["type"] == "extra_forbidden":
-        inside = wording.known(path)
-        if path[-1] in inside:
-            return f"{place}: does not go with what stands beside it; a quantity has one distribution"
-        hint = wording.instead(str(path[-1])) or suggestion(str(path[-1]), inside) or f"known: {', '.join(inside)}"
-        return f"{place}: unknown key; {hint}"
-    if detail["type"] == "missing":
-        return f"{place}: missing; {wording.needed(path)}"
-    ctx = detail.get("ctx", {})
-    value = ctx["value"] if "value" in ctx else _show(detail)
-    right = _unquote(detail) or wording.right(detail) or _right(detail)
-    return f"{place}{f' = {value}' if value else ''}: {right}".removeprefix(": ")
-
-
-def _show(detail: ErrorDetails) -> str:
-    """The value, unless the whole file is meant; a number keeps the point that makes it wrong."""
-    given = detail["input"]
-    if isinstance(given, BaseModel) or not detail["loc"]:
-        return ""
-    return repr(given) if detail["type"] == "int_type" and isinstance(given, float) else flow_text(given, 60)
-
-
-def _place(path: YamlPath, wording: Wording) -> str:
-    text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path).removeprefix(".")
-    owner = wording.owner(path)
-    return f"{text} ({owner})" if owner else text
-
-
-def _unquote(detail: ErrorDetails) -> str:
-    """What would be right for a number in quotes; empty for anything else."""
-    given = detail["input"]
-    quoted = detail["type"] == "float_type" and isinstance(given, str) and parse_numeral(given) is not None
-    return "must be a number, not text; write it without quotes" if quoted else ""
-
-
-def _right(detail: ErrorDetails) -> str:
-    kind = detail["type"]
-    if detail["input"] != detail["input"]:  # NaN, which is not less than anything, either
-        return "must be a finite number"
-    if kind == "float_type":
-        return "must be a number"
-    if kind == "too_long":
-        most = detail["ctx"]["max_length"]
-        return f"must have {most if most == 2 else f'at most {most}'} entries"  # 2: a pair
-    if kind == "too_short":
-        least = detail["ctx"]["min_length"]
-        return "must not be empty" if least == 1 else f"must have at least {least} entries"
-    if kind == "string_pattern_mismatch":
-        pattern = detail["ctx"]["pattern"]
-        name = "must be 1 to 64 lower case letters, digits, - and _, beginning with a letter or digit"
-        return name if pattern == NAME_PATTERN else f"must match {pattern}"
-    if kind == "literal_error":
-        return f"must be {detail['ctx']['expected'].replace(chr(39), '')}"
-    text = str(detail["msg"]).removeprefix("Value error, ")
-    return _RIGHT.get(kind, text.replace("Input should", "must").replace("must be a valid", "must be a"))
-
-
-def suggestion(key: str, known: Iterable[str]) -> str:
-    """What an unknown ``key`` was probably meant to be; empty when nothing is close.
-
-    A key that differs from a known one only in its unit is recognised as such: ``gaps_km``, ``mass``.
-    """
-    names = sorted(known)
-    stems = {name.rsplit("_", 1)[0]: name for name in names if name.rsplit("_", 1)[-1] in UNITS}
-    same = stems.get(key.rsplit("_", 1)[0]) or stems.get(key)
-    close = [same] if same else get_close_matches(key, names, n=1)
-    if not close:
-        return ""
-    unit = UNITS.get(close[0].rsplit("_", 1)[-1], "")
-    return f"did you mean {close[0]}{f' ({unit})' if unit else ''}?"
-
-
-# Settings of a command line, ``key.path=value``: parsed as YAML, and put in their place inside plain data.
-
-
-@dataclass(frozen=True, slots=True)
-class Override:
-    """One setting: where, and which value."""
-
-    text: str  # as it was given
-    path: tuple[str, ...]  # keys from the outermost on; of a list: which entry, from 0
-    value: Any  # typed by the rules of YAML
-
-    @property
-    def top(self) -> str:
-        """The outermost key."""
-        return self.path[0]
-
-    @property
-    def key(self) -> str:
-        """The path as it was written."""
-        return ".".join(self.path)
-
-    def inside(self) -> Override:
-        """The same without its outermost key."""
-        return Override(self.text, self.path[1:], self.value)
-
-    @staticmethod
-    def parse(texts: Sequence[str]) -> list[Override]:
-        """Parse ``key.path=value``, each key once; a value is YAML on one line: ``0.2`` or ``{uniform: [1, 2]}``.
-
-        Raises ``InvalidInput`` for a text without ``=``, an empty key, a key given twice, and a value that is no YAML.
-        """
-        found: list[Override] = []
-        for text in texts:
-            key, equals, value = text.partition("=")
-            path = tuple(part.strip() for part in key.split("."))
-            if not equals or not all(path):
-                raise InvalidInput(f"--set {text!r}: must be KEY=VALUE or KEY.KEY=VALUE, for instance gamma=0.99")
-            if any(each.path == path for each in found):
-                raise InvalidInput(f"--set {'.'.join(path)}: is given twice")
-            found.append(Override(text, path, parse_yaml(value, f"--set {'.'.join(path)}").content))
-        return found
-
-    @staticmethod
-    def put(content: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
-        """Outermost key -> its new value, of ``content`` with the overrides in it; ``content`` stays as it is.
-
-        Raises ``InvalidInput`` for a path that leads into a value that holds nothing.
-        """
-        changed: dict[str, Any] = {}
-        for override in overrides:
-            top = override.top
-            before = changed[top] if top in changed else copy.deepcopy(content.get(top))
-            changed[top] = _placed(before, override.path[1:], override)
-        return changed
-
-
-def _placed(part: Any, path: tuple[str, ...], override: Override) -> Any:
-    """``part`` with the value at ``path`` inside it."""
-    if not path:
-        return override.value
-    key, rest = path[0], path[1:]
-    if part is None:
-        part = {}
-    if isinstance(part, Mapping):
-        return {**part, key: _placed(part.get(key), rest, override)}
-    if isinstance(part, list | tuple):
-        if not (key.isascii() and key.isdigit() and int(key) < len(part)):
-            raise InvalidInput(f"--set {override.key}: {key!r} must be an entry from 0 to {len(part) - 1}")
-        entries = list(part)
-        entries[int(key)] = _placed(entries[int(key)], rest, override)
-        return entries
-    raise InvalidInput(f"--set {override.key}: there is nothing inside {flow_text(part, 60)}; set the whole value")
-
-
-# JSON Schemas of files that people write, for editors that complete and check YAML while one types.
-
-DIALECT = "https://json-schema.org/draft/2020-12/schema"
-
-
-class FileSchema(GenerateJsonSchema):
-    """In a file a key that is not used is left out; it is never ``null``."""
-
-    def nullable_schema(self, schema: NullableSchema) -> JsonSchemaValue:
-        """The schema of the value where there is one."""
-        return self.generate_inner(schema["schema"])
-
-    def default_schema(self, schema: WithDefaultSchema) -> JsonSchemaValue:
-        """As always, but without ``"default": null``."""
-        described = super().default_schema(schema)
-        return {key: value for key, value in described.items() if key != "default" or value is not None}
-
-    @staticmethod
-    def publish(schema: dict[str, Any]) -> dict[str, Any]:
-        """The schema as it is printed and shipped: with the dialect that it is written in, first."""
-        return {"$schema": DIALECT, **schema}
-
-
-def schema_lines(kind: str, command: str) -> str:
-    """The comment by which a new file names its schema, ``scenario`` or ``recipe``, and the command that prints it."""
-    return (
-        f"# yaml-language-server: $schema={kind}.schema.json\n"
-        "# Your editor completes and checks this file once that schema stands beside it:\n"
-        f"#   ethbrake {command} > {kind}.schema.json\n"
-    )

@@ -1,4 +1,4 @@
-"""Scenarios: strict YAML files that describe families of worlds, and the reproducible lists drawn from them."""
+"""Scenarios: strict YAML files that describe families of worlds, and reproducible lists of worlds drawn from them."""
 
 from typing import TYPE_CHECKING
 
@@ -6,35 +6,22 @@ from ethbrake_marl.doors import front_door
 
 if TYPE_CHECKING:
     from ethbrake_marl.files.yaml import parse_yaml as parse_yaml
-    from ethbrake_marl.scenario.observed import (
-        Appended as Appended,
-        common_observation as common_observation,
-        full_state as full_state,
-        observation_for as observation_for,
-        observations_of as observations_of,
-        row_features as row_features,
-        state_features as state_features,
-    )
-    from ethbrake_marl.scenario.recorded import scenario_from_data as scenario_from_data
-    from ethbrake_marl.scenario.sampling import (
-        QUANTITY as QUANTITY,
-        Sample as Sample,
-        ScriptSpec as ScriptSpec,
-        Uniform as Uniform,
-    )
-    from ethbrake_marl.scenario.schema import (
-        Scenario as Scenario,
-        Task as Task,
+    from ethbrake_marl.scenario.catalogue import (
         check_file_name as check_file_name,
         group_of_scenarios as group_of_scenarios,
         list_scenarios as list_scenarios,
         load_scenario as load_scenario,
         new_scenario_text as new_scenario_text,
         register_scenarios as register_scenarios,
-        scenario_json_schema as scenario_json_schema,
         scenario_path as scenario_path,
         shipped_folder as shipped_folder,
     )
-    from ethbrake_marl.scenario.v2x import CHANNELS as CHANNELS, register_preset as register_preset
+    from ethbrake_marl.scenario.channel import CHANNELS as CHANNELS, register_preset as register_preset
+    from ethbrake_marl.scenario.distributions import Uniform as Uniform
+    from ethbrake_marl.scenario.fields import QUANTITY as QUANTITY
+    from ethbrake_marl.scenario.roles import ScriptSpec as ScriptSpec
+    from ethbrake_marl.scenario.sample import Sample as Sample
+    from ethbrake_marl.scenario.schema import Scenario as Scenario, scenario_json_schema as scenario_json_schema
+    from ethbrake_marl.scenario.task import Task as Task
 else:
     __getattr__ = front_door(__name__, __file__)

@@ -1,1617 +1,149 @@
-"""Fields of a scenario: the quantities of a world and how they are drawn, roles, and types of vehicles."""
+"""Draw the worlds of a scenario's lists. World k of a seed has the same bits however many worlds are drawn."""
 
 from __future__ import annotations
 
-import csv
-import io
-import math
-import re
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field as data_field, replace
-from difflib import get_close_matches
-from functools import lru_cache
-from itertools import pairwise
-from operator import not_
-from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, NoReturn, Self
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    Discriminator,
-    Field,
-    GetJsonSchemaHandler,
-    PlainSerializer,
-    PrivateAttr,
-    Tag,
-    ValidationError,
-    ValidationInfo,
-    WithJsonSchema,
-    field_validator,
-    model_validator,
-)
-from pydantic.json_schema import JsonSchemaValue
-from pydantic_core import CoreSchema, PydanticCustomError
 
 from ethbrake_marl.errors import InvalidInput, check_whole_number
-from ethbrake_marl.files.store import read_plain
-from ethbrake_marl.files.yaml import (
-    NAME_PATTERN,
-    UNITS,
-    UNSHOWN,
-    FileModel,
-    YamlPath,
-    parse_numeral,
-    refuse,
-    require,
-    suggestion,
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds, make_worlds
+from ethbrake_marl.scenario.declared import ScenarioFields, obstacle_gap, on_road, world_quantities
+from ethbrake_marl.scenario.distributions import TableColumn, WithLoad, values
+from ethbrake_marl.scenario.fields import (
+    BLOCK,
+    BRAKES,
+    LATER_LOSSES,
+    MIXTURE,
+    OF_WORLD,
+    PER_TYPE,
+    QUANTITY,
+    ROW,
+    TYPES,
+    V2X_NEWS,
+    Place,
 )
-from ethbrake_marl.harm import OBJECTIVES, objectives_of
-from ethbrake_marl.observations import ListedFeatures, listed_features
-from ethbrake_marl.physics import (
-    Bools,
-    Floats,
-    Ints,
-    Worlds,
-    advance,
-    as_road_allows,
-    exp_each,
-    log,
-    make_worlds,
-    normal_probability,
-    normal_quantile_each,
-    real_numbers,
-    stopping_distances,
-)
-from ethbrake_marl.scenario.v2x import V2X, Equipage, Equipped
+from ethbrake_marl.scenario.roles import ScriptSpec
+from ethbrake_marl.scenario.sample import Sample
 
-BLOCK = 8  # uniform numbers per vehicle and world; a multiple of 4, the numbers of one Philox counter
-V2X_NEWS = (1,)  # the stream of the links' delays and losses
-OBSTACLE = (2,)  # the stream of the obstacle's distance
-TYPES = (3,)  # the stream of the vehicles' types and loads
-MIXTURE = (4,)  # the stream of what each world of a mixture is drawn from
-LATER_LOSSES = (5,)  # the stream of a world's key, from which its later messages are lost or not
-SURROUNDINGS = (6,)  # the stream of friction, of the row of a table, and of the time before the alert
-BRAKES = (7,)  # the stream of the rates of brakes that build up, BLOCK numbers per vehicle
-OF_WORLD = 4  # numbers per world of the streams of obstacle, mixture, later losses and surroundings
-PER_TYPE = 4  # numbers per vehicle of the stream of types: type, load, and two that are free; one Philox counter
-ROW = (SURROUNDINGS, 1)  # the place of the number that chooses the row of a table
+Channel = Literal["list", "training"]
 
-Place = tuple[tuple[int, ...], int]  # a stream of uniform numbers, and the column in it
+CHANNELS: dict[str, int] = {"list": 0, "training": 1}
 
+MOST_ATTEMPTS = 1000  # draws of one world after which its scenario counts as unusable
 
-@dataclass(frozen=True, slots=True)
-class QuantityRule:
-    """What a quantity means and which values it may take."""
+_PATIENCE = 10  # attempts for a whole list before one world is tried up to MOST_ATTEMPTS
 
-    name: str  # key in a scenario, field of Worlds or Vehicles
-    unit: str  # key of UNITS, or "" for a plain number
-    per: Literal["vehicle", "pair", "world"]
-    high: float  # largest allowed value
-    positive: bool  # 0 is refused
-    slot: int  # column inside a vehicle's block of uniform numbers
-    column: str  # name in a table of initial states
-    meaning: str
-    example: str
-    low: float = 0.0  # smallest allowed value
-    block: int = 0  # vehicle (from 0) in whose block of uniform numbers entry 0 stands
-    stream: tuple[int, ...] = ()  # of uniform numbers of its own, in which its slot is the column
+MOST_AT_ONCE = 10_000_000  # largest number of worlds in one sample; draw a longer list in parts
 
-    @property
-    def symbol(self) -> str:
-        """Of its unit."""
-        return {"mps": "m/s", "mps2": "m/s2", "mps3": "m/s3"}.get(self.unit, self.unit)
+_MOST_WORLDS = 2**62  # world numbers are 64-bit integers
 
-    @property
-    def label(self) -> str:
-        """Its name in words, with its unit, as an axis has it: ``braking capacity (m/s²)``."""
-        return self.name.removesuffix(f"_{self.unit}").replace("_", " ") + (
-            f" ({self.symbol.replace('s2', 's²').replace('s3', 's³')})" if self.unit else ""
-        )
+_NUMBERS_PER_COUNTER = 4  # 64-bit integers that Philox makes from one counter
 
-    @property
-    def interval(self) -> str:
-        """The allowed range, with its unit, as messages write it."""
-        unit = f" {self.symbol} ({UNITS[self.unit]})" if self.unit else ""
-        return f"finite and in {'(' if self.positive else '['}{self.low:g}, {self.high:g}]{unit}"
 
-    def allows(self, low: float, high: float) -> bool:
-        """Whether every value from ``low`` to ``high`` is in range; false for NaN."""
-        return (low > 0.0 if self.positive else low >= self.low) and high <= self.high
+def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
+    """Return worlds ``first`` to ``first + n - 1`` of the endless list of ``seed``.
 
-    def count(self, vehicles: int) -> int:
-        """How many values a world of ``vehicles`` vehicles has."""
-        return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
+    World k has the same bits for every ``n`` and ``first``. World k of a mixture is drawn from one of its scenarios, by
+    weight, and equals that scenario's own world k under the same seed, bit for bit. So results on a mixture can be
+    compared with results on its scenarios, world by world.
 
-    def place(self, index: int) -> Place:
-        """Which of a world's uniform numbers belongs to entry ``index`` (from 0)."""
-        return self.stream, BLOCK * (self.block + index) + self.slot
+    Args:
+        scenario: the scenario to draw from.
+        n: number of worlds.
+        seed: seed of the list, a whole number of at least 0.
+        first: number of the first world in the list, from 0.
+        channel: ``"list"`` for evaluation, ``"training"`` for training: two independent lists per seed.
 
-    def column_of(self, index: int) -> str:
-        """Name of the column that holds entry ``index`` (from 0) in a table of initial states."""
-        return self.column.format(index + 1)
-
-    def owner(self, index: int) -> str:
-        """Whose value entry ``index`` (from 0) is, in words; empty for a value of the whole world."""
-        front = f"vehicle_{index + 1}"
-        return {"vehicle": front, "pair": f"{front} to vehicle_{index + 2}", "world": ""}[self.per]
-
-    def of(self, worlds: Worlds) -> Floats:
-        """The values that these worlds have, [n, entries]: one entry per vehicle, pair or world.
-
-        Capacities are those on a dry road, as a scenario declares them, where the friction of all is told beside them.
-        """
-        of_vehicles = hasattr(worlds.vehicles, self.name)
-        values: Floats = getattr(worlds.vehicles if of_vehicles else worlds, self.name)
-        if of_vehicles and np.isfinite(worlds.friction).all():
-            values = worlds.dry(self.name)
-        if self.stream == BRAKES:  # as high as a rate can be declared: at once
-            values = np.minimum(values, self.high)
-        if self.stream == OBSTACLE:  # no number where there is none
-            values = np.where(np.isfinite(values), values, np.nan)
-        return values.reshape(worlds.n, -1)
-
-
-class Quantities(NamedTuple):
-    """All quantities by their keys."""
-
-    usual: dict[str, QuantityRule]  # what every world has
-    otherwise: dict[str, QuantityRule]  # other ways to declare speeds, gaps and an obstacle
-    optional: dict[str, QuantityRule]  # what a world need not have; it has a stream of random numbers of its own
-    # A scenario has exactly one of each two, or at most one where what they declare is optional.
-    alternatives: dict[str, str]
-    of_a_type: tuple[str, ...]  # what a type of vehicles may declare
-    needed: tuple[str, ...]  # what has no default, and every vehicle needs
-    declared: dict[str, QuantityRule]  # every key that declares one
-
-    def of(self, worlds: Worlds) -> dict[str, QuantityRule]:
-        """Those that these worlds have: friction only where all have such.
-
-        The distance to an obstacle, and a rate of brakes, are told of all where some have one: the former is NaN
-        where there is no obstacle.
-        """
-        there = {"obstacle_gap_m": worlds.obstacle_ahead.any(), "friction": np.isfinite(worlds.friction).all()}
-        there |= {key: np.isfinite(getattr(worlds.vehicles, key)).any() for key in self.optional if key not in there}
-        return self.usual | {key: rule for key, rule in self.optional.items() if there[key]}
-
-    def columns(self, worlds: Worlds) -> dict[str, Floats]:
-        """Every one of the worlds, each [n], named as in a table of initial states: ``gap_1_m``, ``mass_2_t``."""
-        return {
-            rule.column_of(i): values for rule in self.of(worlds).values() for i, values in enumerate(rule.of(worlds).T)
-        }
-
-
-def _by_name(*rules: QuantityRule) -> dict[str, QuantityRule]:
-    return {rule.name: rule for rule in rules}
-
-
-# The upper ends are far outside traffic: they catch a value in the wrong unit (kilograms, kilometres per hour).
-# The slots are fixed for ever: another order would give other worlds for the same seed.
-_USUAL = _by_name(
-    QuantityRule(
-        "gaps_m", "m", "pair", 1e4, False, 0, "gap_{}_m",
-        "bumper-to-bumper gap of each pair at the alert, front to rear", "[7, 7]",
-    ),
-    QuantityRule(
-        "speeds_mps", "mps", "vehicle", 200.0, False, 1, "speed_{}_mps",
-        "speed of each vehicle at the alert", "[20, 18, 20]",
-    ),
-    QuantityRule(
-        "braking_capacity_mps2", "mps2", "vehicle", 100.0, True, 2, "braking_capacity_{}_mps2",
-        "largest deceleration of each vehicle", "[6, 7, 6]",
-    ),
-    QuantityRule(
-        "driving_capacity_mps2", "mps2", "vehicle", 100.0, False, 3, "driving_capacity_{}_mps2",
-        "largest forward acceleration of each vehicle", "[6, 7, 6]",
-    ),
-    QuantityRule(
-        "latency_s", "s", "vehicle", 3600.0, False, 4, "latency_{}_s",
-        "time from the alert until a vehicle's commands take effect; it coasts until then", "[0, 0.5, 0.8]",
-    ),
-    QuantityRule(
-        "mass_t", "t", "vehicle", 1000.0, True, 5, "mass_{}_t",
-        "mass of each vehicle", "[4.5, 5.5, 5.9]",
-    ),
-    QuantityRule(
-        "speed_limit_mps", "mps", "vehicle", 200.0, True, 6, "speed_limit_{}_mps",
-        "speed at which driving stops accelerating", "40",
-    ),
-    QuantityRule(
-        "restitution", "", "world", 1.0, False, 7, "restitution",
-        "coefficient of restitution of every impact: 0 plastic, 1 elastic", "0.1",
-    ),
-)  # fmt: skip
-
-# Other ways to declare speeds, gaps and an obstacle. What replaces a quantity takes over its uniform numbers; the speed
-# of the line has the one number of vehicle_2 that restitution, one per world, leaves free.
-_OTHERWISE = _by_name(
-    QuantityRule(
-        "time_gaps_s", "s", "pair", 60.0, True, 0, "",
-        "gap of each pair divided by the speed of its rear vehicle, front to rear", "[1, 1]",
-    ),
-    QuantityRule(
-        "line_speed_mps", "mps", "world", 200.0, False, 7, "",
-        "speed that all vehicles share at the alert", "20", block=1,
-    ),
-    QuantityRule(
-        "speed_deviations_mps", "mps", "vehicle", 200.0, False, 1, "",
-        "what each vehicle adds to line_speed_mps", "[0, -2, 0]", low=-200.0,
-    ),
-    QuantityRule(
-        "obstacle_margin_m", "m", "world", 1e4, True, 0, "",
-        "distance of that obstacle from where vehicle_1 stops by full braking as soon as it can", "1.7",
-        stream=OBSTACLE,
-    ),
-    QuantityRule(
-        "alert_s", "s", "world", 3600.0, False, 2, "",
-        "time from the start, when gaps and speeds are as told, to the alert, from which latencies count",
-        "{uniform: [1, 5]}", stream=SURROUNDINGS,
-    ),
-)  # fmt: skip
-_OPTIONAL = _by_name(
-    QuantityRule(
-        "obstacle_gap_m", "m", "world", 1e4, True, 0, "obstacle_gap_m",
-        "distance from the front of vehicle_1 to an unmovable obstacle ahead, at the alert", "42",
-        stream=OBSTACLE,
-    ),
-    QuantityRule(
-        "friction", "", "world", 2.0, True, 0, "friction",
-        "friction of the road: no capacity is above friction x 9.81 m/s2", "{uniform: [0.2, 0.9]}",
-        stream=SURROUNDINGS,
-    ),
-    QuantityRule(
-        "brake_rate_mps3", "mps3", "vehicle", 1e6, True, 0, "brake_rate_{}_mps3",
-        "how fast the deceleration of each vehicle builds up; without it at once", "12.65",
-        stream=BRAKES,
-    ),
-    QuantityRule(
-        "release_rate_mps3", "mps3", "vehicle", 1e6, True, 1, "release_rate_{}_mps3",
-        "how fast it falls again, and driving builds up; without it at once", "25",
-        stream=BRAKES,
-    ),
-)  # fmt: skip
-QUANTITY = Quantities(
-    _USUAL, _OTHERWISE, _OPTIONAL,
-    alternatives={"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps", "obstacle_gap_m": "obstacle_margin_m"},
-    of_a_type=(
-        "braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "latency_s", "speed_limit_mps", "brake_rate_mps3",
-        "release_rate_mps3",
-    ),
-    needed=("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "latency_s"),
-    declared={**_USUAL, **_OTHERWISE, **_OPTIONAL},
-)  # fmt: skip
-_ALSO = (
-    "friction",
-    "brake_rate_mps3",
-    "release_rate_mps3",
-)  # what is drawn where it is declared, and needs nothing else
-_MEANING = {key: rule.meaning for key, rule in QUANTITY.declared.items()}
-
-
-# A quantity of a scenario: a fixed number, or a declared distribution.
-#
-# Each distribution is a pure function of one uniform number ``u`` in [0, 1): its inverse cumulative distribution
-# function. One quantity therefore uses up exactly one uniform number, whatever its distribution is.
-
-_LEAVE_OUT = "must be a number or a distribution; a key that is not used is left out"
-LEAST_MASS = 1e-6  # of a normal distribution inside its bounds; below it the inverse loses its digits
-_LEAST = f"[low, high] must hold at least {LEAST_MASS:g} of the untruncated distribution"
-
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Pair = Annotated[tuple[Number, Number], Field(strict=False)]
-Numbers = Annotated[tuple[Number, ...], Field(strict=False, min_length=1)]
-
-
-class _Distribution(FileModel):
-    """A way to draw a quantity."""
-
-
-class Uniform(_Distribution):
-    """``{uniform: [low, high]}``: every value from low to high is equally likely."""
-
-    uniform: Pair = Field(description="[low, high]")
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Uniform:
-        require(self.uniform[0] <= self.uniform[1], ("uniform",), self.uniform, "low must not be above high")
-        return self
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
-        return self.uniform
-
-    def value(self, u: Floats) -> Floats:
-        """``low + (high - low) u``, in the shape of ``u`` in [0, 1).
-
-        Never above high: u is at most 1 - 2^-53, so (high - low) u is rounded to less than the rounded high - low.
-        """
-        low, high = self.uniform
-        return low + (high - low) * u
-
-
-class LogUniform(_Distribution):
-    """``{loguniform: [low, high]}``: every ratio is equally likely, as between 1 and 2 so between 2 and 4."""
-
-    loguniform: Pair = Field(description="[low, high], both above 0")
-
-    @model_validator(mode="after")
-    def _ordered(self) -> LogUniform:
-        low, high = self.loguniform
-        require(low > 0.0, ("loguniform",), self.loguniform, "low must be above 0")
-        require(low <= high, ("loguniform",), self.loguniform, "low must not be above high")
-        return self
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
-        return self.loguniform
-
-    def value(self, u: Floats) -> Floats:
-        """``low (high / low)^u``, in the shape of ``u`` in [0, 1)."""
-        low, high = self.loguniform
-        return np.clip(low * exp_each((u * log(high / low)).ravel()).reshape(u.shape), low, high)
-
-
-class NormalShape(_Distribution):
-    """Mean and standard deviation of the untruncated bell, and the bounds that cut it."""
-
-    mean: Number
-    sd: Number
-    low: Number
-    high: Number
-
-
-class Normal(_Distribution):
-    """``{normal: {mean, sd, low, high}}``: a normal distribution truncated to [low, high]."""
-
-    normal: NormalShape
-
-    @model_validator(mode="after")
-    def _possible(self) -> Normal:
-        shape = self.normal
-        require(shape.sd > 0.0, ("normal",), shape, "sd must be above 0")
-        require(shape.low < shape.high, ("normal",), shape, "low must be below high")
-        below, above = self._bounds()
-        require(above - below >= LEAST_MASS, ("normal",), shape, _LEAST)
-        return self
-
-    def _bounds(self) -> tuple[float, float]:
-        """Probability below low and below high."""
-        shape = self.normal
-        low, high = (normal_probability((end - shape.mean) / shape.sd) for end in (shape.low, shape.high))
-        return low, high
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
-        return self.normal.low, self.normal.high
-
-    def value(self, u: Floats) -> Floats:
-        """``mean + sd Q(p_low + (p_high - p_low) u)`` with the normal quantile Q; same shape as ``u`` in [0, 1)."""
-        shape = self.normal
-        below, above = self._bounds()
-        quantile = normal_quantile_each((below + (above - below) * u).ravel()).reshape(u.shape)
-        return np.clip(shape.mean + shape.sd * quantile, shape.low, shape.high)
-
-
-class LogNormalShape(_Distribution):
-    """Median, standard deviation of the logarithm, and the bounds that cut it."""
-
-    median: Number
-    sigma: Number
-    low: Number
-    high: Number
-
-
-class LogNormal(_Distribution):
-    """``{lognormal: {median, sigma, low, high}}``: its logarithm is normal; truncated to [low, high]."""
-
-    lognormal: LogNormalShape
-    _of_logarithm: Normal = PrivateAttr()
-
-    @model_validator(mode="after")
-    def _possible(self) -> LogNormal:
-        shape, at = self.lognormal, ("lognormal",)
-        require(min(shape.median, shape.low) > 0.0, at, shape, "median and low must be above 0")
-        require(shape.sigma > 0.0, at, shape, "sigma must be above 0")
-        require(shape.low < shape.high, at, shape, "low must be below high")
-        middle, low, high = (log(value) for value in (shape.median, shape.low, shape.high))
-        try:
-            self._of_logarithm = Normal(normal={"mean": middle, "sd": shape.sigma, "low": low, "high": high})  # type: ignore[arg-type]
-        except ValidationError:
-            refuse(at, shape, _LEAST)
-        return self
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
-        return self.lognormal.low, self.lognormal.high
-
-    def value(self, u: Floats) -> Floats:
-        """``exp`` of the normal logarithm at ``u`` in [0, 1); same shape as ``u``."""
-        drawn = exp_each(self._of_logarithm.value(u).ravel()).reshape(u.shape)
-        return np.clip(drawn, *self.support)
-
-
-class Choice(_Distribution):
-    """``{choice: [a, b, ...]}``: one of these values, equally likely or as ``weights: [...]`` says."""
-
-    choice: Numbers
-    weights: Numbers | None = None
-
-    @model_validator(mode="after")
-    def _weighted(self) -> Choice:
-        if self.weights is not None:
-            fits = f"must have as many entries as choice, {len(self.choice)}"
-            require(len(self.weights) == len(self.choice), ("weights",), self.weights, fits)
-            positive = all(w > 0.0 for w in self.weights) and math.isfinite(sum(self.weights))
-            require(positive, ("weights",), self.weights, "every weight must be above 0, and their sum finite")
-        return self
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
-        return min(self.choice), max(self.choice)
-
-    def value(self, u: Floats) -> Floats:
-        """The first entry whose cumulative weight is above ``u``; same shape as ``u`` in [0, 1)."""
-        cumulative = np.cumsum(np.asarray(self.weights or (1.0,) * len(self.choice)))
-        cumulative /= cumulative[-1]
-        return np.asarray(self.choice)[np.searchsorted(cumulative, u, side="right")]
-
-
-@dataclass(frozen=True, slots=True, repr=False)
-class TableColumn:
-    """A column of a scenario's table: every world takes the value of its own row."""
-
-    name: str
-    rows: Floats = data_field(compare=False)  # [rows]
-    cumulative: Floats = data_field(compare=False)  # [rows] share of the worlds up to this row
-
-    def __repr__(self) -> str:
-        return f"column {self.name} of the table"
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
-        return float(self.rows.min()), float(self.rows.max())
-
-    @property
-    def middle(self) -> TableColumn:
-        """The one row that stands for all: the median."""
-        order = np.argsort(self.rows, kind="stable")
-        shares = np.cumsum(np.diff(self.cumulative, prepend=0.0)[order])
-        return replace(self, rows=self.rows[order][[np.searchsorted(shares, 0.5)]], cumulative=np.ones(1))
-
-    def value(self, u: Floats) -> Floats:
-        """That of the first row whose cumulative weight is above ``u``; same shape as ``u`` in [0, 1)."""
-        found: Floats = self.rows[np.searchsorted(self.cumulative, u, side="right")]
-        return found
-
-
-def _kind(value: object) -> str | None:
-    """Which member of ``Quantity`` a value means; decides whose error messages are shown."""
-    if isinstance(value, _Distribution):
-        return f"#{type(value).__name__.lower()}"
-    if isinstance(value, dict):
-        return next((f"#{name}" for name in DISTRIBUTIONS if name in value), None)
-    return None if isinstance(value, list | tuple) else "#number"
-
-
-DISTRIBUTIONS = ("uniform", "loguniform", "normal", "lognormal", "choice")
-
-# Tags begin with # so that they can be told from keys in the location of an error.
-Quantity = Annotated[
-    Annotated[Number, Tag("#number")]
-    | Annotated[Uniform, Tag("#uniform")]
-    | Annotated[LogUniform, Tag("#loguniform")]
-    | Annotated[Normal, Tag("#normal")]
-    | Annotated[LogNormal, Tag("#lognormal")]
-    | Annotated[Choice, Tag("#choice")],
-    Discriminator(_kind, custom_error_type="quantity", custom_error_message="no such quantity"),
-]
-
-
-class WithLoad(_Distribution):
-    """``{with_load: [empty, full]}``, of a vehicle type only: moves with the load of the vehicle, from 0 to 1.
-
-    ``spread`` is added to it, of its own for every vehicle.
-    """
-
-    with_load: Pair = Field(description="[empty, full]: at load 0 and at load 1")
-    spread: Quantity = Field(default=0.0, exclude_if=not_, description="what each vehicle adds to it by chance")
-
-    @field_validator("spread")
-    @classmethod
-    def _spreads(cls, value: Any) -> Any:
-        right = "must be a distribution around 0, such as {uniform: [-0.3, 0.3]}"
-        require(not isinstance(value, float), (), value, right)
-        return value
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
-        low, high = support(self.spread)
-        return min(self.with_load) + low, max(self.with_load) + high
-
-    def value(self, load: Floats, u: Floats) -> Floats:
-        """``empty + (full - empty) load``, and the spread at ``u``; ``load`` in [0, 1] and ``u`` have one shape."""
-        empty, full = self.with_load
-        moved = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))
-        return moved if self.spread == 0.0 else moved + values(self.spread, u)
-
-
-AnyQuantity = float | Uniform | LogUniform | Normal | LogNormal | Choice | TableColumn
-AnyTypeQuantity = AnyQuantity | WithLoad
-
-
-def support(quantity: AnyTypeQuantity) -> tuple[float, float]:
-    """Smallest and largest value that the quantity can take."""
-    return (quantity, quantity) if isinstance(quantity, float) else quantity.support
-
-
-def values(quantity: AnyQuantity, u: Floats) -> Floats:
-    """The quantity's values for uniform numbers ``u`` in [0, 1), in the shape of ``u``."""
-    return np.full(u.shape, quantity) if isinstance(quantity, float) else quantity.value(u)
-
-
-# A part of a list of worlds: the worlds, where they stand in the list, and what they were drawn as.
-
-_Texts = NDArray[np.str_]
-
-
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """Worlds at the alert, and where in the list they stand.
-
-    >>> import ethbrake_marl as eb
-    >>> sample = eb.load_scenario("paper-random").sample(2, seed=7)
-    >>> sample.index, sample.worlds.gaps_m.round(2)
-    (array([0, 1]), array([[6.62, 8.49], [5.33, 7.79]]))
+    Raises ``InvalidInput`` for a negative seed or ``first``, for ``n < 1``, or if early impacts are rejected and
+    (almost) every draw has one.
 
     """
-
-    worlds: Worlds  # at t = 0
-    index: Ints  # [n] number of each world in the list of its seed
-    rejected: int  # draws refused because of an early impact
-    types: _Texts | None = None  # [n, N] type of every vehicle, where a scenario has types; empty: it has none
-    scenarios: _Texts | None = None  # [n] the scenario of a mixture that each world was drawn from
-
-    def __repr__(self) -> str:
-        numbers = f"numbers {self.index.min()} to {self.index.max()}" if len(self.index) else "no numbers"
-        return f"Sample({self.worlds!r}, {numbers}, {self.rejected:,} rejected)"
-
-    def take(self, rows: ArrayLike) -> Sample:
-        """Some of the worlds, by row or mask (always a copy); none of them was rejected."""
-        some = np.asarray(rows)
-        types, scenarios = (None if each is None else each[some] for each in (self.types, self.scenarios))
-        return Sample(self.worlds.take(some), self.index[some], 0, types, scenarios)
-
-    @staticmethod
-    def join(parts: Sequence[Sample], rejected: int) -> Sample:
-        """The worlds of all parts in the order of their numbers; all have types, or scenarios, or none has."""
-        index = np.concatenate([part.index for part in parts])
-        order = np.argsort(index)
-        joined: dict[str, _Texts] = {}
-        for name in ("types", "scenarios"):
-            given = [getattr(part, name) for part in parts if getattr(part, name) is not None]
-            joined |= {name: np.concatenate(given)[order]} if given else {}
-        worlds = Worlds.concatenate([part.worlds for part in parts]).take(order)
-        return Sample(worlds, index[order], rejected, **joined)
-
-    @property
-    def kinds(self) -> dict[str, _Texts]:
-        """``scenario`` of a mixture and ``vehicle_K_type``, each [n], where the worlds were drawn with such."""
-        columns = {} if self.scenarios is None else {"scenario": self.scenarios}
-        types = () if self.types is None else self.types.T
-        return columns | {f"vehicle_{i + 1}_type": column for i, column in enumerate(types)}
-
-    def count_kinds(self) -> str:
-        """How often each scenario of a mixture, and each type of a vehicle, is there; empty without such."""
-        told = ""
-        for kind, column in self.kinds.items():
-            names, counts = np.unique(column, return_counts=True)
-            told += f"; {kind}: " + ", ".join(f"{n or 'none'} {c}" for n, c in zip(names, counts, strict=True))
-        return told
-
-
-# The fields of a scenario: what a file may say, before anything is checked or drawn.
-
-# Roles: who learns, names of scripts (``name[:argument]``), and the commands of the scripts that need no state.
-
-LEARNER = "learner"
-_PROFILE = "profile"  # a constant command in pieces
-MOST_PIECES = 64
-
-_SPEC = re.compile(r"(?P<name>[a-z][a-z0-9_@.-]*)(:(?P<argument>\S+))?")
-
-
-class ScriptSpec(NamedTuple):
-    """``name[:argument]``, for instance ``constant:3.5``: how a scenario, or a command, names an agent."""
-
-    name: str
-    argument: str | None
-
-    def __str__(self) -> str:
-        return self.name if self.argument is None else f"{self.name}:{self.argument}"
-
-    @staticmethod
-    @lru_cache(maxsize=256)
-    def parse(spec: str) -> ScriptSpec:
-        """Split it.
-
-        Raises ``InvalidInput`` unless the name matches ``[a-z][a-z0-9_@.-]*`` and the argument has no blanks, and for a
-        Python file: a scenario that somebody else wrote must not run code.
-        """
-        match = _SPEC.fullmatch(spec) if isinstance(spec, str) else None
-        if match is None:
-            raise InvalidInput(
-                f"agent {spec!r}: must be name or name:argument, the name in lower case letters, digits and _ @ . -,"
-                " for instance full_brake or constant:3.5"
-            )
-        if match["name"].endswith(".py") or ".py:" in spec:
-            raise InvalidInput(
-                f"agent {spec!r}: is a function of a Python file, and those are loaded only where a person names them"
-                " (--agents); no scenario does. A package that you install can give it a name"
-            )
-        return ScriptSpec(match["name"], match["argument"])
-
-    @property
-    def deceleration_mps2(self) -> float | None:
-        """The deceleration a (negative = drive) of ``constant:a``; None for any other script.
-
-        Raises ``InvalidInput`` when a is missing or not a finite number.
-        """
-        if self.name != "constant":
-            return None
-        deceleration = parse_numeral(self.argument or "")
-        if deceleration is None or not math.isfinite(deceleration):
-            raise InvalidInput(
-                f"agent {str(self)!r}: constant needs a finite deceleration in m/s2 after the colon, for instance"
-                " constant:3.5"
-            )
-        return deceleration
-
-    @property
-    def pieces(self) -> tuple[tuple[float, float], ...]:
-        """The pieces of a ``profile``: s after the latency, m/s2 of braking; none of any other script.
-
-        Raises ``InvalidInput`` unless times begin with 0 and rise, and no braking is negative.
-        """
-        if self.name != _PROFILE:
-            return ()
-        given = [part.split("=") for part in (self.argument or "").split(",")]
-        return checked_pieces([[parse_numeral(number) for number in piece] for piece in given])
-
-    @property
-    def hardest_mps2(self) -> float | None:
-        """The largest deceleration (m/s2) that ``constant:a`` or a ``profile`` asks for; None for any other script."""
-        return max(braking for _, braking in self.pieces) if self.name == _PROFILE else self.deceleration_mps2
-
-    def is_state_free(self) -> bool:
-        """Whether the script's command never depends on the state: ``full_brake``, ``coast`` or ``constant:a``.
-
-        Raises ``InvalidInput`` when such a script has an argument it does not take, or lacks the one it needs.
-        """
-        if self.name == _PROFILE:
-            return len(self.pieces) > 0
-        if self.name in ("full_brake", "coast"):
-            if self.argument is not None:
-                raise InvalidInput(f"agent {str(self)!r}: {self.name} takes no argument")
-            return True
-        return self.deceleration_mps2 is not None
-
-    def command(
-        self, braking_capacity_mps2: ArrayLike, driving_capacity_mps2: ArrayLike | None = None
-    ) -> Floats | None:
-        """Signed command (m/s2) of a state-free script, in the shape of the capacity; None for any other script.
-
-        ``full_brake`` -> -capacity, ``coast`` -> 0, ``constant:a`` -> -a, a ``profile`` that of its first piece.
-        Raises ``InvalidInput`` when a, or a piece, is above the braking capacity of any vehicle, or -a above its
-        driving capacity where that is given.
-        """
-        capacity = np.asarray(braking_capacity_mps2, dtype=np.float64)
-        if not self.is_state_free():
-            return None
-        deceleration = self.hardest_mps2
-        if deceleration is None:
-            return -capacity if self.name == "full_brake" else np.zeros(capacity.shape)
-        if not np.all(deceleration <= capacity):
-            raise InvalidInput(f"agent {str(self)!r}: above the braking capacity {np.min(capacity):g} m/s2")
-        if driving_capacity_mps2 is not None and not np.all(-deceleration <= np.asarray(driving_capacity_mps2)):
-            raise InvalidInput(
-                f"agent {str(self)!r}: above the driving capacity {np.min(driving_capacity_mps2):g} m/s2"
-            )
-        return np.full(capacity.shape, 0.0 - (self.pieces[0][1] if self.pieces else deceleration))
-
-
-def checked_pieces(given: object) -> tuple[tuple[float, float], ...]:
-    """The pieces of a ``profile``, [[s, m/s2], ...], as they are written in roles; raises ``InvalidInput``."""
-    right = f"a profile is 1 to {MOST_PIECES} pieces [s after the latency, m/s2 of braking], such as [[0, 3], [1, 7]]"
-    if not isinstance(given, list | tuple) or not 1 <= len(given) <= MOST_PIECES:
-        raise InvalidInput(right)
-    for piece in given:
-        numbers = isinstance(piece, list | tuple) and len(piece) == 2
-        if not numbers or not all(type(each) in (int, float) and 0.0 <= each <= 3600.0 for each in piece):
-            raise InvalidInput(f"{right}; both in [0, 3600], which {piece!r:.60} is not")
-    if given[0][0] != 0.0 or not all(one[0] < other[0] for one, other in pairwise(given)):
-        raise InvalidInput(f"{right}; times begin with 0 and rise")
-    return tuple((float(begins), float(braking)) for begins, braking in given)
-
-
-def _role_text(role: object) -> object:
-    """A role as a script is named: ``{profile: [[0, 3], [1, 7]]}`` is ``profile:0=3,1=7``."""
-    if not isinstance(role, dict):
-        return role
-    try:
-        if set(role) != {_PROFILE}:
-            raise InvalidInput("must be learner, a script, or {profile: [[0, 3], [1, 7]]} and nothing beside it")
-        pieces = checked_pieces(role[_PROFILE])
-    except InvalidInput as error:
-        refuse((), role, str(error))
-    numbers = (tuple(repr(number).removesuffix(".0") for number in piece) for piece in pieces)
-    return f"{_PROFILE}:" + ",".join(f"{begins}={braking}" for begins, braking in numbers)
-
-
-def _role_content(role: str) -> str | dict[str, list[list[float]]]:
-    """A role as a file says it."""
-    pieces = ScriptSpec.parse(role).pieces
-    return {_PROFILE: [list(piece) for piece in pieces]} if pieces else role
-
-
-_ROLE_SCHEMA = {
-    "anyOf": [
-        {"type": "string"},
-        {
-            "type": "object",
-            "required": [_PROFILE],
-            "additionalProperties": False,
-            "properties": {
-                _PROFILE: {
-                    "type": "array",
-                    "minItems": 1,
-                    "maxItems": MOST_PIECES,
-                    "items": {"type": "array", "minItems": 2, "maxItems": 2, "items": {"type": "number", "minimum": 0}},
-                }
-            },
-        },
-    ]
-}
-Role = Annotated[
-    str, BeforeValidator(_role_text), PlainSerializer(_role_content, return_type=Any), WithJsonSchema(_ROLE_SCHEMA)
-]
-
-
-class Roles(dict[str, str]):
-    """Vehicle -> ``learner`` or a script; like the rest of a scenario it cannot be changed."""
-
-    def _refuse(self, *args: object, **kwargs: object) -> NoReturn:
-        raise InvalidInput("roles of a scenario are frozen; use scenario.replace(roles=...) or scenario.with_learners")
-
-    __setitem__ = __delitem__ = __ior__ = _refuse
-    update = setdefault = pop = popitem = clear = _refuse
-
-    def __reduce__(self) -> tuple[type[Roles], tuple[dict[str, str]]]:
-        """Copy and pickle through the constructor."""
-        return Roles, (dict(self),)
-
-    @staticmethod
-    def complete(given: Mapping[str, str] | None, vehicles: int) -> Roles:
-        """A role for every vehicle in order: full braking where none is given; by default vehicle_2 learns."""
-        roles = {"vehicle_2": LEARNER} if given is None else given
-        names = [f"vehicle_{i + 1}" for i in range(vehicles)]
-        return Roles({name: roles.get(name, "full_brake") for name in names})
-
-
-# Types of vehicles: what a car, a van or a truck is, drawn together, and which of them may stand where.
-#
-# A world's vehicle first gets its type, then its quantities as that type declares them. What moves with the load of a
-# vehicle, ``{with_load: [empty, full]}``, moves together: a full truck is heavy *and* brakes weakly.
-
-ANY = "any"  # in ``types``: every type, by its weight
-
-TypeName = Annotated[str, Field(pattern=NAME_PATTERN)]
-ListedByVehicle = Annotated[
-    dict[Annotated[str, Field(pattern=r"^vehicle_[1-9][0-9]?$")], ListedFeatures],
-    Field(min_length=1, json_schema_extra={"additionalProperties": False}),
-]
-Weight = Annotated[float, Field(gt=0.0, le=1e9, allow_inf_nan=False)]
-
-
-def _loaded(value: object) -> str:
-    return "#with_load" if isinstance(value, WithLoad) or (isinstance(value, dict) and "with_load" in value) else "#one"
-
-
-TypeQuantity = Annotated[
-    Annotated[Quantity, Tag("#one")] | Annotated[WithLoad, Tag("#with_load")], Discriminator(_loaded)
-]
-
-
-class VehicleType(FileModel):
-    """One type: how likely it is, and every quantity that it declares; the rest is as beside ``vehicle_types``."""
-
-    weight: Weight = Field(default=1.0, description="how likely it is, relative to the other types")
-    load: Quantity = Field(
-        default_factory=lambda: Uniform(uniform=(0.0, 1.0)), description="share of the full load, 0 to 1"
-    )
-    braking_capacity_mps2: TypeQuantity | None = Field(default=None, description=_MEANING["braking_capacity_mps2"])
-    driving_capacity_mps2: TypeQuantity | None = Field(default=None, description=_MEANING["driving_capacity_mps2"])
-    mass_t: TypeQuantity | None = Field(default=None, description=_MEANING["mass_t"])
-    latency_s: TypeQuantity | None = Field(default=None, description=_MEANING["latency_s"])
-    speed_limit_mps: TypeQuantity | None = Field(default=None, description=_MEANING["speed_limit_mps"])
-    brake_rate_mps3: TypeQuantity | None = Field(default=None, exclude_if=not_, description=_MEANING["brake_rate_mps3"])
-    release_rate_mps3: TypeQuantity | None = Field(
-        default=None, exclude_if=not_, description=_MEANING["release_rate_mps3"]
-    )
-    v2x: Equipage | None = Field(default=None, exclude_if=not_, description="what it has of V2X; by default all")
-
-    @field_validator(*QUANTITY.of_a_type)
-    @classmethod
-    def _in_range(cls, value: Any, info: ValidationInfo) -> Any:
-        require(value is not None, (), value, _LEAVE_OUT)
-        rule = QUANTITY.declared[str(info.field_name)]
-        require(rule.allows(*support(value)), (), value, f"must be {rule.interval}")
-        return value
-
-    @field_validator("load")
-    @classmethod
-    def _share(cls, value: Any) -> Any:
-        low, high = support(value)
-        require(low >= 0.0 and high <= 1.0, (), value, "must be in [0, 1]: 0 empty, 1 full")
-        return value
-
-
-def _check_type_names(kinds: dict[str, VehicleType]) -> dict[str, VehicleType]:
-    require(ANY not in kinds, (ANY,), UNSHOWN, f"{ANY} stands for every type; give another name")
-    return kinds
-
-
-VehicleTypes = Annotated[dict[TypeName, VehicleType], Field(min_length=1), AfterValidator(_check_type_names)]
-TypesHere = str | dict[str, Weight]  # of one vehicle: a type, ``any``, or a weight for each type that may stand there
-
-
-def _one_or_each(value: object) -> str:
-    return "#each" if isinstance(value, list | tuple) else "#one"
-
-
-Types = Annotated[
-    Annotated[TypesHere, Tag("#one")]
-    | Annotated[tuple[TypesHere, ...], Field(strict=False, min_length=1), Tag("#each")],
-    Discriminator(_one_or_each),
-]
-
-
-class TypesOfLine:
-    """Which types may stand at each place of a line, and how likely each is there."""
-
-    def __init__(self, kinds: Mapping[str, VehicleType], types: Types | None, vehicles: int) -> None:
-        self.names = tuple(kinds)
-        self.kinds = tuple(kinds.values())
-        given: Sequence[TypesHere]
-        given = types if isinstance(types, tuple) else (ANY if types is None else types,) * vehicles
-        self.weights = np.array([[_weight(kinds, name, here) for name in kinds] for here in given])
-
-    def possible(self, vehicle: int) -> list[int]:
-        """Indices of the types that may stand there."""
-        return np.flatnonzero(self.weights[vehicle] > 0.0).tolist()
-
-    def draw(self, u: Floats) -> tuple[Ints, Floats]:
-        """Type (index) and load of every vehicle, both [n, N], from uniform numbers ``u`` [n, N, 2]."""
-        n, vehicles = u.shape[:2]
-        types, load = np.zeros((n, vehicles), np.int64), np.zeros((n, vehicles))
-        for i in range(vehicles):
-            cumulative = np.cumsum(self.weights[i])
-            types[:, i] = np.searchsorted(cumulative / cumulative[-1], u[:, i, 0], side="right")
-            for kind in self.possible(i):
-                rows, shape = types[:, i] == kind, self.kinds[kind].load
-                load[rows, i] = shape if isinstance(shape, float) else shape.value(u[rows, i, 1])
-        return types, load
-
-
-def _weight(kinds: Mapping[str, VehicleType], name: str, here: TypesHere) -> float:
-    if isinstance(here, str):
-        return kinds[name].weight if here == ANY else float(here == name)
-    return here.get(name, 0.0)
-
-
-_LEFT_OUT: Any = object()  # a key that is not given, where a check must say whether it may be
-
-
-PerVehicle = Annotated[
-    Annotated[Quantity, Tag("#one")] | Annotated[tuple[Quantity, ...], Field(strict=False, min_length=1), Tag("#each")],
-    Discriminator(_one_or_each),
-]
-
-
-class _ObjectiveSchema:
-    """The JSON schema of an objective: what is known when it is asked for."""
-
-    @classmethod
-    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        kinds = OBJECTIVES.usable()
-        plain = [name for name, kind in kinds.items() if ":" not in kind.form]
-        with_argument = "|".join(name for name, kind in kinds.items() if ":" in kind.form)
-        return {"type": "string", "anyOf": [{"enum": plain}, {"pattern": f"^({with_argument}):"}]}
-
-
-_ObjectiveName = Annotated[str, _ObjectiveSchema]
-
-
-class _MemberSchema:
-    """In a file also a scenario's name, or the path of its file."""
-
-    @classmethod
-    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        return {"anyOf": [{"type": "string"}, {"type": "object"}]}
-
-
-MOST_NUMBERS = 100_000  # of a table: a scenario is kept whole wherever it is used
-
-Column = Annotated[str, Field(pattern=r"^[a-z_]+(_[0-9]+)?[a-z0-9_]*$", max_length=64)]
-
-
-class Table(FileModel):
-    """Rows of which every world takes one, by weight; in a scenario file read from a CSV file beside it."""
-
-    file: str = Field(default="", exclude_if=not_, description="CSV file with a header, from the scenario's folder on")
-    columns: Annotated[tuple[Column, ...], Field(strict=False, min_length=1)] = Field(
-        description="as in a table of initial states: gap_1_m, speed_2_mps, ...; of a file those that are used"
-    )
-    weights: str | Annotated[Numbers, Field()] | None = Field(
-        default=None, exclude_if=not_, description="how likely each row is; of a file the column that says it"
-    )
-    rows: Annotated[tuple[Numbers, ...], Field(strict=False, min_length=1)] | None = Field(
-        default=None, description="one row of numbers for each; left out with a file, which has them"
-    )
-
-    @model_validator(mode="after")
-    def _complete(self) -> Table:
-        read = "files are read where they stand in a file (load_scenario); give rows"
-        require(not (self.file and self.rows), ("file",), self.file, "give either a file or rows, not both")
-        require(self.rows is not None and not isinstance(self.weights, str), ("rows",), UNSHOWN, read)
-        rows = self.rows or ()
-        for k, row in enumerate(rows):
-            right = f"has {len(row)} numbers; there are {len(self.columns)} columns"
-            require(len(row) == len(self.columns), ("rows", k), UNSHOWN, right)
-        numbers = len(rows) * len(self.columns)
-        require(numbers <= MOST_NUMBERS, ("rows",), UNSHOWN, f"{numbers:,} numbers; at most {MOST_NUMBERS:,}")
-        twice = [name for name in self.columns if self.columns.count(name) > 1]
-        require(not twice, ("columns",), twice[:1], "each column can be given once")
-        if isinstance(self.weights, tuple):
-            fits = f"must be one for each of {len(rows)} rows, all above 0, and their sum finite"
-            good = len(self.weights) == len(rows) and min(self.weights) > 0.0 and math.isfinite(sum(self.weights))
-            require(good, ("weights",), UNSHOWN, fits)
-        return self
-
-    def column_values(self) -> dict[str, TableColumn]:
-        """The columns by name."""
-        rows = np.array(self.rows)
-        weights = self.weights if isinstance(self.weights, tuple) else (1.0,) * len(rows)
-        cumulative = np.cumsum(np.asarray(weights))
-        return {
-            name: TableColumn(name, column, cumulative / cumulative[-1])
-            for name, column in zip(self.columns, rows.T, strict=True)
-        }
-
-
-class Member(FileModel):
-    """One scenario of a mixture: what it says, and how likely it is, relative to the others."""
-
-    scenario: Annotated[dict[str, Any], _MemberSchema] = Field(description="a name, a path, or what its file says")
-    weight: Weight = Field(default=1.0, description="how likely it is, relative to the other scenarios")
-
-
-class ScenarioFields(FileModel):
-    """What is declared of a line of vehicles, and what follows from the declaration alone. See ``Scenario``."""
-
-    name: str = Field(pattern=NAME_PATTERN, description="name; equal to the file's name without .yaml")
-    title: str = Field(default="", description="one line for lists and figures")
-    description: str = Field(default="", description="what the scenario is for")
-    source: str = Field(default="", description="where the values come from")
-    vehicles: int = Field(default=3, ge=2, le=64, description="number of vehicles N, vehicle_1 in front")
-    vehicle_types: VehicleTypes | None = Field(
-        default=None, exclude_if=not_, description="what a car, a truck, ... is: type -> weight and quantities"
-    )
-    types: Types | None = Field(
-        default=None,
-        exclude_if=not_,
-        description="which types may stand where: a type, any, or a weight for each; one entry for all or one for each",
-    )
-    mixture: Annotated[tuple[Member, ...], Field(strict=False)] | None = Field(
-        default=None, exclude_if=not_, description="scenarios that each world is drawn from one of, by weight"
-    )
-    table: Table | None = Field(
-        default=None, exclude_if=not_, description="measured rows of which every world takes one; the rest is drawn"
-    )
-    time_step_s: float = Field(default=0.1, ge=1e-3, allow_inf_nan=False, description="time between two decisions")
-    horizon_s: float = Field(
-        default=8.0, gt=0.0, le=3600.0, allow_inf_nan=False, description="time after which an episode is cut off"
-    )
-    gaps_m: PerVehicle | None = Field(default=None, description=_MEANING["gaps_m"])
-    time_gaps_s: PerVehicle | None = Field(default=None, description=_MEANING["time_gaps_s"])
-    speeds_mps: PerVehicle | None = Field(default=None, description=_MEANING["speeds_mps"])
-    line_speed_mps: Quantity | None = Field(default=None, description=_MEANING["line_speed_mps"])
-    speed_deviations_mps: PerVehicle = Field(default=0.0, description=_MEANING["speed_deviations_mps"])
-    braking_capacity_mps2: PerVehicle | None = Field(
-        default_factory=lambda: _LEFT_OUT, validate_default=True, description=_MEANING["braking_capacity_mps2"]
-    )
-    driving_capacity_mps2: PerVehicle | None = Field(
-        default_factory=lambda: _LEFT_OUT, validate_default=True, description=_MEANING["driving_capacity_mps2"]
-    )
-    mass_t: PerVehicle | None = Field(
-        default_factory=lambda: _LEFT_OUT, validate_default=True, description=_MEANING["mass_t"]
-    )
-    latency_s: PerVehicle | None = Field(
-        default_factory=lambda: _LEFT_OUT, validate_default=True, description=_MEANING["latency_s"]
-    )
-    speed_limit_mps: PerVehicle = Field(default=40.0, description=_MEANING["speed_limit_mps"])
-    restitution: Quantity = Field(default=0.1, description=_MEANING["restitution"])
-    roles: dict[str, Role] = Field(
-        default_factory=lambda data: Roles.complete(None, data.get("vehicles", 3)),
-        description="learner or a script for each vehicle; vehicles left out of a given mapping brake fully",
-    )
-    obstacle_gap_m: Quantity | None = Field(default=None, description=_MEANING["obstacle_gap_m"])
-    obstacle_margin_m: Quantity | None = Field(default=None, description=_MEANING["obstacle_margin_m"])
-    friction: Quantity | None = Field(default=None, exclude_if=not_, description=_MEANING["friction"])
-    brake_rate_mps3: PerVehicle | None = Field(default=None, exclude_if=not_, description=_MEANING["brake_rate_mps3"])
-    release_rate_mps3: PerVehicle | None = Field(
-        default=None, exclude_if=not_, description=_MEANING["release_rate_mps3"]
-    )
-    alert_s: Quantity | None = Field(default=None, exclude_if=not_, description=_MEANING["alert_s"])
-    early_impacts: Literal["keep", "reject"] = Field(
-        default="keep", description="what happens to worlds with an impact before the first learner may act"
-    )
-
-    objective: _ObjectiveName | Annotated[tuple[_ObjectiveName, ...], Field(strict=False)] = Field(
-        default="total", description="whose harm a reward counts: one for all vehicles, or one for each"
-    )
-    observation: ListedFeatures | ListedByVehicle | None = Field(
-        default=None,
-        exclude_if=not_,
-        description="what vehicles observe, or by name what each does: groups and single features, in this order",
-    )
-    v2x: V2X = Field(
-        default_factory=V2X, description="what each vehicle knows when: a preset, and what differs from it"
-    )
-
-    _members: tuple[ScenarioFields, ...] = PrivateAttr(default=())
-    _columns: dict[Entry, TableColumn] = PrivateAttr(default_factory=dict)  # those of the table
-
-    @model_validator(mode="after")
-    def _tabulated(self) -> ScenarioFields:
-        if self.table is not None:
-            known = _table_columns(QUANTITY.declared, self.vehicles)
-            self._columns = {known[name]: column for name, column in self.table.column_values().items()}
-        return self
-
-    @classmethod
-    def of_dump(cls, content: Mapping[str, Any]) -> Self:
-        """That of which ``model_dump`` wrote every key, also those that nobody gave; raises ``ValueError``."""
-        usual = {key: (None, field.default) for key, field in cls.model_fields.items()}
-
-        def given(part: Any) -> Any:
-            if isinstance(part, Mapping):
-                return {key: given(value) for key, value in part.items() if value is not None}
-            return [given(each) for each in part] if isinstance(part, list | tuple) else part
-
-        usual["v2x"] = None, given(V2X().model_dump(mode="json"))  # beside a mixture it would hold for all members
-
-        def declared(scenario: Mapping[str, Any]) -> dict[str, Any]:
-            told = {key: given(value) for key, value in scenario.items() if given(value) not in usual.get(key, ())}
-            if "mixture" in told:
-                told["mixture"] = [{**each, "scenario": declared(each["scenario"])} for each in told["mixture"]]
-            return told
-
-        return cls.model_validate(declared(content))
-
-    @field_validator(
-        *QUANTITY.alternatives, *QUANTITY.alternatives.values(), *QUANTITY.optional, "alert_s", mode="before"
-    )
-    @classmethod
-    def _given(cls, value: Any) -> Any:
-        """``null`` is no value: a key that is not used is left out."""
-        require(value is not None, (), value, _LEAVE_OUT)
-        return value
-
-    @field_validator(*QUANTITY.needed, mode="before")
-    @classmethod
-    def _needed(cls, value: Any, info: ValidationInfo) -> Any:
-        """None where every type declares it, and nobody else has to."""
-        key, data = str(info.field_name), info.data
-        kinds = data.get("vehicle_types")
-        without = None if kinds is None else next((k for k, kind in kinds.items() if getattr(kind, key) is None), None)
-        if value is not _LEFT_OUT:
-            require(value is not None, (), value, _LEAVE_OUT)
-            require(kinds is None or without is not None, (), value, "every type declares it; leave it out")
-            return value
-        if data.get("mixture") is None and {"vehicle_types", "mixture"} <= data.keys() and not _tabled(data, key):
-            if kinds is None:
-                raise PydanticCustomError("missing", "missing", {"at": ()})
-            right = f"type {without} does not declare it: give it there, or here for every type that does not"
-            require(without is None, (), UNSHOWN, right)
-        return None
-
-    @field_validator("vehicle_types", "types", "mixture", "table", mode="before")
-    @classmethod
-    def _not_empty(cls, value: Any) -> Any:
-        empty = value is None or (isinstance(value, dict | list | tuple) and not value)
-        require(not empty, (), value, "must not be empty; a key that is not used is left out")
-        return value
-
-    @field_validator("types")
-    @classmethod
-    def _types(cls, value: Any, info: ValidationInfo) -> Any:
-        """Every entry names types that are declared, and a list has one entry per vehicle."""
-        if not {"vehicles", "vehicle_types"} <= info.data.keys():
-            return value
-        vehicles, kinds = info.data["vehicles"], info.data["vehicle_types"]
-        require(kinds is not None, (), value, "needs vehicle_types, which says what the types are")
-        listed = isinstance(value, tuple)
-        right = f"has {len(value)} entries; {vehicles} vehicles need {vehicles}, or one for all"
-        require(not listed or len(value) == vehicles, (), UNSHOWN, right)
-        for index, entry in enumerate(value if listed else (value,)):
-            at: YamlPath = (index,) if listed else ()
-            names = [entry] if isinstance(entry, str) else list(entry)
-            require(len(names) > 0, at, entry, "must name a type")
-            for name in names:
-                hint = suggestion(name, kinds) or f"known: {', '.join(kinds)}"
-                known = name in kinds or (name == ANY and isinstance(entry, str))
-                require(known, at, entry, f"unknown type {name}; {hint}")
-        return value
-
-    @field_validator("table")
-    @classmethod
-    def _columns_of_line(cls, value: Table | None, info: ValidationInfo) -> Table | None:
-        """Every column is one of this line's, and its numbers are in range."""
-        if value is None or "vehicles" not in info.data:
-            return value
-        known = _table_columns({**QUANTITY.usual, **QUANTITY.optional}, info.data["vehicles"])
-        for name, column in value.column_values().items():
-            hint = suggestion(name, known) or f"known: {', '.join(known)}"
-            require(name in known, ("columns",), name, f"unknown column; {hint}")
-            rule = QUANTITY.declared[known[name][0]]
-            bad = [k for k, number in enumerate(column.rows.tolist()) if not rule.allows(number, number)]
-            at = ("rows", bad[0], value.columns.index(name)) if bad else ()
-            require(not bad, at, column.rows[bad[0]] if bad else 0.0, f"{name} must be {rule.interval}")
-        return value
-
-    @field_validator(*QUANTITY.declared)
-    @classmethod
-    def _entries(cls, value: Any, info: ValidationInfo) -> Any:
-        """Every entry of a quantity is in range over its whole support, and a list has the right length."""
-        rule, vehicles = QUANTITY.declared[str(info.field_name)], info.data.get("vehicles")
-        if value is None:
-            return value
-        listed = isinstance(value, tuple)
-        if listed and vehicles is not None:
-            count, per = rule.count(vehicles), "one per pair" if rule.per == "pair" else "one per vehicle"
-            right = f"has {len(value)} entries; {vehicles} vehicles need {count} ({per}), or one for all"
-            require(len(value) == count, (), UNSHOWN, right)
-        for index, entry in enumerate(value if listed else (value,)):
-            low, high = support(entry)
-            overlap = "; a negative gap means overlapping vehicles" if rule.per == "pair" and low < 0.0 else ""
-            at = (index,) if listed else ()
-            require(rule.allows(low, high), at, entry, f"must be {rule.interval}{overlap}")
-        return value
-
-    @field_validator("roles")
-    @classmethod
-    def _roles(cls, value: dict[str, str], info: ValidationInfo) -> dict[str, str]:
-        vehicles = info.data.get("vehicles")
-        if vehicles is None:
-            return value
-        names = [f"vehicle_{i + 1}" for i in range(vehicles)]
-        for name, role in value.items():
-            close = [] if name.startswith("vehicle_") else get_close_matches(name, names, n=1)
-            hint = f"did you mean {close[0]}?" if close else f"this scenario has vehicle_1 ... vehicle_{vehicles}"
-            require(name in names, (name,), role, f"unknown vehicle; {hint}")
-            try:
-                ScriptSpec.parse(role).is_state_free()
-            except InvalidInput as error:
-                refuse((name,), role, str(error))
-            require(not role.startswith(f"{LEARNER}:"), (name,), role, f"{LEARNER} takes no argument")
-        return Roles.complete(value, vehicles)
-
-    @field_validator("objective", mode="before")
-    @classmethod
-    def _objective(cls, value: Any, info: ValidationInfo) -> Any:
-        if "vehicles" in info.data:
-            try:
-                objectives_of(value, info.data["vehicles"])
-            except InvalidInput as error:
-                refuse((), value, str(error).removeprefix("objective: "))
-        return value
-
-    @field_validator("observation", mode="before")
-    @classmethod
-    def _observation(cls, value: Any, info: ValidationInfo) -> Any:
-        vehicles = info.data.get("vehicles", 0)
-        names = [f"vehicle_{i + 1}" for i in range(vehicles)]
-        for name, listed in value.items() if isinstance(value, dict) and value else [(None, value)]:
-            at = () if name is None else (name,)
-            right = f"unknown vehicle; this scenario has vehicle_1 ... vehicle_{vehicles}"
-            require(name is None or not names or name in names, at, UNSHOWN, right)
-            try:
-                listed_features(listed)
-            except InvalidInput as error:
-                refuse(at, listed, str(error).removeprefix("observation: "))
-        return value
-
-    @property
-    def members(self) -> tuple[ScenarioFields, ...]:
-        """The scenarios of a mixture, whole; none for any other scenario."""
-        return self._members
-
-    @property
-    def vehicle_names(self) -> tuple[str, ...]:
-        """``vehicle_1`` (front) to ``vehicle_N`` (rear)."""
-        return tuple(f"vehicle_{i + 1}" for i in range(self.vehicles))
-
-    @property
-    def learners(self) -> tuple[int, ...]:
-        """Indices (from 0) of the vehicles that learn."""
-        return tuple(i for i, name in enumerate(self.vehicle_names) if self.roles[name] == LEARNER)
-
-    @property
-    def scripts(self) -> dict[int, str]:
-        """Index (from 0) -> script of every vehicle that does not learn."""
-        roles = [self.roles[name] for name in self.vehicle_names]
-        return {i: role for i, role in enumerate(roles) if role != LEARNER}
-
-    def play_pieces(self, worlds: Worlds, driven: Sequence[int] = ()) -> Worlds:
-        """These worlds, in which its scripts brake in the pieces of their ``profile``, but for ``driven`` vehicles."""
-        return worlds.play_pieces({i: ScriptSpec.parse(s).pieces for i, s in self.scripts.items() if i not in driven})
-
-    @property
-    def has_obstacle(self) -> bool:
-        """Whether an obstacle stands ahead of Vehicle 1, however its distance is declared."""
-        if self.members:
-            return any(member.has_obstacle for member in self.members)
-        return self.declares("obstacle_gap_m") or self.obstacle_margin_m is not None
-
-    @property
-    def has_friction(self) -> bool:
-        """Whether the road is known, in some member of a mixture at least."""
-        return any(member.has_friction for member in self.members) or self.declares("friction")
-
-    @property
-    def builds_up(self) -> bool:
-        """Whether brakes may build up, in some member of a mixture at least."""
-        own = self.declares("brake_rate_mps3") or self.declares("release_rate_mps3")
-        return own or any(member.builds_up for member in self.members)
-
-    def declares(self, field: str) -> bool:
-        """Whether it says what a quantity is: under its key, by type, or in its table for every vehicle or pair."""
-        kinds = (self.vehicle_types or {}).values() if field in QUANTITY.of_a_type else ()
-        return (
-            getattr(self, field) is not None
-            or any(getattr(kind, field) is not None for kind in kinds)
-            or _tabled({"table": self.table, "vehicles": self.vehicles}, field)
-        )
-
-    @property
-    def table_entries(self) -> dict[Entry, TableColumn]:
-        """The columns of the table by what they say; none without a table."""
-        return self._columns
-
-    @property
-    def by_link(self) -> bool:
-        """Whether news may come link by link, in some member of a mixture at least; see ``V2X.by_link``."""
-        return any(member.by_link for member in self.members) or self.v2x.by_link
-
-    @property
-    def types_of_line(self) -> TypesOfLine | None:
-        """Which types may stand where; None without types."""
-        return None if self.vehicle_types is None else TypesOfLine(self.vehicle_types, self.types, self.vehicles)
-
-    def possible_quantities(self, field: str) -> tuple[dict[int, AnyTypeQuantity], ...]:
-        """``quantities`` by the type that the vehicle has (index; 0 without types), one mapping per entry.
-
-        A type that says nothing of it has what is declared beside the types. Raises as ``quantities``.
-        """
-        line = self.types_of_line
-        if line is None or field not in QUANTITY.of_a_type:
-            return tuple({0: each} for each in self.quantities(field))
-        found: list[dict[int, AnyTypeQuantity]] = []
-        for i in range(self.vehicles):
-            if (field, i) in self.table_entries:
-                found.append({0: self.table_entries[field, i]})
-                continue
-            own = {kind: getattr(line.kinds[kind], field) for kind in line.possible(i)}
-            found.append({kind: self.quantities(field)[i] if each is None else each for kind, each in own.items()})
-        return tuple(found)
-
-    def supports(self, field: str) -> tuple[tuple[float, float], ...]:
-        """Smallest and largest value of every entry of ``quantities``, whatever type stands there."""
-        found = []
-        for each in self.possible_quantities(field):
-            lows, highs = zip(*(support(quantity) for quantity in each.values()), strict=True)
-            found.append((min(lows), max(highs)))
-        return tuple(found)
-
-    def quantities(self, field: str) -> tuple[AnyQuantity, ...]:
-        """What is declared under a key, one entry per vehicle (gaps: per pair; restitution, line speed: one).
-
-        Raises ``InvalidInput`` for a key that this scenario does not use, ``gaps_m`` beside ``time_gaps_s``.
-        """
-        declared: AnyQuantity | tuple[AnyQuantity, ...] | None = getattr(self, QUANTITY.declared[field].name)
-        if self.members:
-            raise InvalidInput(f"scenario {self.name!r}: is a mixture; its members say what {field} is")
-        if declared is None and not self.declares(field):
-            raise InvalidInput(f"scenario {self.name!r}: {field} is not given; it is derived, see Scenario.bounds")
-        count = QUANTITY.declared[field].count(self.vehicles)
-        entries: tuple[Any, ...] = declared if isinstance(declared, tuple) else (declared,) * count
-        return tuple(self.table_entries.get((field, i), entry) for i, entry in enumerate(entries))
-
-    def bounds(self, field: str, *, dry: bool = False) -> tuple[tuple[float, float], ...]:
-        """Smallest and largest value of each entry of ``gaps_m``, ``speeds_mps``, ..., however it is declared.
-
-        Capacities are what the road allows; ``dry``: what they are on a dry one.
-        """
-        found = [world_quantities(member, _supports_of(member)) for member in self.members or (self,)]
-        at_once = np.full((2, self.vehicles), QUANTITY.declared[field].high)  # of members that declare no rate
-        lows, highs = zip(*((each if dry else on_road(each)).get(field, at_once) for each in found), strict=True)
-        return tuple(zip(np.min(lows, axis=0).tolist(), np.max(highs, axis=0).tolist(), strict=True))
-
-    @property
-    def farthest_obstacle_m(self) -> float:
-        """Upper bound of the distance to an obstacle that is declared by its margin."""
-        found = on_road(world_quantities(self, _supports_of(self)))
-        low, high = ({key: bounds[[row]] for key, bounds in found.items()} for row in (0, 1))
-        slowest = high | {key: low[key] for key in ("braking_capacity_mps2", "brake_rate_mps3") if key in low}
-        farthest = obstacle_gap(self, slowest, lambda key: np.array([support(self.quantities(key)[0])[1]]))
-        assert farthest is not None
-        return float(farthest[0])
-
-    def sample(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
-        """Worlds ``first`` to ``first + n - 1`` of the endless list that belongs to ``seed``.
-
-        World k is the same bits whatever ``n`` and ``first`` are. The channels ``"list"`` (evaluation) and
-        ``"training"`` are independent of each other. Raises ``InvalidInput`` for a negative seed or ``first``,
-        ``n < 1``, or when early impacts are rejected and (almost) every draw has one.
-
-        World k of a mixture is drawn from one member, by weight, and is then that member's own world k under the same
-        seed, bit for bit. So results on a mixture can be compared with results on its members, world by world.
-        """
-        for name, value, least in (
-            ("number of worlds", n, 1),
-            ("seed of the list", seed, 0),
-            ("first world", first, 0),
-        ):
-            check_whole_number(name, value, least)
-        if not n <= MOST_AT_ONCE:
-            raise InvalidInput(f"number of worlds = {n}: at most {MOST_AT_ONCE:,} at once; draw a longer list in parts")
-        if not int(first) + int(n) <= _MOST_WORLDS:
-            raise InvalidInput(f"sample: first = {first!r}: a list has {_MOST_WORLDS} worlds")
-        if channel not in CHANNELS:
-            raise InvalidInput(f"sample: channel {channel!r}: must be one of {', '.join(CHANNELS)}")
-        if self.mixture is None:
-            return _draw_numbers(self, np.arange(first, first + n, dtype=np.int64), int(seed), channel)
-        chosen = self.members_of(n, int(seed), first=first, channel=channel)
-        typed = any(member.vehicle_types is not None for member in self.members)
-        parts = []
-        for k, member in enumerate(self.members):
-            index = first + np.flatnonzero(chosen == k)
-            if len(index):
-                drawn = _draw_numbers(member, index, int(seed), channel)
-                no_type = np.full((len(index), self.vehicles), "") if typed and drawn.types is None else drawn.types
-                parts.append(replace(drawn, types=no_type, scenarios=np.full(len(index), member.name)))
-        return Sample.join(parts, sum(part.rejected for part in parts))
-
-    def members_of(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Ints:
-        """From which of its ``members`` such worlds of a mixture are drawn, [n]; 0 without a mixture."""
-        cumulative = np.cumsum([member.weight for member in self.mixture or ()] or [1.0])
-        u = uniform_numbers(seed, channel, 0, first, n, OF_WORLD, of=MIXTURE)[:, 0]
-        return np.searchsorted(cumulative / cumulative[-1], u, side="right")
-
-    def equipped(self, types: Ints | None = None) -> Equipped:
-        """Who has what of V2X in worlds with these types [n, N]; without them, what everybody surely has, [1, N]."""
-        line, each = self.types_of_line, []
-        own = self.v2x.vehicles or {}
-        for i, name in enumerate(self.vehicle_names):
-            kinds = [Equipage()] if line is None else [kind.v2x or Equipage() for kind in line.kinds]
-            if name in own:
-                kinds = [own[name]] * len(kinds)
-            here = Equipped.of(kinds)
-            if types is not None:
-                each.append((here.sends[0, types[:, i]], here.hears[0, types[:, i]]))
-            else:
-                possible = [0] if line is None else line.possible(i)
-                each.append((here.sends[:, possible].all(axis=1), here.hears[:, possible].max(axis=1)))
-        sends, hears = zip(*each, strict=True)
-        return Equipped(np.stack(sends, axis=1), np.stack(hears, axis=1))
-
-    def middle_world(self) -> Worlds:
-        """The world (n = 1) in which every number is in the middle of its distribution: the median."""
-        alone = self.model_copy()
-        alone._columns = {entry: column.middle for entry, column in self.table_entries.items()}
-        return alone.sample_by(lambda width, of: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
-
-    def sample_by(self, numbers: Callable[[int, tuple[int, ...]], Floats], index: Ints) -> Sample:
-        """The worlds of ``numbers(width, of)``, uniform numbers [n, width] of a stream, ``()`` the first; all of them.
-
-        An early impact is not refused here.
-        """
-        line, typed = self.types_of_line, None
-        if line is not None:
-            u = numbers(PER_TYPE * self.vehicles, TYPES)
-            typed = line.draw(u.reshape(len(u), self.vehicles, PER_TYPE))
-        declared = drawn_quantities(self, numbers, typed)
-        drawn = world_quantities(self, declared)
-        obstacle_gap_m = obstacle_gap(self, on_road(drawn), lambda key: declared(key)[:, 0])
-        of_world = {key: drawn.pop(key)[:, 0] for key in ("restitution", "friction") if key in drawn}
-        worlds = make_worlds(
-            drawn.pop("gaps_m"), drawn.pop("speeds_mps"), obstacle_gap_m=obstacle_gap_m, **of_world, **drawn
-        )
-        if self.v2x.by_link:
-            u = numbers(self.v2x.width(self.vehicles), V2X_NEWS)
-            periodic = self.v2x.channel.persistence == "periodic"
-            key = numbers(OF_WORLD, LATER_LOSSES)[:, 0] if periodic else np.zeros(len(u))
-            equipped = self.equipped(None if typed is None else typed[0])
-            worlds = self.v2x.with_channel(worlds, u, key, self.time_step_s, equipped)
-        worlds = self.play_pieces(worlds)
-        return Sample(worlds, index, 0, None if typed is None or line is None else np.array(line.names)[typed[0]])
-
-    @property
-    def table_columns(self) -> dict[str, Entry]:
-        """Columns that a table of initial states may have for this scenario: ``gap_1_m``, ``speed_1_mps``, ..."""
-        return _table_columns(_quantities(self), self.vehicles)
-
-    def read_worlds(self, path: str | Path) -> Worlds:
-        """Read worlds from a CSV file with a header line; columns as in ``worlds_from_table``.
-
-        Raises ``InvalidInput`` with file, line and column for an unknown, repeated or missing column, a value that is
-        not a number or out of range, a row of another length, a file without rows, or one beyond ``SIZE_LIMIT``.
-        """
-        file = Path(path)
-        header, rows, lines = _read_csv(file)
-        entries = _known_columns(header, self, f"{file}, line 1")
-        table = np.empty((len(rows), len(header)))
-        for r, row in enumerate(rows):
-            table[r] = [_number_at(file, header, row, lines[r], name) for name in header]
-        given = {entry: table[:, c] for c, entry in enumerate(entries)}
-        return _worlds(given, self, _Naming(str(file), "file", lines))
-
-    @staticmethod
-    def read_rows(file: Path, columns: object, weights: object) -> dict[str, Any]:
-        """The rows of a scenario's table, and their weights, from these columns of a CSV file.
-
-        Raises ``InvalidInput`` naming file, line and column.
-        """
-        header, rows, lines = _read_csv(file)
-        weights_of = [] if weights is None else [weights]
-        if not isinstance(columns, list | tuple):
-            raise InvalidInput(f"{file}: columns = {columns!r:.60}: must be a list of columns: {', '.join(header)}")
-        for name in (*columns, *weights_of):
-            if header.count(name) != 1:
-                many = "is there twice" if name in header else f"is not there; {suggestion(str(name), header)}"
-                raise InvalidInput(f"{file}, line 1: column {name!r:.60} {many.removesuffix('; ')}")
-        found = [
-            [_number_at(file, header, row, line, str(name)) for name in (*columns, *weights_of)]
-            for row, line in zip(rows, lines, strict=False)  # blank lines at the end are no rows
-        ]
-        told: dict[str, Any] = {"rows": [row[: len(columns)] for row in found]}
-        return told if weights is None else told | {"weights": [row[-1] for row in found]}
-
-    def worlds_from_table(self, columns: Mapping[str, ArrayLike]) -> Worlds:
-        """Worlds from columns of equal length n: ``gap_1_m`` ..., ``speed_1_mps`` ..., and optionally the others.
-
-        Optional: ``braking_capacity_1_mps2``, ``driving_capacity_1_mps2``, ``latency_1_s``, ``mass_1_t``,
-        ``speed_limit_1_mps`` and so on for each vehicle, ``restitution``, and ``obstacle_gap_m`` where the scenario has
-        it. What is left out comes from the scenario, where it must be a fixed number. Raises ``InvalidInput`` naming
-        the column and the row (from 0).
-        """
-        entries = _known_columns(list(columns), self, "initial states")
-        given = {
-            entry: _numbers(f"initial states: {name}", column)
-            for entry, (name, column) in zip(entries, columns.items(), strict=True)
-        }
-        shapes = {column.shape for column in given.values()}
-        if len(shapes) != 1 or len(next(iter(shapes))) != 1:
-            lengths = ", ".join(f"{name} {list(np.shape(column))}" for name, column in columns.items())
-            raise InvalidInput(f"initial states: columns must be lists of one and the same length, not {lengths}")
-        return _worlds(given, self, _Naming("initial states", "table"))
-
-    def worlds_from_state(self, initial_state: Mapping[str, Any]) -> Worlds:
-        """The one world of ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``; keys are a scenario's quantities.
-
-        A single number stands for every vehicle. What is left out comes from the scenario, where it must be a fixed
-        number. Raises ``InvalidInput`` naming the key and the entry.
-        """
-        if not isinstance(initial_state, Mapping):
-            raise InvalidInput(f"initial_state = {initial_state!r}: must be a mapping such as {{'gaps_m': [7, 7]}}")
-        given: dict[Entry, Floats] = {}
-        known = _quantities(self)
-        for field, value in initial_state.items():
-            if field not in known:
-                if field in QUANTITY.optional:
-                    raise InvalidInput(f"initial_state: {field} is not of this scenario: {self.name!r} has no {field}")
-                hint = suggestion(str(field), known) or f"known: {', '.join(known)}"
-                raise InvalidInput(f"initial_state: unknown key {field!r}; {hint}")
-            count = known[field].count(self.vehicles)
-            numbers = _numbers(f"initial_state: {field}", value)
-            if numbers.shape not in ((), (count,)):
-                several = f"{self.vehicles} vehicles need {count} numbers, or one for all"
-                right = "must be one number" if known[field].per == "world" else several
-                raise InvalidInput(f"initial_state: {field} has shape {list(numbers.shape)}; {right}")
-            for index, number in enumerate(np.broadcast_to(numbers, (count,))):
-                given[field, index] = np.array([number])
-        return _worlds(given, self, _Naming("initial_state", "state"))
-
-    def ranges(self) -> Ranges:
-        """Every number that the scenario draws.
-
-        Raises ``InvalidInput`` for a scenario that draws nothing, a mixture, and a channel whose delays are drawn:
-        worlds of these cannot be given one by one.
-        """
-        if self.members:
-            members = ", ".join(member.name for member in self.members)
-            raise InvalidInput(f"scenario {self.name!r}: is a mixture; take one of its scenarios: {members}")
-        if self.v2x.by_link:
-            raise InvalidInput(
-                f"scenario {self.name!r}: v2x: draws delays and losses, which no table of worlds holds; give v2x: paper"
-                " (--set v2x=paper)"
-            )
-        found = {**_of_types(self), **_of_quantities(self)}
-        if not found:
-            raise InvalidInput(f"scenario {self.name!r}: draws nothing: all its worlds are the same")
-        return Ranges(self, tuple(found), tuple(found.values()))
-
-
-# From what a scenario declares, or a table gives, to worlds.
-
-
-def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]) -> dict[str, Floats]:
-    """Every quantity of k worlds, each [k, entries], from what ``declared(key)`` gives for the keys in use.
-
-    ``speed = line speed + own deviation`` and ``gap = time gap x speed of the rear vehicle of the pair``. Both only
-    grow with what they are made of, so the bounds of what is declared give the bounds of what the worlds have.
+    for name, value, least in (("number of worlds", n, 1), ("seed of the list", seed, 0), ("first world", first, 0)):
+        check_whole_number(name, value, least)
+    if not n <= MOST_AT_ONCE:
+        raise InvalidInput(f"number of worlds = {n}: at most {MOST_AT_ONCE:,} at once; draw a longer list in parts")
+    if not int(first) + int(n) <= _MOST_WORLDS:
+        raise InvalidInput(f"sample: first = {first!r}: a list has {_MOST_WORLDS} worlds")
+    if channel not in CHANNELS:
+        raise InvalidInput(f"sample: channel {channel!r}: must be one of {', '.join(CHANNELS)}")
+    if scenario.mixture is None:
+        return _draw_numbers(scenario, np.arange(first, first + n, dtype=np.int64), int(seed), channel)
+    chosen = members_of(scenario, n, int(seed), first=first, channel=channel)
+    typed = any(member.vehicle_types is not None for member in scenario.members)
+    parts = []
+    for k, member in enumerate(scenario.members):
+        index = first + np.flatnonzero(chosen == k)
+        if len(index):
+            drawn = _draw_numbers(member, index, int(seed), channel)
+            no_type = np.full((len(index), scenario.vehicles), "") if typed and drawn.types is None else drawn.types
+            parts.append(replace(drawn, types=no_type, scenarios=np.full(len(index), member.name)))
+    return Sample.join(parts, sum(part.rejected for part in parts))
+
+
+def members_of(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Ints:
+    """Return the scenario of a mixture from which each world is drawn, as an index into ``scenario.members``, [n].
+
+    The index is 0 without a mixture. Arguments are the same as in ``sample``.
     """
-    other = {"gaps_m": scenario.time_gaps_s, "speeds_mps": scenario.line_speed_mps}
-    found = {key: declared(key) for key in QUANTITY.usual if other.get(key) is None}
-    if scenario.alert_s is not None:
-        found["latency_s"] = found["latency_s"] + declared("alert_s")
-    for key in _ALSO:
-        if scenario.declares(key):
-            found[key] = declared(key)
-    if scenario.line_speed_mps is not None:
-        found["speeds_mps"] = declared("line_speed_mps") + declared("speed_deviations_mps")
-    if scenario.time_gaps_s is not None:
-        found["gaps_m"] = declared("time_gaps_s") * found["speeds_mps"][:, 1:]
-    return {key: found[key] for key in (*QUANTITY.usual, *_ALSO) if key in found}
+    cumulative = np.cumsum([member.weight for member in scenario.mixture or ()] or [1.0])
+    u = uniform_numbers(seed, channel, 0, first, n, OF_WORLD, of=MIXTURE)[:, 0]
+    return np.searchsorted(cumulative / cumulative[-1], u, side="right")
 
 
-def on_road(found: Mapping[str, Floats]) -> dict[str, Floats]:
-    """Quantities of worlds, their capacities as the road allows them: at most friction times gravity."""
-    return as_road_allows(found, found["friction"]) if "friction" in found else dict(found)
+def middle_world(scenario: ScenarioFields) -> Worlds:
+    """Return one world (n = 1) in which every quantity that ``scenario`` draws is the median of its distribution."""
+    alone = scenario.model_copy()
+    alone._columns = {entry: column.middle for entry, column in scenario.table_entries.items()}
+    return sample_by(alone, lambda width, of: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
 
 
-def obstacle_gap(
-    scenario: ScenarioFields, found: Mapping[str, Floats], declared: Callable[[str], Floats]
-) -> Floats | None:
-    """Distance from Vehicle 1 to the obstacle ahead, [k], of worlds with the quantities ``found``; None without one.
+def sample_by(scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]], Floats], index: Ints) -> Sample:
+    """Return the worlds that given uniform numbers produce; early impacts are not rejected.
 
-    As declared, or ``margin + v_1 tau_1 + v_1^2 / (2 a_1)``: so far beyond where Vehicle 1 stops by itself.
+    Args:
+        scenario: the scenario to draw from; not a mixture.
+        numbers: function (width, stream) -> uniform numbers in [0, 1), [n, width]; the stream is a tuple such as
+            ``fields.TYPES``, or ``()`` for the main stream.
+        index: number of each world in its list, [n], to be noted in the sample.
+
     """
-    if scenario.declares("obstacle_gap_m"):
-        return declared("obstacle_gap_m")
-    if scenario.obstacle_margin_m is None:
-        return None
-    speed, latency, capacity = (found[key][:, 0] for key in ("speeds_mps", "latency_s", "braking_capacity_mps2"))
-    rate = found["brake_rate_mps3"][:, 0] if "brake_rate_mps3" in found else np.full(len(speed), np.inf)
-    return declared("obstacle_margin_m") + stopping_distances(speed, latency, capacity, rate)
+    line, typed = scenario.types_of_line, None
+    if line is not None:
+        u = numbers(PER_TYPE * scenario.vehicles, TYPES)
+        typed = line.draw(u.reshape(len(u), scenario.vehicles, PER_TYPE))
+    declared = drawn_quantities(scenario, numbers, typed)
+    drawn = world_quantities(scenario, declared)
+    obstacle_gap_m = obstacle_gap(scenario, on_road(drawn), lambda key: declared(key)[:, 0])
+    of_world = {key: drawn.pop(key)[:, 0] for key in ("restitution", "friction") if key in drawn}
+    worlds = make_worlds(
+        drawn.pop("gaps_m"), drawn.pop("speeds_mps"), obstacle_gap_m=obstacle_gap_m, **of_world, **drawn
+    )
+    if scenario.v2x.by_link:
+        u = numbers(scenario.v2x.width(scenario.vehicles), V2X_NEWS)
+        periodic = scenario.v2x.channel.persistence == "periodic"
+        key = numbers(OF_WORLD, LATER_LOSSES)[:, 0] if periodic else np.zeros(len(u))
+        equipped = scenario.equipped(None if typed is None else typed[0])
+        worlds = scenario.v2x.with_channel(worlds, u, key, scenario.time_step_s, equipped)
+    worlds = scenario.play_pieces(worlds)
+    return Sample(worlds, index, 0, None if typed is None or line is None else np.array(line.names)[typed[0]])
 
 
 def drawn_quantities(
     scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]], Floats], typed: tuple[Ints, Floats] | None
 ) -> Callable[[str], Floats]:
-    """What each declared key is in n worlds, [n, entries], from ``numbers`` as of ``ScenarioFields.sample_by``.
+    """Return a function that maps the key of a declared quantity to its values in n worlds, [n, entries].
 
-    ``typed``: type (index) and load of every vehicle, both [n, N], where the scenario has types.
+    There is one entry per vehicle, per pair or per world, as ``QUANTITY`` says for the key.
+
+    Args:
+        scenario: the scenario that declares the quantities.
+        numbers: source of uniform numbers, as for ``sample_by``.
+        typed: type (index) and load of every vehicle, both [n, N]; None without types.
+
     """
     streams: dict[tuple[int, ...], Floats] = {(): numbers(BLOCK * scenario.vehicles, ())}
 
@@ -1638,30 +170,23 @@ def drawn_quantities(
     return drawn
 
 
-def _supports_of(scenario: ScenarioFields) -> Callable[[str], Floats]:
-    """Smallest and largest value of every entry of each declared key, [2, entries]."""
-    return lambda key: np.array(scenario.supports(key)).T
-
-
-Channel = Literal["list", "training"]
-
-CHANNELS: dict[str, int] = {"list": 0, "training": 1}
-MOST_ATTEMPTS = 1000  # draws of one world before its scenario is declared unusable
-_PATIENCE = 10  # attempts of a whole list before one world is tried to its end
-
-MOST_AT_ONCE = 10_000_000  # worlds of one sample; a longer list is drawn in parts
-
-_MOST_WORLDS = 2**62  # their numbers are 64-bit integers
-_NUMBERS_PER_COUNTER = 4  # 64-bit integers that Philox makes from one counter
-
-
 def uniform_numbers(
     seed: int, channel: Channel, attempt: int, first: int, n: int, width: int, *, of: tuple[int, ...] = ()
 ) -> Floats:
-    """Uniform numbers in [0, 1) of worlds ``first`` to ``first + n - 1``: [n, width], width a multiple of 4.
+    """Return uniform numbers in [0, 1) for worlds ``first`` to ``first + n - 1``, [n, width].
 
-    Row k depends on (seed, channel, attempt, of, first + k, width) only; ``of`` names a stream of its own, such as
-    ``V2X_NEWS``. u is the upper 53 bits of a Philox integer.
+    Row k depends only on (seed, channel, attempt, of, first + k, width). A number is the upper 53 bits of a Philox
+    integer.
+
+    Args:
+        seed: seed of the list.
+        channel: ``"list"`` or ``"training"``.
+        attempt: number of the draw, from 0; a world that is rejected is drawn again with the next attempt.
+        first: number of the first world in the list, from 0.
+        n: number of worlds.
+        width: numbers per world, a multiple of 4.
+        of: a separate stream of numbers, such as ``fields.V2X_NEWS``; ``()``: the main stream.
+
     """
     sequence = np.random.SeedSequence([seed], spawn_key=(CHANNELS[channel], attempt, *of))
     key = sequence.generate_state(2, np.uint64)
@@ -1672,7 +197,10 @@ def uniform_numbers(
 
 
 def _draw_numbers(scenario: ScenarioFields, index: Ints, seed: int, channel: Channel) -> Sample:
-    """The worlds with these numbers (ascending) of the scenario's list."""
+    """Return the worlds with the ascending numbers ``index`` [n] of the scenario's list.
+
+    Early impacts are rejected if the scenario says so. Other arguments are the same as in ``sample``.
+    """
     drawn = _draw(scenario, seed, channel, 0, index)
     if scenario.early_impacts == "keep" or not scenario.learners:
         return drawn
@@ -1683,10 +211,10 @@ def _draw_numbers(scenario: ScenarioFields, index: Ints, seed: int, channel: Cha
 
 
 def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
-    """Which worlds have an impact before (or just when) the first learner may act: [n].
+    """Return whether each world has an impact before, or just when, the first learner can act, [n].
 
-    Vehicles follow their state-free scripts and learners coast, which nobody can change before that moment. Needs a
-    learner: without one no impact is early, and ``draw`` refuses nothing.
+    Until then scripted vehicles follow their scripts, which must not depend on the state, and learners coast; so no
+    learner can prevent this impact. The scenario must have a learner.
     """
     vehicles = worlds.vehicles
     command = np.zeros(worlds.speeds_mps.shape)
@@ -1703,7 +231,16 @@ def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
 
 
 def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample, early: Bools) -> Sample:
-    """Draw refused worlds again, attempt by attempt, until every one is accepted."""
+    """Draw rejected worlds again, attempt by attempt, until all are accepted; return the complete sample.
+
+    Args:
+        scenario: the scenario to draw from.
+        seed: seed of the list.
+        channel: ``"list"`` or ``"training"``.
+        drawn: worlds of the first attempt.
+        early: whether each of them is rejected for an early impact, [n].
+
+    """
     parts, pending, rejected = [drawn.take(~early)], drawn.index[early], int(early.sum())
     for attempt in range(1, MOST_ATTEMPTS):
         if attempt == _PATIENCE and len(pending) > 1:
@@ -1720,7 +257,11 @@ def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample
 
 
 def _redraw_one(scenario: ScenarioFields, seed: int, channel: Channel, index: Ints) -> None:
-    """Follow one world to its end; if it fails the whole list fails, and this way soon."""
+    """Raise ``InvalidInput`` if all remaining attempts to draw world number ``index`` [1] are rejected.
+
+    Testing one world first makes a list whose draws are all rejected fail early. Other arguments are the same as in
+    ``sample``.
+    """
     for attempt in range(_PATIENCE, MOST_ATTEMPTS):
         if not early_impact(scenario, _draw(scenario, seed, channel, attempt, index).worlds)[0]:
             return
@@ -1737,265 +278,15 @@ def _unusable(scenario: ScenarioFields, world: int) -> InvalidInput:
 
 
 def _draw(scenario: ScenarioFields, seed: int, channel: Channel, attempt: int, index: Ints) -> Sample:
-    """The worlds with these numbers (ascending), as drawn in this attempt."""
+    """Draw the worlds with the ascending numbers ``index`` [n] once; early impacts are not rejected.
+
+    ``attempt``: number of the draw, from 0, which selects the random numbers. Other arguments are the same as in
+    ``sample``.
+    """
     first, last = int(index[0]), int(index[-1])
 
     def numbers(width: int, of: tuple[int, ...] = ()) -> Floats:
         u = uniform_numbers(seed, channel, attempt, first, last - first + 1, width, of=of)
         return u if len(u) == len(index) else u[index - first]
 
-    return scenario.sample_by(numbers, index)
-
-
-# Worlds whose initial conditions the user gives: a table (one row per world) or one state for ``reset``.
-
-Entry = tuple[str, int]  # quantity and index (from 0) of the vehicle or pair
-
-SIZE_LIMIT = 64 << 20  # bytes of a table
-
-_ALWAYS_IN_A_TABLE = ("gaps_m", "speeds_mps")
-
-
-@dataclass(frozen=True, slots=True)
-class _Naming:
-    """How messages call a value: by column and row of a table, or by key and index of one state."""
-
-    where: str
-    kind: Literal["file", "table", "state"]
-    lines: Sequence[int] = ()  # of a file: on which each row begins
-
-    def entry(self, entry: Entry) -> str:
-        field, index = entry
-        if self.kind != "state":
-            return f"column {QUANTITY.declared[field].column_of(index)}"
-        return field if QUANTITY.declared[field].per == "world" else f"{field}[{index}]"
-
-    def value(self, entry: Entry, row: int) -> str:
-        if self.kind == "state":
-            return f"{self.where}: {self.entry(entry)}"
-        place = f"line {self.lines[row]}" if self.kind == "file" else f"row {row}"
-        return f"{self.where}, {place}, {self.entry(entry)}"
-
-
-def _quantities(scenario: ScenarioFields) -> dict[str, QuantityRule]:
-    """What a world of this scenario has."""
-    there = {"obstacle_gap_m": scenario.has_obstacle, "friction": scenario.has_friction}
-    return QUANTITY.usual | {
-        key: rule for key, rule in QUANTITY.optional.items() if there.get(key, scenario.declares(key))
-    }
-
-
-def _table_columns(rules: Mapping[str, QuantityRule], vehicles: int) -> dict[str, Entry]:
-    """The columns of a table with these quantities, and the entry of each."""
-    named = {key: rule for key, rule in rules.items() if rule.column}
-    return {rule.column_of(i): (key, i) for key, rule in named.items() for i in range(rule.count(vehicles))}
-
-
-def _tabled(data: Mapping[str, Any], key: str) -> bool:
-    """Whether the table of fields of a scenario has every entry of a quantity."""
-    table, rule = data.get("table"), QUANTITY.declared[key]
-    if table is None or "vehicles" not in data or not rule.column:
-        return False
-    return all(rule.column_of(i) in table.columns for i in range(rule.count(data["vehicles"])))
-
-
-def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Naming) -> Worlds:
-    """Check the given columns, each [n], fill in the scenario's fixed numbers, and build the worlds."""
-    if scenario.members:
-        raise InvalidInput(
-            f"{naming.where}: scenario {scenario.name!r} is a mixture, and nothing says which of its scenarios a world"
-            f" belongs to; take one of them: {', '.join(member.name for member in scenario.members)}"
-        )
-    n = len(next(iter(given.values()))) if given else 1
-    full: dict[str, Floats] = {}
-    rules = _quantities(scenario)
-    last = ("gaps_m", "obstacle_gap_m")  # may need the others
-    for field, rule in sorted(rules.items(), key=lambda item: item[0] in last):
-        full[field] = np.empty((n, rule.count(scenario.vehicles)))
-        for index in range(rule.count(scenario.vehicles)):
-            column = given.get((field, index))
-            if column is None:
-                column = _fixed(scenario, field, index, full)
-            if column is None:
-                missing = naming.entry((field, index))
-                raise InvalidInput(f"{naming.where}: {missing} is missing, and random in scenario {scenario.name!r}")
-            good = (column > 0.0 if rule.positive else column >= 0.0) & (column <= rule.high)
-            _require_all(good, naming, (field, index), column, f"must be {rule.interval}")
-            full[field][:, index] = column
-    _check_together(full, scenario, naming)
-    of_world = {field: full.pop(field)[:, 0] for field, rule in rules.items() if rule.per == "world"}
-    worlds = make_worlds(full.pop("gaps_m"), full.pop("speeds_mps"), **of_world, **full)
-    line = scenario.types_of_line
-    drawn = line is not None and any(kind.v2x is not None for kind in line.kinds)
-    return scenario.v2x.with_fixed_news(
-        scenario.play_pieces(worlds), scenario.time_step_s, naming.where, None if drawn else scenario.equipped()
-    )
-
-
-def _fixed(scenario: ScenarioFields, field: str, index: int, full: Mapping[str, Floats]) -> Floats | None:
-    """What the scenario fixes for this entry, [n] or [1]; None if random.
-
-    A time gap is taken at the speeds in ``full``, the margin to an obstacle from where Vehicle 1 stops there.
-    """
-    if field == "obstacle_gap_m":
-        low, high = support(scenario.quantities(field if scenario.declares(field) else "obstacle_margin_m")[0])
-        return obstacle_gap(scenario, on_road(full), lambda key: np.array([low])) if low == high else None
-    by_time = field == "gaps_m" and scenario.time_gaps_s is not None
-    told = scenario.bounds(field, dry=True)[index]
-    low, high = support(scenario.quantities("time_gaps_s")[index]) if by_time else told
-    if low != high:
-        return None
-    return low * full["speeds_mps"][:, index + 1] if by_time else np.array([low])
-
-
-def _check_together(full: Mapping[str, Floats], scenario: ScenarioFields, naming: _Naming) -> None:
-    for index in range(scenario.vehicles):
-        latency, speed, limit = (full[f][:, index] for f in ("latency_s", "speeds_mps", "speed_limit_mps"))
-        right = f"must be below the scenario's horizon_s ({scenario.horizon_s:g} s)"
-        _require_all(latency < scenario.horizon_s, naming, ("latency_s", index), latency, right)
-        good = speed <= limit
-        limit_mps = limit[np.argmin(good)]  # of the world that the message is about
-        right = f"must not be above speed_limit_mps of vehicle_{index + 1}, {limit_mps:g} m/s"
-        _require_all(good, naming, ("speeds_mps", index), speed, right)
-
-
-def _require_all(good: Bools, naming: _Naming, entry: Entry, column: Floats, right: str) -> None:
-    """Refuse the first world for which ``good`` does not hold."""
-    if not good.all():
-        row = int(np.argmin(good))
-        raise InvalidInput(f"{naming.value(entry, row)} = {column[row]:.12g}: {right}")
-
-
-def _known_columns(header: list[str], scenario: ScenarioFields, where: str) -> list[Entry]:
-    """The entry of each column; unknown, repeated and missing columns are errors."""
-    known = scenario.table_columns
-    if twice := [name for name, times in Counter(header).items() if times > 1]:
-        raise InvalidInput(f"{where}: column {twice[0]!r} is given twice")
-    for name in header:
-        if name not in known:
-            hint = suggestion(name, known) or f"known: {', '.join(known)}"
-            separator = "; columns are separated by commas" if ";" in name or "\t" in name else ""
-            raise InvalidInput(f"{where}: unknown column {name!r}; {hint}{separator}")
-    for name, (field, _) in known.items():
-        if field in _ALWAYS_IN_A_TABLE and name not in header:
-            raise InvalidInput(f"{where}: column {name!r} is missing; {scenario.vehicles} vehicles need it")
-    return [known[name] for name in header]
-
-
-def _numbers(what: str, value: ArrayLike) -> Floats:
-    try:
-        return real_numbers(value)
-    except ValueError as error:
-        raise InvalidInput(f"{what} = {value!r}: {error}; must be a number or a list of numbers") from None
-
-
-def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
-    """Header and rows of a CSV file, unchecked, and the line on which each row begins; there is at least one row."""
-    rows: list[list[str]] = []
-    lines: list[int] = []
-    data = read_plain(file, SIZE_LIMIT)
-    try:
-        reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
-        begins = 1
-        for row in reader:
-            rows.append(row)
-            lines.append(begins)
-            begins = reader.line_num + 1
-    except (csv.Error, ValueError) as error:
-        raise InvalidInput(f"{file}: cannot be read as CSV: {error}") from None
-    while rows and not rows[-1]:
-        rows.pop()  # blank lines at the end
-    if not rows or not rows[0]:
-        raise InvalidInput(f"{file}, line 1: must name the columns, for instance gap_1_m,gap_2_m,speed_1_mps,...")
-    if len(rows) == 1:
-        raise InvalidInput(f"{file}: has a header but no rows; one row is one world")
-    return [name.strip() for name in rows[0]], rows[1:], lines[1:]
-
-
-def _number_at(file: Path, header: list[str], row: list[str], line: int, column: str) -> float:
-    """The number in this column of a row of a CSV file."""
-    if len(row) != len(header):
-        raise InvalidInput(f"{file}, line {line}: {len(row)} values, but the header has {len(header)} columns")
-    text = row[header.index(column)]
-    number = parse_numeral(text.strip())
-    if number is None:
-        raise InvalidInput(f"{file}, line {line}, column {column}: {text!r:.60} is not a number")
-    return number
-
-
-# The ranges of a scenario as a unit cube: one coordinate for each number that it draws.
-#
-# A search moves in the cube, where every point is as likely as any other and gives one world; a list is a random sample
-# of it.
-
-_UNUSED = 0.5  # in the place of numbers that change nothing
-
-
-@dataclass(frozen=True, slots=True)
-class Ranges:
-    """The numbers that a scenario draws: their names, and where each stands among a world's uniform numbers."""
-
-    scenario: ScenarioFields
-    names: tuple[str, ...]
-    places: tuple[Place, ...]
-
-    def sample(self, points: Floats) -> tuple[Sample, Bools]:
-        """The worlds at ``points`` [n, coordinates] of [0, 1), and which of them the scenario would accept, [n].
-
-        A scenario that rejects early impacts does not accept worlds that have one.
-        """
-        n, vehicles = len(points), self.scenario.vehicles
-        widths = {(): BLOCK * vehicles, TYPES: PER_TYPE * vehicles, OBSTACLE: OF_WORLD, SURROUNDINGS: OF_WORLD}
-        widths[BRAKES] = widths[()]
-        streams = {of: np.full((n, width), _UNUSED) for of, width in widths.items()}
-        for (of, column), u in zip(self.places, points.T, strict=True):
-            streams[of][:, column] = u
-        found = self.scenario.sample_by(lambda _, of: streams[of], np.arange(n, dtype=np.int64))
-        if self.scenario.early_impacts == "keep" or not self.scenario.learners:
-            return found, np.ones(n, np.bool_)
-        return found, ~early_impact(self.scenario, found.worlds)
-
-
-def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:
-    """Name -> place of every quantity that is drawn."""
-    used: list[str] = []
-
-    def note(key: str) -> Floats:
-        used.append(key)
-        return np.ones((1, len(scenario.possible_quantities(key))))
-
-    world_quantities(scenario, note)
-    used += [key for key in ("obstacle_gap_m", "obstacle_margin_m") if getattr(scenario, key) is not None]
-    places: dict[str, Place] = {
-        _name(key, i): QUANTITY.declared[key].place(i)
-        for key in used
-        for i, possible in enumerate(scenario.possible_quantities(key))
-        if any(_drawn(entry.spread if isinstance(entry, WithLoad) else entry) for entry in possible.values())
-    }
-    if any(_drawn(column, tabled=True) for column in scenario.table_entries.values()):
-        places["row of the table"] = ROW
-    return places
-
-
-def _of_types(scenario: ScenarioFields) -> dict[str, Place]:
-    """Name -> place of the type and the load of every vehicle that has several, or moves something with its load."""
-    if scenario.types_of_line is None:
-        return {}
-    places: dict[str, Place] = {}
-    for i, vehicle in enumerate(scenario.vehicle_names):
-        possible = [scenario.possible_quantities(key)[i] for key in QUANTITY.of_a_type if scenario.declares(key)]
-        if any(len(each) > 1 for each in possible):
-            places[f"{vehicle} type"] = (TYPES, PER_TYPE * i)
-        if any(isinstance(entry, WithLoad) for each in possible for entry in each.values()):
-            places[f"{vehicle} load"] = (TYPES, PER_TYPE * i + 1)
-    return places
-
-
-def _drawn(entry: AnyTypeQuantity, *, tabled: bool = False) -> bool:
-    low, high = support(entry)
-    return low != high and isinstance(entry, TableColumn) == tabled
-
-
-def _name(key: str, index: int) -> str:
-    owner = QUANTITY.declared[key].owner(index)
-    return f"{key} of {owner}" if owner else key
+    return sample_by(scenario, numbers, index)

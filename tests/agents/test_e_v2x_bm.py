@@ -9,22 +9,21 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import Team, drive, e_v2x_bm, make_agent, optimise_coupled, optimise_pairwise, pairwise_harm
-from ethbrake_marl.agents.e_v2x_bm import (
-    CoupledOptimum,
-    Line,
-    Samples,
-    closing_speed_squared,
-    least_to_spare_front,
-    make_line,
-    most_to_spare_rear,
-    share_start,
-    simulate,
-    will_stay_apart,
-)
-from ethbrake_marl.physics import Floats, Impacts, Worlds, advance, forecast, make_worlds
-from ethbrake_marl.physics.compiling import compiled
-from ethbrake_marl.physics.kernel import FLAG, ROW
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.e_v2x_bm import coupled
+from ethbrake_marl.agents.e_v2x_bm.constants import Line, make_line, share_start, simulate, will_stay_apart
+from ethbrake_marl.agents.e_v2x_bm.contacts import closing_speed_squared, least_to_spare_front, most_to_spare_rear
+from ethbrake_marl.agents.e_v2x_bm.coupled import CoupledOptimum, optimise_coupled
+from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
+from ethbrake_marl.agents.e_v2x_bm.samples import Samples
+from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.agents.protocol import Team
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.forecast import forecast
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.left_out import Impacts
+from ethbrake_marl.physics.rows import FLAG, ROW
+from ethbrake_marl.physics.state import Floats, Worlds, make_worlds
 from tests.agents.test_drive import PAIR
 
 PAPER = eb.load_scenario("paper-random")
@@ -324,11 +323,11 @@ def test_coupled__takes_the_middle_of_a_collision_free_interval(rear_mps2):
 
 def test_coupled__threads_batch_and_what_was_searched_before_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     worlds, searches = PAPER.sample(600, 7).worlds, []
-    search = e_v2x_bm._search_worlds
-    monkeypatch.setattr(e_v2x_bm, "_search_worlds", lambda *given: searches.append(1) or search(*given))
+    search = coupled._search_worlds
+    monkeypatch.setattr(coupled, "_search_worlds", lambda *given: searches.append(1) or search(*given))
     found = {}
     for cores in (1, 3):
-        monkeypatch.setattr(e_v2x_bm, "_FOUND", {})
+        monkeypatch.setattr(coupled, "_FOUND", {})
         monkeypatch.setattr("os.cpu_count", lambda cores=cores: cores)
         found[cores] = optimise_coupled(worlds, 1)
         again = optimise_coupled(worlds, 1)

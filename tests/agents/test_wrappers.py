@@ -16,8 +16,8 @@ from stable_baselines3.common import vec_env
 from stable_baselines3.common.monitor import Monitor
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import drive
-from ethbrake_marl.envs import InTurns
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.envs.pettingzoo import InTurns
 from ethbrake_marl.errors import InvalidInput
 
 SCENARIO = eb.load_scenario("paper-random")

@@ -25,9 +25,9 @@ from ethbrake_marl.cli import app as frame
 from ethbrake_marl.cli.app import add_command, app, run_command, whole_command
 from ethbrake_marl.cli.command import Out
 from ethbrake_marl.errors import AlreadyExists
-from ethbrake_marl.evaluation import EPISODES, LIST_SEED
-from ethbrake_marl.physics.compiling import compiled
-from tests.cli.conftest import Command, check_refused, told_json
+from ethbrake_marl.evaluation.identity import EPISODES, LIST_SEED
+from ethbrake_marl.physics.jit import compiled
+from tests.fixtures.commands import Command, check_refused, told_json
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = [""]  # every one, groups too
@@ -71,7 +71,6 @@ def test_help__says_the_list_that_the_package_has(ethbrake: Command) -> None:
     assert all(
         f"[default: {each}]" in " ".join(ethbrake("run", "--help").out.split()) for each in (EPISODES, LIST_SEED)
     )
-    assert f"[default: {LIST_SEED}]" in ethbrake("watch", "--help").out
 
 
 @pytest.mark.parametrize(
@@ -110,8 +109,8 @@ def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, 
     folder = tmp_path / ("ethbrake_marl-x" if temporary else "kept")
     folder.mkdir()
     monkeypatch.setattr("ethbrake_marl.kernel_store.cache_folder", lambda: folder)
-    monkeypatch.setattr("ethbrake_marl.physics.compiling.cache_folder", lambda: folder)
-    monkeypatch.setattr("ethbrake_marl.physics.compiling._loaded", loaded)
+    monkeypatch.setattr("ethbrake_marl.physics.jit.cache_folder", lambda: folder)
+    monkeypatch.setattr("ethbrake_marl.physics.jit._loaded", loaded)
     monkeypatch.setattr("ethbrake_marl.kernel_store._tellers", [])
     monkeypatch.setitem(event._registered, "numba:compile", [])  # nobody listens any more after this test
     monkeypatch.setattr("warnings.showwarning", None)
@@ -154,11 +153,11 @@ def test_a_command_of_a_program__prints_where_it_likes(ethbrake: Command, monkey
 
 
 def test_defect_of_the_program__keeps_its_traceback_and_missing_memory_is_one_line(ethbrake, monkeypatch) -> None:
-    monkeypatch.setattr("ethbrake_marl.scenario.list_scenarios", Mock(side_effect=RuntimeError("a defect")))
+    monkeypatch.setattr("ethbrake_marl.scenario.catalogue.list_scenarios", Mock(side_effect=RuntimeError("a defect")))
     with pytest.raises(RuntimeError, match="a defect"):
         ethbrake("scenario", "list")
     short = Mock(side_effect=MemoryError("Unable to allocate 9 TiB"))
-    monkeypatch.setattr("ethbrake_marl.evaluation.evaluate_held", short)
+    monkeypatch.setattr("ethbrake_marl.evaluation.chunks.evaluate_held", short)
     check_refused(ethbrake("evaluate"), "not enough memory (Unable to allocate 9 TiB)", "fewer worlds")
 
 
@@ -192,13 +191,11 @@ def test_program__prints_a_table_on_a_narrow_stdout_and_needs_no_torch(encoding:
         "sys.argv[1:] = ['evaluate', '--episodes', '5', '--agents', 'coast']\n"
         "try:\n    main()\n"
         "except SystemExit as end:\n    assert not end.code\n"
-        "print('loaded:', *{'torch', 'stable_baselines3', 'matplotlib'} & set(sys.modules))\n"
-        "import ethbrake_marl.studies.reproduction\n"
-        "print('with the items of the paper:', *{'torch'} & set(sys.modules))",
+        "print('loaded:', *{'torch', 'stable_baselines3', 'matplotlib'} & set(sys.modules))\n",
         PYTHONIOENCODING=encoding,
     )
     assert status == 0 and "coast" in out, err
-    assert out.endswith("loaded:\nwith the items of the paper:\n"), out
+    assert out.endswith("loaded:\n"), out
 
 
 def test_kernels__a_temporary_cache_is_told_and_removed_at_the_end(tmp_path: Path) -> None:

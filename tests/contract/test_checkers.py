@@ -15,15 +15,17 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.drawing import HEIGHT, WIDTH, Viewer
-from ethbrake_marl.envs.interfaces import EthBrakeEnv, env, parallel_env
+from ethbrake_marl.envs.gymnasium import EthBrakeEnv
+from ethbrake_marl.envs.pettingzoo import env, parallel_env
+from ethbrake_marl.envs.rendering import HEIGHT, WIDTH
+from ethbrake_marl.envs.viewer import Viewer
 from tests.contract.interfaces import FIVE, LEVELS, PAPER, REST, SCENARIOS, line
 
 pytestmark = pytest.mark.filterwarnings(
     "error",
     # PettingZoo's checkers pass {"options": 1} on purpose; asking for a warning here is our own rule.
-    "ignore:reset. unknown option options, ignored:ethbrake_marl.envs.interfaces.UnknownResetOption",
-    "ignore::ethbrake_marl.envs.interfaces.IgnoredAction",  # they act for all agents
+    "ignore:reset. unknown option options, ignored:ethbrake_marl.envs.making.UnknownResetOption",
+    "ignore::ethbrake_marl.envs.making.IgnoredAction",  # they act for all agents
     "ignore:.*is different from the unwrapped version",  # a shield is: that is its use
 )
 ANY_START = PAPER.replace(early_impacts="keep")
@@ -90,3 +92,10 @@ def test_stable_baselines3__makes_it_by_its_id() -> None:
     assert make_vec_env("EthBrake-v0", n_envs=2).reset().shape[0] == 2
     model = PPO("MlpPolicy", "EthBrake-v0", n_steps=16, batch_size=16, n_epochs=1, device="cpu").learn(16)
     assert model.get_env().render(mode="rgb_array").shape == (HEIGHT, WIDTH, 3)
+
+
+def test_old_gymnasium_spec__is_made():
+    spec = gymnasium.make("EthBrake-v0", scenario="paper-random").spec
+    old = spec.to_json().replace("ethbrake_marl.envs.gymnasium:", "ethbrake_marl.envs:")
+    assert old != spec.to_json()
+    assert gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(old)).reset(seed=1)[0].shape

@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.envs.interfaces import UnknownResetOption
+from ethbrake_marl.envs.making import UnknownResetOption
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.scenario import QUANTITY, Scenario, load_scenario
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.schema import Scenario
 from tests.contract.interfaces import (
     BARE,
     BATCHED,

@@ -143,7 +143,7 @@ BLOCKS: dict[str, How] = {
     "ethbrake train": _by(SUITE, "tests/test_imports.py"),
     "agent,world,impacts,first_impact_harm,total_harm": TUTORIAL,
     "-1.0 26.97": TUTORIAL,
-    "6.07 0": _by(SUITE, "tests/hosts/test_hosts.py"),
+    "6.07 0": _by(SUITE, "tests/extensions/hosts/test_hosts.py"),
     "Policy('ppo', 27 observations": _by(SUITE, "tests/docs/test_printed.py"),
     "ethbrake train --scenario cooperation-3-pair": TRAINED,
     "ethbrake agent export runs/early": TRAINED,
@@ -167,22 +167,24 @@ TABLES: dict[str, How] = {
     "| who drives Vehicle 2 | knows | collisions": _by(NIGHTLY, *_TESTS),
     "| what | first-impact harm | of the best known": TRAINED,
     "| no. | label | the paper": _by(BY_HAND),
-    "| `--draw` | full_brake": _by(SUITE, "tests/scenario/test_recorded.py"),
-    "| agent in a host | here | SUMO": _by(SUITE, "tests/hosts/test_sumo.py"),
+    "| `--draw` | full_brake": _by(SUITE, "tests/extensions/recorded/test_recorded.py"),
+    "| agent in a host | here | SUMO": _by(SUITE, "tests/extensions/hosts/test_sumo.py"),
     "| work | has | lacks": _by(BY_HAND),
     "| for | recipe | scenario | differs": _by(BY_HAND),
 }
 
 PICTURES: dict[str, How] = {
     "emergency.svg": _by(NIGHTLY, "ethbrake watch --agents full_brake,universal@shipped --output emergency.svg"),
+    "game-loop.svg": _by(BY_HAND),
     "model-": _by(SUITE, "tests/docs/test_studies.py"),
     "deceleration.png": _by(
         NIGHTLY,
         'python -c "import ethbrake_marl as eb; from ethbrake_marl.scenario import Task;'
+        " from ethbrake_marl.extensions.report import deceleration_curve, deceleration_figure, write_picture;"
         " scenario = eb.load_scenario('paper-random');"
-        " curve = eb.deceleration_curve(scenario.sample(1, 7, first=5).worlds, Task(scenario, scenario.learners));"
-        " figure = eb.deceleration_figure(curve, title='paper-random, world 5 of the list of seed 7');"
-        " eb.write_picture('deceleration.png', figure)\"",
+        " curve = deceleration_curve(scenario.sample(1, 7, first=5).worlds, Task(scenario, scenario.learners));"
+        " figure = deceleration_figure(curve, title='paper-random, world 5 of the list of seed 7');"
+        " write_picture('deceleration.png', figure)\"",
     ),
     "sampled-convergence.png": _by(NIGHTLY, "python docs/studies/sampling.py sampled-convergence.png"),
     "price-of-not-knowing.png": _by(NIGHTLY, "python docs/studies/price.py price-of-not-knowing.png"),

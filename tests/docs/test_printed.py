@@ -13,10 +13,11 @@ import pytest
 import yaml
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.e_v2x_bm import optimise_pairwise, pairwise_harm
+from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.policies import shipped_policies
-from ethbrake_marl.scenario import list_scenarios, load_scenario, new_scenario_text
+from ethbrake_marl.policies.shipped import shipped_policies
+from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario, new_scenario_text
+from ethbrake_marl.scenario.tables import worlds_from_table
 from tests.docs.printed import (
     BLOCKS,
     EXACT,
@@ -130,7 +131,7 @@ def test_reference_values__are_those_of_the_closed_form() -> None:
         scenario = load_scenario("paper-random").replace(latency_s=[0.0, *latency])
         start = {f"gap_{k}_m": [gap] for k, gap in enumerate(gaps, 1)}
         start |= {f"speed_{k}_mps": [speed] for k, speed in enumerate(speeds, 1)}
-        worlds = scenario.worlds_from_table(start)
+        worlds = worlds_from_table(scenario, start)
         found = optimise_pairwise(worlds, 1)
         told = [found.spares_front_mps2, found.spares_rear_mps2, found.deceleration_mps2, found.harm]
         told.append(pairwise_harm(worlds, [6, 7, 6]).sum(axis=1))

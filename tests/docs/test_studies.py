@@ -13,17 +13,24 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import optimise_pairwise
-from ethbrake_marl.agents.registry import drive, make_agent
-from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.evaluation.measures import PAPER_NOTE, PAPER_ROWS
-from ethbrake_marl.figures import picture_bytes
-from ethbrake_marl.harm import OBJECTIVES, scored
-from ethbrake_marl.learning.training import Scheme
-from ethbrake_marl.limits.limits import best_known
-from ethbrake_marl.scenario import Task, load_scenario
-from ethbrake_marl.studies import reproduction
-from ethbrake_marl.studies.reproduction import FULL_BRAKE, GAPS, ITEMS, NAMES, Reproduction, Result, checked_result
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
+from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.evaluation.lineup import make_lineup
+from ethbrake_marl.extensions.report.paper_rows import PAPER_NOTE, PAPER_ROWS
+from ethbrake_marl.extensions.report.style import picture_bytes
+from ethbrake_marl.extensions.reproduction import pages, strategies, tables as tables_module, verdicts
+from ethbrake_marl.extensions.reproduction.folder import Reproduction, Result, checked_result
+from ethbrake_marl.extensions.reproduction.items import ITEMS
+from ethbrake_marl.extensions.reproduction.making import choose_items
+from ethbrake_marl.extensions.reproduction.open_quantities import GAPS
+from ethbrake_marl.extensions.reproduction.strategies import FULL_BRAKE, NAMES
+from ethbrake_marl.extensions.search.shipped import best_known
+from ethbrake_marl.game.objectives import OBJECTIVES, scored
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.tables import worlds_from_table
+from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.training.recipe import Scheme
 from tests.docs.site import DOCS, load
 from tests.fixtures.installed import write_metadata
 
@@ -198,7 +205,7 @@ def test_paper__harms_at_three_delays_are_as_committed(spec: str, name: str) -> 
     state = {"gap_1_m": [7], "gap_2_m": [7], "speed_1_mps": [20], "speed_2_mps": [18], "speed_3_mps": [20]}
     for told, delay in zip(row[1:], ("low", "middle", "high"), strict=True):
         scenario = load_scenario(f"paper-delay-{delay}")
-        worlds = scenario.worlds_from_table(state)
+        worlds = worlds_from_table(scenario, state)
         outcome = eb.evaluate(worlds, make_lineup([spec], scenario), scenario=scenario).outcome(spec)
         assert told.value == f"{outcome.first_impact_harm.mean():.2f}"
 
@@ -213,38 +220,38 @@ def test_paper__full_braking_over_the_total_distance_is_as_committed() -> None:
 
 
 def test_reproduction__is_made_of_the_committed_data_of_every_item_and_gap() -> None:
-    assert reproduction.docs_page(list(RESULTS.values())) == MADE_AGAIN
+    assert pages.docs_page(list(RESULTS.values())) == MADE_AGAIN
     assert list(RESULTS) == [item.name for item in ITEMS]
     assert [row[0].value for row in RESULTS["gaps"].tables[0].rows] == [gap.name for gap in GAPS]
     for name, result in RESULTS.items():
-        assert reproduction.summarise_verdicts(result.comparisons) == result.verdict, name
+        assert verdicts.summarise_verdicts(result.comparisons) == result.verdict, name
     assert [label for item in ITEMS for label in item.labels if f"`{label}`" not in PAPER_TEXT] == []
     for name in ("README", "paper"):
         assert "(reproduction.md)" in (DOCS / f"{name}.md").read_text("utf-8"), name
 
 
 def test_reproduction__every_figure_is_there_and_no_other() -> None:
-    folder, prefix = reproduction.FIGURES, reproduction.PREFIX
+    folder, prefix = pages.FIGURES, pages.PREFIX
     shown = set(re.findall(rf"\]\(\.\./{folder}/({prefix}[a-z0-9-]+\.svg)\)", SITE.add_reproduction("")))
     assert shown == {path.name for path in (DOCS / folder).glob(f"{prefix}*")}
     assert shown == {f"{prefix}{each.stem}.svg" for result in RESULTS.values() for each in result.figures}
 
 
 def test_reproduction__trajectories_and_full_braking_are_as_committed(tmp_path: Path) -> None:
-    (item,) = Reproduction.choose(["trajectories"])
+    (item,) = choose_items(["trajectories"])
     made, committed = item.make(Reproduction("quick", tmp_path)), RESULTS["trajectories"]
     assert made.verdicts == committed.comparisons
     (table,), (kept,) = made.tables, committed.tables
     told = [[cell.in_words for cell in row] for row in table.shown()]
     assert told == [[cell.value for cell in row] for row in kept.rows]
     tables = {table.title: table for table in RESULTS["random-table"].tables}
-    for reading in reproduction.READINGS:
+    for reading in strategies.READINGS:
         scenario = reading.scenario("paper-random")
-        agents = reproduction.lineup(scenario, FULL_BRAKE)
-        found = reproduction.drive_list(scenario, agents, 10_000, Reproduction("quick", tmp_path))
-        rate = reproduction.collision_rate(found.outcome(NAMES[FULL_BRAKE]).collided)
+        agents = strategies.lineup(scenario, FULL_BRAKE)
+        found = strategies.drive_list(scenario, agents, 10_000, Reproduction("quick", tmp_path))
+        rate = tables_module.collision_rate(found.outcome(NAMES[FULL_BRAKE]).collided)
         (row,) = (row for row in tables[reading.name].rows if row[0].value == NAMES[FULL_BRAKE])
-        assert row[1].value == reproduction.PERCENT.show(rate).in_words
+        assert row[1].value == verdicts.PERCENT.show(rate).in_words
 
 
 # docs/cooperation.md and the pages of its dials

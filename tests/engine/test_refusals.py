@@ -5,17 +5,18 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ethbrake_marl.actions import checked_action
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.engine import Engine
-from ethbrake_marl.envs import parallel_env
-from ethbrake_marl.envs.interfaces import make_engine
+from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.envs.making import make_engine
+from ethbrake_marl.envs.pettingzoo import parallel_env
 from ethbrake_marl.errors import UnknownName
-from ethbrake_marl.harm import declared_objectives, empty_ledger, injury_probability, scored
-from ethbrake_marl.observations import ObservationSpec, choose_observation, observe
-from ethbrake_marl.physics import advance
-from ethbrake_marl.rewards import reward_params
-from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.game.actions import checked_action
+from ethbrake_marl.game.harm import empty_ledger, injury_probability
+from ethbrake_marl.game.objectives import declared_objectives, scored
+from ethbrake_marl.game.observations import ObservationSpec, choose_observation, observe
+from ethbrake_marl.game.rewards import reward_params
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.scenario.catalogue import load_scenario
 from tests.fixtures.policies import make_policy
 from tests.physics.random_worlds import line
 from tests.refused import refused

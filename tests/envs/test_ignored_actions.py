@@ -9,7 +9,7 @@ import pytest
 from pettingzoo.utils.conversions import aec_to_parallel
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.interfaces import IgnoredAction
+from ethbrake_marl.envs.making import IgnoredAction
 from ethbrake_marl.errors import InvalidInput
 
 COAST = np.zeros(1, np.float32)

@@ -19,25 +19,16 @@ from stable_baselines3.common.monitor import Monitor
 
 import ethbrake_marl as eb
 from ethbrake_marl import ethbrake_v0
-from ethbrake_marl.engine import Stream
-from ethbrake_marl.envs import (
-    EthBrakeEnv,
-    EthBrakeVecEnv,
-    action_box,
-    env,
-    feature_box,
-    make_sb3_vec_env,
-    parallel_env,
-    register_environments,
-)
-from ethbrake_marl.envs.interfaces import IgnoredAction, make_engine
-from ethbrake_marl.envs.registration import GYMNASIUM_ID, PETTINGZOO_ID
+from ethbrake_marl.engine.stream import Stream
+from ethbrake_marl.envs.gymnasium import EthBrakeEnv
+from ethbrake_marl.envs.making import IgnoredAction, action_box, feature_box
+from ethbrake_marl.envs.pettingzoo import env, parallel_env
+from ethbrake_marl.envs.registration import GYMNASIUM_ID, PETTINGZOO_ID, register_environments
+from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.algorithms import play_to_the_end
-from ethbrake_marl.observations import Feature
-from ethbrake_marl.scenario import full_state, state_features
+from ethbrake_marl.game.features import Feature
+from ethbrake_marl.game.full_state import full_state, state_features
 from tests.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial_state, line
-from tests.engine.test_engine import act, no_offsets
 
 near = pytest.approx
 ROOT = Path(__file__).resolve().parents[2]
@@ -300,7 +291,8 @@ def test_import__stays_light_until_a_name_is_used_and_lets_gymnasium_make_it_by_
         "import gymnasium; e = gymnasium.make('ethbrake_marl:EthBrake-v0'); print(type(e.unwrapped).__name__)\n"
         "e.reset(seed=0); e.step(e.action_space.sample())\n"
         "a = eb.EthBrakeEnv(render_mode='ansi'); a.reset(seed=0); a.render()\n"
-        "print(e.unwrapped.engine._watched, p.engine._watched, *{'PIL', 'pygame', 'matplotlib'} & set(sys.modules))"
+        "watched = e.unwrapped.engine._now.watched, p.engine._now.watched\n"
+        "print(*watched, *{'PIL', 'pygame', 'matplotlib'} & set(sys.modules))"
     )
     command = [sys.executable, "-W", "error", "-c", program]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -713,16 +705,6 @@ def test_shares_of_the_steps__add_up_to_those_of_the_episode() -> None:
     for count, share in shares.items():
         assert np.allclose(share, engine.ledger.since(begun).vehicle_harm(count))
     assert np.allclose(cost, shares["first"].sum(axis=1))
-
-
-def test_branch__tells_nothing_of_a_row_that_cannot_be_advanced() -> None:
-    engine = make_engine("paper-random", 3, seed=3)
-    moment = engine.moment()
-    moment.state[1, -1 - 5] = np.nan
-    new = engine.branch(moment)
-    new.roster.failed[1] = "a contact was missed"
-    gained, _ = play_to_the_end(new, act, no_offsets(3), 1.0)
-    assert np.isnan(gained).tolist() == [False, True, False]
 
 
 def test_stream__gives_every_world_of_its_list_once_and_in_order() -> None:

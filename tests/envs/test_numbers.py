@@ -9,6 +9,7 @@ import torch
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.scenario.tables import worlds_from_table
 
 Make = Callable[[float], Any]
 BAD: dict[str, tuple[Make, str]] = {
@@ -99,7 +100,7 @@ def test_metres__that_are_no_number_are_refused(bad: str) -> None:
             batch.reset()
     table = {"gap_1_m": [7.0, make(7.0)], "gap_2_m": [7.0, 7.0], **{f"speed_{i}_mps": [20.0, 20.0] for i in (1, 2, 3)}}
     with pytest.raises(InvalidInput, match=rf"^initial states: gap_1_m = (?s:.*){message}"):
-        eb.load_scenario("paper-random").worlds_from_table(table)
+        worlds_from_table(eb.load_scenario("paper-random"), table)
 
 
 GOOD: dict[str, Make] = {

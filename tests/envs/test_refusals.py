@@ -9,7 +9,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl import parallel_env
 from ethbrake_marl.errors import UnknownName
-from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.scenario.catalogue import load_scenario
 from tests.contract.interfaces import CRASH, FIVE, PAPER
 from tests.refused import refused
 

@@ -13,9 +13,9 @@ from gymnasium.wrappers import TimeAwareObservation
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.interfaces import UnknownResetOption
+from ethbrake_marl.envs.making import UnknownResetOption
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario.schema import Scenario
 from tests.contract.interfaces import PAPER, REST, actions
 from tests.envs.test_interfaces import SHORT, FromOneStream, assert_same_infos, initial_state
 

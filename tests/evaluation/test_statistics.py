@@ -10,21 +10,19 @@ from hypothesis import given, strategies as st
 from scipy.stats import bootstrap
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation import statistics
+from ethbrake_marl.evaluation import seeds as seeds_module
+from ethbrake_marl.evaluation.seeds import interquartile_mean, mean_over_seeds, share_over_seeds
 from ethbrake_marl.evaluation.statistics import (
     Moments,
     exact_sum,
-    interquartile_mean,
     mean,
-    mean_over_seeds,
     paired_difference,
     rate,
     relative_decrease,
     root,
-    share_over_seeds,
 )
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.studies.experiment import results_csv
+from ethbrake_marl.training.experiment import results_csv
 
 # ---------------------------------------------------------------- exact sums
 
@@ -132,8 +130,8 @@ def test_mean_over_seeds__worlds_of_both_sides_are_drawn_together() -> None:
 
 @pytest.mark.parametrize("resamples", [1, 2, 3])
 def test_resamples__are_as_many_as_asked_for(resamples: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(statistics, "_AT_ONCE", 4)  # two at a time
-    assert statistics._resample_means((np.arange(4.0).reshape(2, 2),), resamples, 0).shape == (resamples, 1)
+    monkeypatch.setattr(seeds_module, "_AT_ONCE", 4)  # two at a time
+    assert seeds_module._resample_means((np.arange(4.0).reshape(2, 2),), resamples, 0).shape == (resamples, 1)
 
 
 def rounded(estimate):

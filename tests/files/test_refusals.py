@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle
-from ethbrake_marl.files.store import check_target, open_plain, read_plain, write_output
+from ethbrake_marl.files.plain import open_plain, read_plain
+from ethbrake_marl.files.store import check_target, write_output
 from ethbrake_marl.files.yaml import DEPTH_LIMIT, SIZE_LIMIT, parse_yaml, read_yaml
 from tests.refused import refused
 

@@ -1,9 +1,10 @@
 """Settings KEY=VALUE of recipes and scenarios, and the YAML that they are written in."""
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.inputs import load_runnable
-from ethbrake_marl.files.yaml import Override, flow_text, parse_yaml
-from ethbrake_marl.learning.training import read_settings
+from ethbrake_marl.evaluation.trial import load_runnable
+from ethbrake_marl.files.overrides import Override
+from ethbrake_marl.files.yaml import flow_text, parse_yaml
+from ethbrake_marl.training.settings import read_settings
 
 PPO = eb.load_recipe("ppo")
 

@@ -15,7 +15,7 @@ from itertools import accumulate, pairwise
 from math import inf, isqrt
 from typing import Any, NamedTuple
 
-from ethbrake_marl.physics import Worlds
+from ethbrake_marl.physics.state import Worlds
 
 Rationals = tuple[Fraction, ...]
 ZERO = Fraction(0)

@@ -9,8 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.physics import Bools, Floats, Impacts, Worlds, advance, make_worlds
-from ethbrake_marl.physics.kernel import BOUND
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.left_out import Impacts
+from ethbrake_marl.physics.motion import BOUND
+from ethbrake_marl.physics.state import Bools, Floats, Worlds, make_worlds
 from tests.reference.tolerances import ENERGY_EPS, EPS, FEW_IMPACTS
 
 CAPACITY_MPS2 = 8.0

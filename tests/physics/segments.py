@@ -12,8 +12,10 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.physics import Bools, Floats, ImpactRows, Ints, Worlds, advance, make_worlds
-from ethbrake_marl.physics.kernel import BOUND
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.left_out import ImpactRows
+from ethbrake_marl.physics.motion import BOUND
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds, make_worlds
 from tests.physics.exact_simulator import line_of, simulate
 from tests.reference.tolerances import DISCRIMINANT_EPS, END_EPS, EPS, GAP_M
 

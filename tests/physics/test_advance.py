@@ -10,9 +10,13 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import PhysicsError
-from ethbrake_marl.physics import Impacts, Worlds, advance, compiling, forecast, kernel
-from ethbrake_marl.physics.compiling import by_parts
-from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.physics import jit, motion, segment
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.forecast import forecast
+from ethbrake_marl.physics.jit import by_parts
+from ethbrake_marl.physics.left_out import Impacts
+from ethbrake_marl.physics.state import Worlds
+from ethbrake_marl.scenario.catalogue import load_scenario
 from tests.physics.random_worlds import Draws, driving_lines, line, place_ahead
 
 Events = list[tuple[float, int, float]]
@@ -294,15 +298,15 @@ def test_bounces__of_three_pressing_vehicles_end_in_contact() -> None:
 def test_bounces__more_than_any_segment_holds_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     # e = 1 and a push of 10 m/s2 against a heavy wall: a bounce of 0.2 m/s every 0.04 s for 50,000 s
     if numba.config.DISABLE_JIT:  # a million events would take long
-        monkeypatch.setattr(kernel, "BOUND", kernel.BOUND._replace(MOST_EVENTS=50))
+        monkeypatch.setattr(segment, "BOUND", motion.BOUND._replace(MOST_EVENTS=50))
     wall = line([0.0], [0.0, 0.2], mass_t=[2.0**60, 1.0], restitution=1.0)
-    most = kernel.BOUND.MOST_EVENTS
+    most = motion.BOUND.MOST_EVENTS
     with pytest.raises(PhysicsError, match=f"world 0: more than {most} events between 0 s and 50000 s"):
         advance(wall, [-10.0, 10.0], 50_000.0)
 
 
 def test_impacts__are_listed_on_demand_in_a_list_that_grows(monkeypatch: pytest.MonkeyPatch) -> None:
-    module, runs = importlib.import_module("ethbrake_marl.physics.batch"), []
+    module, runs = importlib.import_module("ethbrake_marl.physics.advance"), []
     monkeypatch.setattr(module, "by_parts", lambda *given: runs.append(given) or by_parts(*given))
     wall = line([0.0], [0.0, 8.0], mass_t=[2.0**50, 1.0], restitution=1.0)  # a bounce each second
     for until, needed in ((10.5, 1), (129.5, 2)):
@@ -327,7 +331,7 @@ def test_threads__give_the_same_bits_and_the_same_impacts_in_the_same_order(thre
 
 
 def test_threads__one_is_the_default_and_starts_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiling, "ThreadPoolExecutor", None)
+    monkeypatch.setattr(jit, "ThreadPoolExecutor", None)
     assert advance(line([9.0], [4.0, 4.0]), 0.0, 1.0)[0].time_s.tolist() == [1.0]
 
 

@@ -15,9 +15,7 @@ from numba.core.errors import NumbaError
 from scipy.special import ndtri
 
 import ethbrake_marl
-from ethbrake_marl.physics.compiling import (
-    by_parts,
-    compiled as compile_kernel,
+from ethbrake_marl.physics.elementary import (
     exp,
     exp_each,
     log,
@@ -25,6 +23,7 @@ from ethbrake_marl.physics.compiling import (
     normal_quantile,
     normal_quantile_each,
 )
+from ethbrake_marl.physics.jit import by_parts, compiled as compile_kernel
 
 # ---------------------------------------------------------------- compilation
 

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from ethbrake_marl.physics import Impacts, Worlds, advance
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.left_out import Impacts
+from ethbrake_marl.physics.state import Worlds
 from tests.physics.random_worlds import (
     HARMS,
     HORIZON_S,

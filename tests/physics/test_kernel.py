@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import drive, fixed_commands, script_agents
-from ethbrake_marl.physics.kernel import Decisions, contact, drift, force_range, settle, solo_motion, speed_event
-from ethbrake_marl.search import Profiles, profile_problem
+from ethbrake_marl.agents.driving import drive, script_agents
+from ethbrake_marl.agents.protocol import fixed_commands
+from ethbrake_marl.engine.profiles import Profiles, profile_problem
+from ethbrake_marl.physics.episode import Decisions
+from ethbrake_marl.physics.motion import contact, drift, force_range, settle, solo_motion, speed_event
 from tests.fixtures.asked import Acts
 
 NEVER = (math.inf, 0.0)

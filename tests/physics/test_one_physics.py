@@ -11,15 +11,19 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from ethbrake_marl.actions import action_to_command
-from ethbrake_marl.agents import make_agent
-from ethbrake_marl.agents.e_v2x_bm import StateFree
-from ethbrake_marl.engine import Engine
-from ethbrake_marl.harm import HarmCount, Ledger, empty_ledger
-from ethbrake_marl.physics import CLOCK, Floats, Ints, Worlds, advance, make_worlds
-from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.search import ProfileProblem, Profiles, profile_problem
-from ethbrake_marl.shield.step_shield import begin_running, plan_harm
+from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.agents.scripts import StateFree
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine.profiles import ProfileProblem, Profiles, profile_problem
+from ethbrake_marl.game.actions import action_to_command
+from ethbrake_marl.game.harm import HarmCount, Ledger, empty_ledger
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.episode import CLOCK
+from ethbrake_marl.physics.state import Floats, Ints, Worlds, make_worlds
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.certify import plan_harm
+from ethbrake_marl.shield.running import begin_running
 from tests.physics.random_worlds import Draws
 from tests.physics.test_build_up import Pieces, by_small_steps
 

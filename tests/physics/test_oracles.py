@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from ethbrake_marl.physics import Floats, Worlds, advance
-from ethbrake_marl.physics.kernel import contact
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.motion import contact
+from ethbrake_marl.physics.state import Floats, Worlds
 from tests.physics.exact_simulator import Hit, Line, line_of, regression, simulate, square_root
 from tests.physics.manufacture import Case, floats, manufactured, pressed, stored, worlds_of
 from tests.physics.random_worlds import HORIZON_S, driving_lines, line, place_ahead, touching_lines

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import PhysicsError
-from ethbrake_marl.harm import empty_ledger
-from ethbrake_marl.physics import advance, advance_sampled, forecast
+from ethbrake_marl.game.harm import empty_ledger
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.forecast import forecast
+from ethbrake_marl.physics.paper_map import advance_sampled
 from tests.physics.random_worlds import line
 from tests.refused import refused
 

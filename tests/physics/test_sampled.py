@@ -7,7 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.physics import Floats, Impacts, Worlds, advance, advance_sampled
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.left_out import Impacts
+from ethbrake_marl.physics.paper_map import advance_sampled
+from ethbrake_marl.physics.state import Floats, Worlds
 from tests.physics.random_worlds import line
 
 

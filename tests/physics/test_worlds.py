@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.physics import Worlds, make_worlds
-from ethbrake_marl.physics.batch import Packed, columns as places
+from ethbrake_marl.physics.columns import Packed, columns as places
+from ethbrake_marl.physics.state import Worlds, make_worlds
 from tests.physics.random_worlds import line
 
 

@@ -11,9 +11,12 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, UnknownName
-from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.learning.training import load_recipe
-from ethbrake_marl.policies import Actor, Policy, load_named_policy, load_policy, shipped_name
+from ethbrake_marl.evaluation.lineup import make_lineup
+from ethbrake_marl.policies.actor import Actor
+from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.policies.shipped import load_named_policy, shipped_name
+from ethbrake_marl.training.recipe import load_recipe
 from tests.refused import refused
 
 PAPER = eb.load_scenario("paper-random")

@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.limits.limits import BestHarmTable, best_harm, table_bytes
-from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.extensions.search.best_harm import best_harm
+from ethbrake_marl.extensions.search.tables import BestHarmTable, table_bytes
+from ethbrake_marl.scenario.catalogue import load_scenario
 from tests.programmes.cage import NASTY, Case, damaged, write
 
 SHAPE_TEXTS = (

@@ -43,7 +43,18 @@ KINDS = (*RESOLUTIONS, *(f"{resolution}-light" for resolution in RESOLUTIONS))
 EXTRAS = ("train", "dev")
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")  # that the light kinds of --ci look for
 # Each interface, the physics with its golden worlds, and what touches most of the packages.
-TESTS = ("contract", "envs", "physics", "golden", "scenario", "agents", "evaluation", "files", "figures", "cli")
+TESTS = (
+    "contract",
+    "envs",
+    "physics",
+    "golden",
+    "scenario",
+    "agents",
+    "evaluation",
+    "files",
+    "extensions/report",
+    "cli",
+)
 CALM = "ignore::DeprecationWarning"  # that something will go from another package is what other versions differ in
 
 

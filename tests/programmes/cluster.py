@@ -19,12 +19,12 @@ from pathlib import Path
 
 import yaml
 
+from tests.extensions.studies.conftest import RECIPE
+from tests.extensions.studies.counting import PROGRAM, finished, holders
 from tests.programmes import Cases, Given, Told
-from tests.studies.conftest import RECIPE
-from tests.studies.counting import PROGRAM, finished, holders
 
 WORK = {
-    "counting": ([sys.executable, "-m", "tests.studies.counting"], []),
+    "counting": ([sys.executable, "-m", "tests.extensions.studies.counting"], []),
     "training": ([*PROGRAM, "study", "sweep"], ["--retries", "5", "--output"]),
 }
 NODES = 2  # with one core each

@@ -24,12 +24,18 @@ from typing import Any, NamedTuple
 import yaml
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.inputs import NamedWorld, NamedWorlds, states_of
-from ethbrake_marl.learning.runs import NUMBERS, train
-from ethbrake_marl.policies import content_sha256, load_policy, shipped_policies
-from ethbrake_marl.studies.sweep import SweepPlan
-from ethbrake_marl.studies.tuning import TuningPlan
-from tests.programmes.cage import NASTY, OUTSIDE, PRECIOUS, Case, damaged, write
+from ethbrake_marl.evaluation.varying import states_of
+from ethbrake_marl.extensions.studies.named_worlds import NamedWorld, NamedWorlds
+from ethbrake_marl.extensions.studies.sweep import SweepPlan
+from ethbrake_marl.extensions.studies.tuning import TuningPlan
+from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.policies.manifest import content_sha256
+from ethbrake_marl.policies.shipped import shipped_policies
+from ethbrake_marl.scenario.tables import read_worlds
+from ethbrake_marl.training.checkpoint import NUMBERS
+from ethbrake_marl.training.session import train
+from tests.learning.tiny import LINKS, link_out, newest
+from tests.programmes.cage import NASTY, Case, damaged, write
 
 # ---------------------------------------------------------------- text
 
@@ -363,7 +369,9 @@ def texts() -> dict[str, Text]:
         "sweep": Text(SWEEP, sweep, SweepPlan.read),
         "tuning": Text(TUNING, tune, TuningPlan.read),
         "worlds": Text(worlds_text(), again, lambda path: NamedWorlds.read(path).worlds_of(paper, "x")),
-        "CSV": Text(STATES, states, paper.read_worlds, 10, CSV, {"damaged": UNCERTAIN["damaged"]}, "mine.csv"),
+        "CSV": Text(
+            STATES, states, partial(read_worlds, paper), 10, CSV, {"damaged": UNCERTAIN["damaged"]}, "mine.csv"
+        ),
     }
 
 
@@ -628,11 +636,6 @@ def stopped(algorithm: str) -> Path:
     return folder
 
 
-def newest(run: Path) -> Path:
-    """The newest checkpoint."""
-    return max(run.glob("checkpoints/step_*"))
-
-
 def _text_of_table(rng: random.Random, path: Path) -> None:
     path.write_bytes(
         rng.choice(
@@ -651,13 +654,8 @@ def _text_of_table(rng: random.Random, path: Path) -> None:
     )
 
 
-def _link(name: str, target: str, rng: random.Random, run: Path) -> None:
-    """A link out of the run in the place of something in it."""
-    path = run / name
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    path.unlink(missing_ok=True)
-    path.symlink_to(run.parents[1] / OUTSIDE / target)
+def _link(name: str, rng: random.Random, run: Path) -> None:
+    link_out(name, run)
 
 
 def _pipe(rng: random.Random, run: Path) -> None:
@@ -713,14 +711,7 @@ CHANGES: dict[str, tuple[tuple[str, ...], int, bool, Spoil]] = {
     "something more": (("ppo",), 24, False, _more),
     "files exchanged": (("ppo", "sac"), 25, False, _swapped),
     "a pipe for a file": (("ppo", "sac"), 25, False, _pipe),
-    "checkpoints: link outside": (("ppo",), 1, True, partial(_link, "checkpoints", "")),
-    "tensorboard: link outside": (("ppo",), 1, True, partial(_link, "tensorboard", "")),
-    "run.lock: link outside": (("ppo",), 1, True, partial(_link, "run.lock", PRECIOUS)),
-    "progress.csv: link outside": (("ppo",), 1, False, partial(_link, "progress.csv", PRECIOUS)),
-    "config.json: link outside": (("ppo",), 1, True, partial(_link, "config.json", PRECIOUS)),
-    "team.json: link outside": (("ppo",), 1, False, partial(_link, "team.json", PRECIOUS)),
-    "policy: link outside": (("ppo",), 1, False, partial(_link, "policy", "")),
-    "events: link outside": (("ppo",), 1, False, partial(_link, "tensorboard/events.out.tfevents.1.x", PRECIOUS)),
+    **{f"{name}: link outside": (("ppo",), 1, certain, partial(_link, name)) for name, (_, certain) in LINKS.items()},
     "progress.csv damaged": (("ppo",), 10, False, lambda r, f: _text_of_table(r, f / "progress.csv")),
     "checkpoint: numbers edited": (("ppo", "sac"), 40, False, lambda r, f: edited(r, newest(f) / NUMBERS)),
     "checkpoint: numbers are no JSON": (("ppo",), 17, False, lambda r, f: no_json(r, newest(f) / NUMBERS)),

@@ -28,8 +28,8 @@ import typer.main
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import EthBrakeError
-from ethbrake_marl.limits.limits import BestHarmTable
-from ethbrake_marl.policies import load_policy
+from ethbrake_marl.extensions.search.tables import BestHarmTable
+from ethbrake_marl.policies.bundle import load_policy
 from tests.programmes import Cases, Given, Told
 from tests.programmes.archives import COMMAND, good_bytes, table_cases
 from tests.programmes.cage import (

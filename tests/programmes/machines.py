@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl import make_sb3_vec_env
-from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
+from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.evaluation.chunks import Lineup, tally_list
-from ethbrake_marl.evaluation.statistics import mean_over_seeds
-from ethbrake_marl.harm import injury_probability
-from ethbrake_marl.limits.limits import best_harm
-from ethbrake_marl.limits.lower_bound import lower_bound
-from ethbrake_marl.policies import load_shipped, shipped_policies
-from ethbrake_marl.scenario import list_scenarios, load_scenario
+from ethbrake_marl.evaluation.seeds import mean_over_seeds
+from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
+from ethbrake_marl.extensions.search.best_harm import best_harm
+from ethbrake_marl.game.harm import injury_probability
+from ethbrake_marl.policies.shipped import load_shipped, shipped_policies
+from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 from tests.golden.test_golden import SHIELDS, decisions_hash, figures, sampled
 from tests.programmes import Cases, Given, Told, watched
 

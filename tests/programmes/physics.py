@@ -15,11 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.errors import PhysicsError
-from ethbrake_marl.harm import split
-from ethbrake_marl.physics import Floats, Impacts, Ints, Worlds, advance, make_worlds
+from ethbrake_marl.game.harm import split
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.left_out import Impacts
+from ethbrake_marl.physics.state import Floats, Ints, Worlds, make_worlds
+from tests.extensions.proofs.test_lower_bound import bounded_and_found
+from tests.fixtures.lines import REGIONS
 from tests.golden.test_golden import GOLDEN, figures
-from tests.limits.test_lower_bound import bounded_and_found
-from tests.limits.worlds import REGIONS
 from tests.physics.exact_simulator import line_of, simulate
 from tests.physics.manufacture import Case, manufactured, pressed, stored
 from tests.physics.random_worlds import (

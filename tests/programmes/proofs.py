@@ -25,8 +25,8 @@ from unittest import mock
 import numpy as np
 import z3
 
-from ethbrake_marl.physics import kernel
-from ethbrake_marl.shield import step_shield
+from ethbrake_marl.physics import impact, motion, rows
+from ethbrake_marl.shield import certify, members
 from tests.programmes import Cases, Given, Told
 
 # ---------------------------------------------------------------- symbolic execution
@@ -209,8 +209,8 @@ def prove(end: Ended, statement: Any, what: str, *assumed: Any) -> None:
 def contact() -> int:
     """``events.contact`` against ``events.drift``, the gap as a function of time."""
     gap, closing, pressing, when = symbols("gap closing pressing when")
-    found = list(_run(kernel, lambda: kernel.contact(gap, closing, pressing), [exact(gap) >= 0]))
-    after = exact(kernel.drift(gap, closing, pressing, when))
+    found = list(_run(motion, lambda: motion.contact(gap, closing, pressing), [exact(gap) >= 0]))
+    after = exact(motion.drift(gap, closing, pressing, when))
     for end in found:
         time, speed = end.result
         if isinstance(time, float):
@@ -218,7 +218,7 @@ def contact() -> int:
             prove(end, after >= 0, "never closes", exact(when) >= 0)
             continue
         prove(end, exact(time) >= 0, "not in the past")
-        prove(end, exact(kernel.drift(gap, closing, pressing, time)) == 0, "the gap is closed then")
+        prove(end, exact(motion.drift(gap, closing, pressing, time)) == 0, "the gap is closed then")
         prove(end, after > 0, "it is open before", exact(when) > 0, exact(when) < exact(time))
         prove(end, exact(speed) == exact(closing + pressing * time), "the speed is the one then")
         prove(end, exact(speed) >= 0, "and it approaches")
@@ -230,7 +230,7 @@ def stopping() -> int:
     """``events.solo_motion`` against ``events.stopping_distance``."""
     speed, capacity, latency, limit, time = symbols("speed capacity latency limit time")
     known = [exact(speed) >= 0, exact(capacity) > 0, exact(latency) >= 0, exact(time) >= 0, exact(limit) >= 0]
-    found = list(_run(kernel, lambda: kernel.solo_motion(speed, -capacity, latency, limit, time), known))
+    found = list(_run(motion, lambda: motion.solo_motion(speed, -capacity, latency, limit, time), known))
     whole = exact(speed * latency + speed * speed / (2.0 * capacity))
     for end in found:
         after, way, _ = end.result
@@ -252,13 +252,13 @@ def _cluster(vehicles: int, closing: float) -> tuple[list[Symbol], list[Symbol],
     known = [exact(m) > 0 for m in mass] + [exact(restitution) >= 0, exact(restitution) <= 1]
 
     def resolve() -> list[Symbol]:
-        table = np.zeros((kernel.ROW.OF_IMPACT, vehicles), dtype=object)
-        table[kernel.ROW.MASS], table[kernel.ROW.SPEED] = mass, speed
-        table[kernel.ROW.CLOSING, : vehicles - 1] = closing
-        kernel.resolve_cluster(table, restitution, 0, vehicles - 1)
-        return list(table[kernel.ROW.SPEED])
+        table = np.zeros((rows.ROW.OF_IMPACT, vehicles), dtype=object)
+        table[rows.ROW.MASS], table[rows.ROW.SPEED] = mass, speed
+        table[rows.ROW.CLOSING, : vehicles - 1] = closing
+        impact.resolve_cluster(table, restitution, 0, vehicles - 1)
+        return list(table[rows.ROW.SPEED])
 
-    return mass, speed, restitution, list(_run(kernel, resolve, known))
+    return mass, speed, restitution, list(_run(impact, resolve, known))
 
 
 def _sum(*columns: list[Symbol]) -> Any:
@@ -316,7 +316,7 @@ def plastic() -> int:
 def settling() -> int:
     """``events.settle`` on any range of forces."""
     low, high, other = symbols("low high other")
-    found = list(_run(kernel, lambda: kernel.settle(low, high), [exact(low) <= exact(high)]))
+    found = list(_run(motion, lambda: motion.settle(low, high), [exact(low) <= exact(high)]))
     for end in found:
         value = exact(end.result)
         prove(end, z3.And(value >= exact(low), value <= exact(high)), "within the range")
@@ -432,13 +432,13 @@ def _decided(line: _Line, usable: tuple[bool, ...]) -> int:
         plan, room = line.plan.copy(), np.zeros((2, *line.plan.shape), object)
         after, out, tried = np.zeros(1, object), np.zeros((vehicles, 4), object), np.zeros((2, vehicles), object)
         proposed = np.array([p if use else math.nan for p, use in zip(line.proposed, usable, strict=True)], object)
-        good = step_shield.decide_world(
+        good = certify.decide_world(
             None, None, np.zeros(1, bool), made, proposed, line.budget, line.certified, line.constants, plan, room,
             tried, after, np.zeros(1, bool), out,
         )  # fmt: skip
         return good, plan, out
 
-    found = list(_run(step_shield, decide, line.known(), line))
+    found = list(_run(members, decide, line.known(), line))
     for end in found:
         good, plan, out = end.result
         assert good
@@ -478,78 +478,78 @@ class Bug(NamedTuple):
 
 BUGS = {
     "the earlier root of a contact": Bug(
-        kernel, "contact", "return (speed - closing) / pressing, speed", "return -closing / pressing, speed",
+        motion, "contact", "return (speed - closing) / pressing, speed", "return -closing / pressing, speed",
         contact,
     ),
     "a contact missed where the gap opens first": Bug(
-        kernel, "contact", "if pressing > 0.0:", "if pressing > 0.0 and gap < 1.0:", contact
+        motion, "contact", "if pressing > 0.0:", "if pressing > 0.0 and gap < 1.0:", contact
     ),
     "the way while nothing is in force is forgotten": Bug(
-        kernel, "solo_motion", "way = speed * onset", "way = 0.0", stopping
+        motion, "solo_motion", "way = speed * onset", "way = 0.0", stopping
     ),
     "restitution of what moves, not of what is left over": Bug(
-        kernel, "resolve_cluster", "pooled + bounce * (pooled - table[ROW.SPEED, i])",
+        impact, "resolve_cluster", "pooled + bounce * (pooled - table[ROW.SPEED, i])",
         "pooled + bounce * (pooled + table[ROW.SPEED, i])", two,
     ),
     "blocks pooled without their masses": Bug(
-        kernel, "pool", "table[ROW.BLOCK_LOW, count] / mass", "table[ROW.BLOCK_LOW, count] / 2.0", energy
+        impact, "pool", "table[ROW.BLOCK_LOW, count] / mass", "table[ROW.BLOCK_LOW, count] / 2.0", energy
     ),
     "a plastic impact is not put in order": Bug(
-        kernel, "resolve_cluster", "bounce = restitution if largest >= BOUND.PLASTIC_SPEED_MPS else 0.0",
+        impact, "resolve_cluster", "bounce = restitution if largest >= BOUND.PLASTIC_SPEED_MPS else 0.0",
         "bounce = restitution", plastic,
     ),
     "the budget may rise": Bug(
-        step_shield, "decide_world", "    if value <= budget:\n        for c in",
+        certify, "decide_world", "    if value <= budget:\n        for c in",
         "    if value <= 2.0 * budget:\n        for c in", decision,
     ),
     "later proposals are not certified": Bug(
-        step_shield, "decide_world", "    if value <= budget:\n        for c in",
+        certify, "decide_world", "    if value <= budget:\n        for c in",
         "    if value <= budget or step > 0:\n        for c in", decision,
     ),
     "the fallback is the plan's first action": Bug(
-        step_shield, "decide_world", "take_steps(world, states, ended, step, plan[step], after, over)",
+        certify, "decide_world", "take_steps(world, states, ended, step, plan[step], after, over)",
         "take_steps(world, states, ended, step, plan[0], after, over)", decision,
     ),
     "the plan is followed from the second decision on": Bug(
-        step_shield, "try_action", "value = worst_of_plan(world, after, over, step + 1,",
+        certify, "try_action", "value = worst_of_plan(world, after, over, step + 1,",
         "value = worst_of_plan(world, after, over, 1,", decision,
     ),
     "a constant begins one decision late": Bug(
-        step_shield, "better_plan", "for j in range(step, plan.shape[0]):",
+        certify, "better_plan", "for j in range(step, plan.shape[0]):",
         "for j in range(step + 1, plan.shape[0]):",
         decision,
     ),
     "a vehicle that never moves": Bug(
-        kernel, "solo_motion", "    way = 0.0\n    steady",
+        motion, "solo_motion", "    way = 0.0\n    steady",
         "    return speed, 0.0, math.nan\n    way = 0.0\n    steady",
         stopping,
     ),
     "half the time": Bug(
-        kernel, "solo_motion", "    way = 0.0\n    steady", "    duration = duration / 2.0\n    way = 0.0\n    steady",
+        motion, "solo_motion", "    way = 0.0\n    steady", "    duration = duration / 2.0\n    way = 0.0\n    steady",
         stopping,
     ),
     "the plan that was certified with a proposal is not kept": Bug(
-        step_shield, "try_action", "                copy_action(room[0, j], plan[j])", "                pass",
+        certify, "try_action", "                copy_action(room[0, j], plan[j])", "                pass",
         decision,
     ),
     "a constant counts without being certified": Bug(
-        step_shield, "better_plan", "certified = worst_of_plan(world, states, ended, step, trial, most)",
+        certify, "better_plan", "certified = worst_of_plan(world, states, ended, step, trial, most)",
         "certified = least", decision,
     ),
     "the bound of the plan is told for the proposal": Bug(
-        step_shield, "decide_world", "tell_action(out, plan[step], value, budget - value)",
+        certify, "decide_world", "tell_action(out, plan[step], value, budget - value)",
         "tell_action(out, plan[step], certified, budget - value)", decision,
     ),
     "of two, what was tried last is looked at, not what is applied": Bug(
-        step_shield, "decide_world", "take_steps(world, states, ended, step, plan[step], after, over)",
+        certify, "decide_world", "take_steps(world, states, ended, step, plan[step], after, over)",
         "take_steps(world, states, ended, step, tried[1], after, over)", decision_of_two,
     ),
     "the first of two that is accepted keeps the bound from before": Bug(
-        step_shield, "decide_world", "bound, accepted = value, accepted + 1", "accepted = accepted + 1",
+        certify, "decide_world", "bound, accepted = value, accepted + 1", "accepted = accepted + 1",
         decision_of_two,
     ),
     "a plan for two is written for the first alone": Bug(
-        step_shield, "copy_action", "for c in range(to.shape[0]):", "for c in range(1):", decision_of_two
+        certify, "copy_action", "for c in range(to.shape[0]):", "for c in range(1):", decision_of_two
     ),
 }  # fmt: skip
 

@@ -10,7 +10,8 @@ from multiprocessing.context import ForkProcess
 from pathlib import Path
 
 import ethbrake_marl as eb
-from ethbrake_marl.learning.runs import newest_usable, resume, train
+from ethbrake_marl.training.checkpoint import newest_usable
+from ethbrake_marl.training.session import resume, train
 from tests.programmes import Cases, Given, Told
 
 SOON_S = 300.0

@@ -18,27 +18,25 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.search import profile_problem
-from ethbrake_marl.shield.step_shield import StepShield, begin_running, plan_harm
-from ethbrake_marl.shield.uncertainty import parse_uncertainty
+from ethbrake_marl.engine.profiles import profile_problem
+from ethbrake_marl.extensions.certified.robust_step import RobustShield
+from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.shield.certify import plan_harm
+from ethbrake_marl.shield.running import begin_running
+from tests.extensions.certified.estimates import ABOVE, INSIDE, LISTS, WAYS, shielded
 from tests.programmes import Cases, Given, Told
 from tests.shield.attacks import (
-    ABOVE,
     ADVERSARIES,
-    INSIDE,
     LEAKS,
-    LISTS,
     TEAM_ADVERSARIES,
     TEAMS,
     TOLERANCE,
-    WAYS,
     Attack,
     above_later,
     attack,
     line,
     search,
-    shielded,
 )
 from tests.shield.plays import INSIDE as WRAPPED, PLAYS, WRAPPERS, Tally, disturbed, played, wrapped
 
@@ -116,7 +114,7 @@ def attacks(given: Given) -> Cases:
         one.append((f"bound: N = {N}, {count}, {name}", share, line(N), case))
         rates.append((f"build-up: N = {N}, {count}, {name}", share, line(N).replace(**RATES), case))
         if name != "worst_case":  # which looks for one world
-            unsure = {**case, "uncertainty": UNSURE}
+            unsure = {**case, "uncertain": (RobustShield, parse_uncertainty(UNSURE))}
             rates.append(
                 (f"build-up: {UNSURE}, N = {N}, {count}, {name}", 0.25 * share, line(N).replace(**RATES), unsure)
             )
@@ -223,21 +221,21 @@ def inside(robust: str, given: Given, scenario: Any = "paper-random", intervals:
     scenario, uncertainty = load_scenario(scenario), parse_uncertainty(intervals or given.intervals)
     boxes = given.boxes
     told, rng = scenario.sample(boxes, given.seed).worlds, np.random.default_rng(given.seed)
-    shield = StepShield(scenario, 1, uncertainty=uncertainty, robust=robust)
+    shield = RobustShield(scenario, 1, uncertainty=uncertainty, robust=robust)
     shield.begin(told, np.arange(boxes))
     decisions, begun = 0, time.process_time()
-    while not shield.running.finished.all():
-        decisions += int((~shield.running.finished).sum())
+    while not shield.memory.running.finished.all():
+        decisions += int((~shield.memory.running.finished).sum())
         shield.decide(np.zeros(boxes))
     took, above, excess, harm = time.process_time() - begun, 0, -np.inf, 0.0
     draws = [min(BATCH, given.draws - first) for first in range(0, given.draws, BATCH)]
     for k, n in product(range(boxes), draws):
         truth = uncertainty.draw(told.take(np.full(n, k)), rng)
-        plan = np.repeat(shield.backup.plan[k : k + 1], n, axis=0)
+        plan = np.repeat(shield.memory.backup.plan[k : k + 1], n, axis=0)
         realised = plan_harm(begin_running(profile_problem(truth, [1], horizon_s=scenario.horizon_s)), plan)
-        over = realised - shield.first_bound[k]
+        over = realised - shield.memory.first_bound[k]
         above, excess, harm = above + int((over > TOLERANCE).sum()), max(excess, over.max()), harm + realised.sum()
-    bound = float(shield.first_bound.mean())
+    bound = float(shield.memory.first_bound.mean())
     return Told(
         None if robust == "corners" else above == 0 and bool(np.isfinite(bound)),
         f"{boxes * given.draws:,} worlds of {boxes} boxes, above: {above:,}, most by {excess:.2g}; bound {bound:.2f},"

@@ -181,7 +181,7 @@ def test_page__says_how_much_the_attack_holds():
 def test_bugs__each_patch_stands_in_the_code_exactly_once() -> None:
     bugs, misfits = faults.planted()
     assert misfits == []
-    assert {bug.folder for bug in bugs} >= {"physics", "shield", "limits", "learning", "evaluation", "ethbrake_marl"}
+    assert {bug.folder for bug in bugs} >= {"physics", "engine", "shield", "extensions", "training", "ethbrake_marl"}
 
 
 def test_mutants__are_code_of_as_many_lines_and_the_same_for_the_same_seed() -> None:
@@ -220,31 +220,31 @@ def test_version__that_is_not_the_pinned_one_is_a_fault_but_not_its_local_part()
 
 
 def test_tests_of_a_function__are_those_that_call_it() -> None:
-    summing = ["physics/worlds.py:sum_rows"]
+    summing = ["physics/state.py:sum_rows"]
     tests = Callers(
         {
-            "tests/test_a.py::test_one": (0.1, ["physics/batch.py:advance"]),
+            "tests/test_a.py::test_one": (0.1, ["physics/advance.py:advance"]),
             "tests/test_b.py::test_two": (0.2, summing),
             "tests/physics/test_c.py::test_three": (9.0, summing),
             "tests/test_d.py::test_shoving": (9.0, summing),
         }
     )
-    kernel = next(f for f in functions_of(PACKAGE / "physics/batch.py") if f.key.endswith(":advance_worlds"))
+    kernel = next(f for f in functions_of(PACKAGE / "physics/advance.py") if f.key.endswith(":advance_worlds"))
     assert kernel.compiled
     assert tests.of(kernel) == {"tests/test_a.py::test_one"}
-    file = PACKAGE / "physics/worlds.py"
+    file = PACKAGE / "physics/state.py"
     first = file.read_text("utf-8").splitlines().index("def sum_rows(values: Floats) -> Floats:") + 1
     summed = tests.at(file, first + 2)
-    assert summed.key == "physics/worlds.py:sum_rows"
+    assert summed.key == "physics/state.py:sum_rows"
 
 
 def test_tests__near_the_module_come_first_then_the_quick_ones() -> None:
-    file = PACKAGE / "physics/worlds.py"
+    file = PACKAGE / "physics/state.py"
     first = file.read_text("utf-8").splitlines().index("def sum_rows(values: Floats) -> Floats:") + 1
-    summing = ["physics/worlds.py:sum_rows"]
+    summing = ["physics/state.py:sum_rows"]
     tests = Callers(
         {
-            "tests/test_a.py::test_one": (0.1, ["physics/batch.py:advance"]),
+            "tests/test_a.py::test_one": (0.1, ["physics/advance.py:advance"]),
             "tests/test_b.py::test_two": (0.2, summing),
             "tests/physics/test_c.py::test_three": (9.0, summing),
             "tests/test_d.py::test_shoving": (9.0, summing),

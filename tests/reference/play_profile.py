@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from ethbrake_marl.harm import Ledger, empty_ledger
-from ethbrake_marl.physics import Floats, Worlds, advance
+from ethbrake_marl.game.harm import Ledger, empty_ledger
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.state import Floats, Worlds
 
 
 def play_profile(worlds: Worlds, vehicle: int, switch_s: Floats, command_mps2: Floats) -> tuple[Worlds, Ledger]:

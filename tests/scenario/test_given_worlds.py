@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.learning import Training
 from ethbrake_marl.scenario.sampling import uniform_numbers
+from ethbrake_marl.scenario.tables import read_worlds, table_columns, worlds_from_state, worlds_from_table
+from ethbrake_marl.training.training import Training
 from tests.scenario.test_sampling import ALL_RANDOM, DELAYS, PAPER, bits, build, closing_pair, quantity, typed
 
 LINE = {"time_gaps_s": {"uniform": [0.2, 2]}, "line_speed_mps": {"uniform": [10, 38]}}
@@ -135,7 +136,7 @@ HEADER = "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps"
 )
 def test_table_in_csv__gives_the_state_and_the_scenario_the_rest(scenario, empty_folder: Path) -> None:
     Path("worlds.csv").write_text(f"{HEADER}\n10,8,20,18,20\n5,9,22,1.8e1, 20\n", "utf-8")
-    worlds = scenario.read_worlds("worlds.csv")
+    worlds = read_worlds(scenario, "worlds.csv")
     assert worlds.gaps_m.tolist() == [[10.0, 8.0], [5.0, 9.0]]
     assert worlds.speeds_mps.tolist() == [[20.0, 18.0, 20.0], [22.0, 18.0, 20.0]]
     assert worlds.vehicles.latency_s.tolist() == [[0.0, 0.5, 0.8]] * 2
@@ -146,7 +147,7 @@ def test_table_in_csv__gives_the_state_and_the_scenario_the_rest(scenario, empty
 def test_table_in_csv__may_hold_any_quantity_in_any_order_after_a_byte_order_mark(empty_folder: Path) -> None:
     columns = f"\ufefflatency_2_s,restitution,mass_3_t,speed_limit_1_mps,{HEADER}"
     Path("worlds.csv").write_text(f"{columns}\n0.2,0.3,6,30,10,8,20,18,20\n", "utf-8")
-    vehicles = PAPER.replace(mass_t=[4.5, 5.5, {"uniform": [5, 6]}]).read_worlds("worlds.csv").vehicles
+    vehicles = read_worlds(PAPER.replace(mass_t=[4.5, 5.5, {"uniform": [5, 6]}]), "worlds.csv").vehicles
     assert vehicles.latency_s.tolist() == [[0.0, 0.2, 0.8]]
     assert vehicles.restitution.tolist() == [0.3]
     assert vehicles.mass_t.tolist() == [[4.5, 5.5, 6.0]]
@@ -156,21 +157,21 @@ def test_table_in_csv__may_hold_any_quantity_in_any_order_after_a_byte_order_mar
 @pytest.mark.parametrize("end", ["", "\n", "\n\n", "\r\n\r\n"])
 def test_table_in_csv__may_end_in_blank_lines(end: str, empty_folder: Path) -> None:
     Path("worlds.csv").write_text(f"{HEADER}\n10,8,20,18,20{end}", "utf-8")
-    assert PAPER.read_worlds("worlds.csv").n == 1
+    assert read_worlds(PAPER, "worlds.csv").n == 1
 
 
 def test_table_of_columns__is_the_same_worlds_as_sampled_ones() -> None:
     sampled = PAPER.sample(50, 3).worlds
     columns = {f"gap_{i + 1}_m": sampled.gaps_m[:, i] for i in range(2)}
     columns |= {f"speed_{i + 1}_mps": sampled.speeds_mps[:, i] for i in range(3)}
-    assert bits(PAPER.worlds_from_table(columns)) == bits(sampled)
-    assert [*closing_pair(7).table_columns][:4] == ["gap_1_m", "speed_1_mps", "speed_2_mps", "braking_capacity_1_mps2"]
-    assert len(closing_pair(7).table_columns) == 1 + 6 * 2 + 1
+    assert bits(worlds_from_table(PAPER, columns)) == bits(sampled)
+    assert [*table_columns(closing_pair(7))][:4] == ["gap_1_m", "speed_1_mps", "speed_2_mps", "braking_capacity_1_mps2"]
+    assert len(table_columns(closing_pair(7))) == 1 + 6 * 2 + 1
     table = {f"gap_{p}_m": [7, 7] for p in (1, 2)} | {f"speed_{i}_mps": [10, 20] for i in (1, 2, 3)}
-    assert ahead(obstacle_margin_m=1.5).worlds_from_table(table).obstacle_gap_m.tolist() == [16.5, 51.5]
+    assert worlds_from_table(ahead(obstacle_margin_m=1.5), table).obstacle_gap_m.tolist() == [16.5, 51.5]
     # the first: 5 + 10 + 1.5
-    assert ahead(obstacle_margin_m=1.5).worlds_from_table(
-        {**table, "obstacle_gap_m": [30, 31]}
+    assert worlds_from_table(
+        ahead(obstacle_margin_m=1.5), {**table, "obstacle_gap_m": [30, 31]}
     ).obstacle_gap_m.tolist() == [30.0, 31.0]
 
 
@@ -204,7 +205,7 @@ def test_table_of_columns__is_the_same_worlds_as_sampled_ones() -> None:
     ],
 )
 def test_state_that_is_given__is_filled_in_with_what_is_fixed(scenario, state, expected) -> None:
-    worlds = scenario.worlds_from_state(state)
+    worlds = worlds_from_state(scenario, state)
     assert {name: quantity(worlds, name)[0].tolist() for name in expected} == expected
 
 

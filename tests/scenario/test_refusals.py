@@ -8,8 +8,11 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.errors import UnknownName
-from ethbrake_marl.scenario import Scenario, load_scenario, new_scenario_text, parse_yaml
-from ethbrake_marl.scenario.sampling import ScriptSpec
+from ethbrake_marl.files.yaml import parse_yaml
+from ethbrake_marl.scenario.catalogue import load_scenario, new_scenario_text
+from ethbrake_marl.scenario.roles import ScriptSpec
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.tables import worlds_from_state
 from tests.refused import refused
 
 PAPER, DELAYS = load_scenario("paper-random"), load_scenario("mixture-delays")
@@ -311,8 +314,8 @@ CALLS: dict[str, Callable[[], object]] = {
         name="x", mixture=[{"scenario": "paper-random"}]
     ),
     "scenario 'mixture-delays': is a mixture; its members say what mass_t is": lambda: DELAYS.quantities("mass_t"),
-    "initial_state: scenario 'mixture-delays' is a mixture, and nothing says which": lambda: DELAYS.worlds_from_state(
-        {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
+    "initial_state: scenario 'mixture-delays' is a mixture, and nothing says which": lambda: worlds_from_state(
+        DELAYS, {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
     ),
     "scenario 'paper-random': mass_t[0] (vehicle_1) = -1: must be finite": lambda: PAPER.replace(mass_t=[-1, 2, 3]),
     "scenario 'paper-random': objective = frontfirst: unknown objective": lambda: PAPER.replace(objective="frontfirst"),

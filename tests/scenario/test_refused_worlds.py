@@ -6,7 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.tables import read_worlds, worlds_from_state, worlds_from_table
 from tests.refused import refused
 
 PAPER = load_scenario("paper-random")
@@ -21,7 +23,7 @@ CLOSE = PAPER.replace(gaps_m=3, speeds_mps=20, latency_s=[0, 1, 1])
 def read(text: str, scenario: Scenario = PAPER) -> object:
     """The worlds of a file of this text."""
     Path("worlds.csv").write_text(text, encoding="utf-8")
-    return scenario.read_worlds("worlds.csv")
+    return read_worlds(scenario, "worlds.csv")
 
 
 FILES: dict[str, Callable[[], object]] = {
@@ -58,8 +60,8 @@ FILES: dict[str, Callable[[], object]] = {
     ),
     "worlds.csv: has a header but no rows; one row is one world": lambda: read(HEADER + "\n"),
     "worlds.csv, line 1: must name the columns": lambda: read(""),
-    "none.csv: no such file": lambda: PAPER.read_worlds("none.csv"),
-    "/dev/zero: is not a plain file but a device, a pipe or a socket": lambda: PAPER.read_worlds("/dev/zero"),
+    "none.csv: no such file": lambda: read_worlds(PAPER, "none.csv"),
+    "/dev/zero: is not a plain file but a device, a pipe or a socket": lambda: read_worlds(PAPER, "/dev/zero"),
     "worlds.csv: column mass_2_t is missing, and random in scenario 'paper-random'": lambda: read(
         HEADER + "\n10,8,20,18,20\n", PAPER.replace(mass_t=[4.5, {"uniform": [5, 6]}, 5.9])
     ),
@@ -75,52 +77,52 @@ def test_table__is_refused_with_its_line_and_column(message: str) -> None:
 
 GIVEN: dict[str, Callable[[], object]] = {
     "initial states: columns must be lists of one and the same length, not gap_1_m [2], gap_2_m [3]": lambda: (
-        PAPER.worlds_from_table(COLUMNS | {"gap_1_m": [1, 2]})
+        worlds_from_table(PAPER, COLUMNS | {"gap_1_m": [1, 2]})
     ),
     "initial states: columns must be lists of one and the same length, not gap_1_m [], gap_2_m [3]": lambda: (
-        PAPER.worlds_from_table(COLUMNS | {"gap_1_m": 1})
+        worlds_from_table(PAPER, COLUMNS | {"gap_1_m": 1})
     ),
     "initial states: gap_1_m = ['1', '2', '3']: is not a number; must be a number or a list of numbers": lambda: (
-        PAPER.worlds_from_table(COLUMNS | {"gap_1_m": ["1", "2", "3"]})
+        worlds_from_table(PAPER, COLUMNS | {"gap_1_m": ["1", "2", "3"]})
     ),
     "initial states: gap_1_m = [True, True, True]: is a truth value; must be a number or a list": lambda: (
-        PAPER.worlds_from_table(COLUMNS | {"gap_1_m": [True, True, True]})
+        worlds_from_table(PAPER, COLUMNS | {"gap_1_m": [True, True, True]})
     ),
     "initial states: gap_1_m = [[1], [2, 3]]: has rows of different lengths; must be a number or a list": lambda: (
-        PAPER.worlds_from_table(COLUMNS | {"gap_1_m": [[1], [2, 3]]})
+        worlds_from_table(PAPER, COLUMNS | {"gap_1_m": [[1], [2, 3]]})
     ),
     "initial states, row 1, column speed_2_mps = nan: must be finite and in [0, 200] m/s (metres": lambda: (
-        PAPER.worlds_from_table(COLUMNS | {"speed_2_mps": [1, np.nan, 3]})
+        worlds_from_table(PAPER, COLUMNS | {"speed_2_mps": [1, np.nan, 3]})
     ),
-    "initial states: unknown column 'gaps_1_m'; did you mean gap_1_m (metres)?": lambda: PAPER.worlds_from_table(
-        COLUMNS | {"gaps_1_m": [1, 2, 3]}
+    "initial states: unknown column 'gaps_1_m'; did you mean gap_1_m (metres)?": lambda: worlds_from_table(
+        PAPER, COLUMNS | {"gaps_1_m": [1, 2, 3]}
     ),
-    "initial states: column obstacle_gap_m is missing, and random": lambda: OBSTACLE.worlds_from_table(COLUMNS),
-    "initial_state: speeds_mps[0] is missing, and random in scenario 'paper-random'": lambda: PAPER.worlds_from_state(
-        {"gaps_m": [7, 7]}
+    "initial states: column obstacle_gap_m is missing, and random": lambda: worlds_from_table(OBSTACLE, COLUMNS),
+    "initial_state: speeds_mps[0] is missing, and random in scenario 'paper-random'": lambda: worlds_from_state(
+        PAPER, {"gaps_m": [7, 7]}
     ),
-    "initial_state: unknown key 'gap_m'; did you mean gaps_m (metres)?": lambda: PAPER.worlds_from_state(
-        {"gap_m": [7, 7], "speeds_mps": 20}
+    "initial_state: unknown key 'gap_m'; did you mean gaps_m (metres)?": lambda: worlds_from_state(
+        PAPER, {"gap_m": [7, 7], "speeds_mps": 20}
     ),
-    "initial_state: restitution has shape [2]; must be one number": lambda: PAPER.worlds_from_state(
-        {"restitution": [0.1, 0.2]}
+    "initial_state: restitution has shape [2]; must be one number": lambda: worlds_from_state(
+        PAPER, {"restitution": [0.1, 0.2]}
     ),
-    "initial_state: gaps_m has shape [3]; 3 vehicles need 2 numbers, or one for all": lambda: PAPER.worlds_from_state(
-        {"gaps_m": [7, 7, 7], "speeds_mps": 20}
+    "initial_state: gaps_m has shape [3]; 3 vehicles need 2 numbers, or one for all": lambda: worlds_from_state(
+        PAPER, {"gaps_m": [7, 7, 7], "speeds_mps": 20}
     ),
-    "initial_state: gaps_m[1] = -7: must be finite and in [0, 10000] m (metres)": lambda: PAPER.worlds_from_state(
-        {"gaps_m": [7, -7], "speeds_mps": 20}
+    "initial_state: gaps_m[1] = -7: must be finite and in [0, 10000] m (metres)": lambda: worlds_from_state(
+        PAPER, {"gaps_m": [7, -7], "speeds_mps": 20}
     ),
-    "initial_state: gaps_m = True: is a truth value; must be a number or a list of numbers": lambda: (
-        PAPER.worlds_from_state({"gaps_m": True, "speeds_mps": 20})
+    "initial_state: gaps_m = True: is a truth value; must be a number or a list of numbers": lambda: worlds_from_state(
+        PAPER, {"gaps_m": True, "speeds_mps": 20}
     ),
-    "initial_state = [7, 7]: must be a mapping such as {'gaps_m': [7, 7]}": lambda: PAPER.worlds_from_state([7, 7]),
-    "initial_state: gaps_m[1] = 12000: must be finite and in [0, 10000] m (metres)": lambda: PAPER.replace(
-        time_gaps_s=[1, 60]
-    ).worlds_from_state({"speeds_mps": [20, 20, 200], "speed_limit_mps": 200}),
-    "initial_state: the scenario draws what each vehicle knows when (v2x: nominal)": lambda: PAPER.replace(
-        v2x="nominal", early_impacts="keep"
-    ).worlds_from_state({"gaps_m": 7, "speeds_mps": 20}),
+    "initial_state = [7, 7]: must be a mapping such as {'gaps_m': [7, 7]}": lambda: worlds_from_state(PAPER, [7, 7]),
+    "initial_state: gaps_m[1] = 12000: must be finite and in [0, 10000] m (metres)": lambda: worlds_from_state(
+        PAPER.replace(time_gaps_s=[1, 60]), {"speeds_mps": [20, 20, 200], "speed_limit_mps": 200}
+    ),
+    "initial_state: the scenario draws what each vehicle knows when (v2x: nominal)": lambda: worlds_from_state(
+        PAPER.replace(v2x="nominal", early_impacts="keep"), {"gaps_m": 7, "speeds_mps": 20}
+    ),
 }
 
 
@@ -156,8 +158,8 @@ def test_list__cannot_be_drawn(message: str) -> None:
 def test_table__that_is_no_text_or_too_large_is_refused(empty_folder: Path) -> None:
     Path("bytes.csv").write_bytes(b"\xff\xfe\x00")
     with refused("bytes.csv: cannot be read as CSV: 'utf-8' codec can't decode byte 0xff in position 0"):
-        PAPER.read_worlds("bytes.csv")
+        read_worlds(PAPER, "bytes.csv")
     with open("huge.csv", "wb") as stream:
         stream.truncate(2**26 + 1)  # sparse
     with refused("huge.csv: larger than 64 MiB, the limit for such a file"):
-        PAPER.read_worlds("huge.csv")
+        read_worlds(PAPER, "huge.csv")

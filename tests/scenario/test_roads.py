@@ -9,11 +9,14 @@ import pytest
 from scipy import stats
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import Team, drive, make_agent
-from ethbrake_marl.evaluation import states_of
-from ethbrake_marl.limits import prove
-from ethbrake_marl.scenario import QUANTITY, Task
-from ethbrake_marl.shield import parse_uncertainty
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.agents.protocol import Team
+from ethbrake_marl.evaluation.varying import states_of
+from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.ranges import ranges
+from ethbrake_marl.scenario.sampling import middle_world
+from ethbrake_marl.scenario.tables import worlds_from_state, worlds_from_table
 from tests.refused import refused
 
 PAPER = eb.load_scenario("paper-random")
@@ -74,7 +77,7 @@ def test_friction__is_one_number_for_the_whole_line_and_moves_nothing_else() -> 
         assert (getattr(worlds, name) == getattr(dry, name)).all()
     assert wet.bounds("braking_capacity_mps2") == ((9.81 * 0.2, 6.0), (9.81 * 0.2, 7.0), (9.81 * 0.2, 6.0))
     assert wet.bounds("braking_capacity_mps2", dry=True) == ((6.0, 6.0), (7.0, 7.0), (6.0, 6.0))
-    assert wet.ranges().names[-1] == "friction"
+    assert ranges(wet).names[-1] == "friction"
 
 
 def test_margin__is_added_to_the_way_on_that_road() -> None:
@@ -89,22 +92,11 @@ def test_table_of_initial_states__gives_the_same_worlds() -> None:
     states = states_of(worlds, wet)
     assert list(states[0])[-1] == "friction"
     assert "braking_capacity_2_mps2" in states[0]
-    again = wet.worlds_from_table({name: [state[name] for state in states] for name in states[0]})
+    again = worlds_from_table(wet, {name: [state[name] for state in states] for name in states[0]})
     assert (again.road == worlds.road).all()
     assert (again.vehicles.braking_capacity_mps2 == worlds.vehicles.braking_capacity_mps2).all()
     state = {"friction": 0.5, "gaps_m": 7, "speeds_mps": 20, "braking_capacity_mps2": 6}
-    assert wet.worlds_from_state(state).friction.tolist() == [0.5]
-
-
-def test_uncertainty_of_friction__moves_all_capacities_together() -> None:
-    # Its uncertainty moves all capacities together: of 0.6 +- 0.2, shares 0, 1/8, ..., 1 of the way up.
-    worlds = FIXED.replace(friction=0.6, braking_capacity_mps2=[4, 7, 9]).sample(1, 7).worlds
-    members = parse_uncertainty("friction=0.2,braking_capacity_mps2.vehicle_3=3").members(worlds)
-    shares, dry = [0, 0.125, 0.25, 0.375, 0.625, 0.75, 0.875, 1], ([4, 7, 6], [4, 7, 12])
-    expected = [[4, 5.886, 5.886]] + [np.minimum(d, 9.81 * (0.4 + 0.4 * share)) for d in dry for share in shares]
-    assert members.vehicles.braking_capacity_mps2.shape == (17, 3)
-    assert len(expected) == 17
-    assert np.abs(members.vehicles.braking_capacity_mps2 - np.array(expected)).max() <= 1e-12
+    assert worlds_from_state(wet, state).friction.tolist() == [0.5]
 
 
 def test_mixture__where_only_some_tell_it_tells_no_friction() -> None:
@@ -120,18 +112,6 @@ def test_mixture__where_only_some_tell_it_tells_no_friction() -> None:
     assert [state["braking_capacity_2_mps2"] for state in states_of(worlds, mixed)] == braking.tolist()
 
 
-def test_proof__reads_what_the_road_allows() -> None:
-    # The proof reads what the road allows; and 20 x 0.5 = 10 m are lost where all brake alike.
-    near = FIXED.replace(gaps_m=30, braking_capacity_mps2=[9, 7, 6], latency_s=[0, 0.5, 0.8])
-    assert [
-        prove(near.replace(friction=mu).sample(1, 7).worlds, Task(near, (1,))).avoidable.tolist() for mu in (0.3, 1.0)
-    ] == [[True], [True]]
-    assert final(FIXED.replace(gaps_m=[4, 40], latency_s=[0, 0.5, 0.5], friction=0.3)).pair_hit[0].tolist() == [
-        True,
-        False,
-    ]
-
-
 def test_table__has_one_row_for_each_world_of_which_none_is_torn() -> None:
     found = tabled(TABLE).sample(600, 7).worlds
     rows = np.stack([found.gaps_m[:, 0], found.speeds_mps[:, 1]], axis=1)
@@ -142,9 +122,9 @@ def test_table__has_one_row_for_each_world_of_which_none_is_torn() -> None:
     alone = tabled({**TABLE, "weights": [1, 1, 8]}).sample(600, 7).worlds
     assert (alone.speeds_mps[:, [0, 2]] == found.speeds_mps[:, [0, 2]]).all()
     assert abs(np.mean(alone.gaps_m[:, 0] == 7.0) - 0.8) < 0.05
-    assert tabled(TABLE).ranges().names[-1] == "row of the table"
+    assert ranges(tabled(TABLE)).names[-1] == "row of the table"
     assert tabled(TABLE).bounds("gaps_m") == ((5.0, 7.0), (9.0, 9.0))
-    assert tabled(TABLE).middle_world().gaps_m[0].tolist() == [6.0, 9.0]
+    assert middle_world(tabled(TABLE)).gaps_m[0].tolist() == [6.0, 9.0]
     one = eb.Scenario(**{**FIXED.declared(), "table": {"columns": ["gap_1_m", "mass_3_t"], "rows": [[12, 30]]}})
     assert one.sample(3, 7).worlds.gaps_m.tolist() == [[12.0, 40.0], [12.0, 40.0], [12.0, 40.0]]
     assert one.sample(3, 7).worlds.vehicles.mass_t[:, 2].tolist() == [30.0, 30.0, 30.0]
@@ -214,7 +194,7 @@ def test_spread__is_added_to_what_the_load_gives() -> None:
     assert 0.49 < more.max() <= 0.5
     assert abs(np.corrcoef(wide.mass_t.ravel(), more.ravel())[0, 1]) < 0.02
     assert spread.bounds("braking_capacity_mps2")[0] == (4.5, 7.5)
-    assert [f"{key} of vehicle_1" in spread.ranges().names for key in ("braking_capacity_mps2", "mass_t")] == [
+    assert [f"{key} of vehicle_1" in ranges(spread).names for key in ("braking_capacity_mps2", "mass_t")] == [
         True,
         False,
     ]
@@ -232,7 +212,7 @@ def test_alert_s__everybody_goes_on_until_then() -> None:
     assert 1 <= latency.min() < 1.2
     assert 4.8 < latency.max() <= 5
     assert drawn.bounds("latency_s") == ((1.0, 5.0), (1.0, 5.0), (1.0, 5.0))
-    assert drawn.ranges().names == ("alert_s",)
+    assert ranges(drawn).names == ("alert_s",)
 
 
 # ---------------------------------------------------------------- what is refused
@@ -251,18 +231,9 @@ ROADS: dict[str, Callable[[], object]] = {
     ),
     "scenario 'paper-random': friction = 0: must be finite and in (0, 2]": lambda: FIXED.replace(friction=0),
     "must be a number or a distribution; a key that is not used is left out": lambda: FIXED.replace(friction=None),
-    "uncertainty: friction is one number for the whole line; give it without a vehicle": lambda: parse_uncertainty(
-        "friction.vehicle_2=0.1"
+    "scenario 'paper-random': draws nothing: all its worlds are the same": lambda: ranges(
+        eb.Scenario(**{**FIXED.declared(), "table": {"columns": ["gap_1_m", "mass_3_t"], "rows": [[12, 30]]}})
     ),
-    "uncertainty: friction=0.1: friction is not known in every world; declare it in the scenario": lambda: (
-        parse_uncertainty("friction=0.1").members(FIXED.sample(1, 7).worlds)
-    ),
-    "uncertainty: friction=1: 0.6 in world 0 may be as low as -0.4; it must stay above 0": lambda: parse_uncertainty(
-        "friction=1"
-    ).members(FIXED.replace(friction=0.6).sample(1, 7).worlds),
-    "scenario 'paper-random': draws nothing: all its worlds are the same": lambda: eb.Scenario(
-        **{**FIXED.declared(), "table": {"columns": ["gap_1_m", "mass_3_t"], "rows": [[12, 30]]}}
-    ).ranges(),
     "only without messages one by one (v2x: paper): what was": lambda: FIXED.replace(alert_s=2, v2x="nominal"),
     "with latency_s a vehicle may act as late as 40 s; it must be below horizon_s": lambda: FIXED.replace(alert_s=40),
 }
@@ -353,4 +324,4 @@ def test_table_of_a_file__is_refused_with_the_row_of_the_file(empty_folder: Path
 def test_state_that_is_given__needs_a_channel_that_draws_nothing() -> None:
     kinds = {"equipped": {"weight": 7}, "without": {"weight": 3, "v2x": SILENT}}
     with refused("initial_state: the scenario draws what each vehicle knows when (v2x: nominal)"):
-        FIXED.replace(vehicle_types=kinds, v2x=LINKS).worlds_from_state({"gaps_m": [7, 7], "speeds_mps": [20, 20, 20]})
+        worlds_from_state(FIXED.replace(vehicle_types=kinds, v2x=LINKS), {"gaps_m": [7, 7], "speeds_mps": [20, 20, 20]})

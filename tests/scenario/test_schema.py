@@ -19,21 +19,18 @@ from pydantic import ValidationError
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.inputs import load_runnable, scenario_sha256
-from ethbrake_marl.files.yaml import flow_text, read_yaml
-from ethbrake_marl.harm import HARM_COUNTS, empty_ledger
-from ethbrake_marl.scenario import (
-    QUANTITY,
-    ScriptSpec,
-    Uniform,
-    new_scenario_text,
-    parse_yaml,
-    scenario_json_schema,
-    schema as shipped_files,
-    shipped_folder,
-)
-from ethbrake_marl.scenario.schema import changed_content
-from ethbrake_marl.scenario.v2x import PRESETS
+from ethbrake_marl.evaluation.identity import scenario_sha256
+from ethbrake_marl.evaluation.trial import load_runnable
+from ethbrake_marl.files.yaml import flow_text, parse_yaml, read_yaml
+from ethbrake_marl.game.harm import HARM_COUNTS, empty_ledger
+from ethbrake_marl.scenario import catalogue
+from ethbrake_marl.scenario.catalogue import new_scenario_text, shipped_folder
+from ethbrake_marl.scenario.channel import PRESETS
+from ethbrake_marl.scenario.distributions import Uniform
+from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.mixtures import changed_content
+from ethbrake_marl.scenario.roles import ScriptSpec
+from ethbrake_marl.scenario.schema import scenario_json_schema
 from tests.contract.interfaces import LEVELS
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -162,7 +159,7 @@ def test_level_4__has_the_lines_of_level_3_and_full_braking_never_meets_its_obst
 def test_folder__of_an_installed_package_is_inside_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    monkeypatch.setattr(shipped_files, "_PACKAGE", tmp_path / "ethbrake_marl")
+    monkeypatch.setattr(catalogue, "_PACKAGE", tmp_path / "ethbrake_marl")
     name, find = {"scenarios": ("scenarios", shipped_folder), "recipes": ("train", eb.TrainingRecipe.shipped)}[kind]
     with pytest.raises(InvalidInput, match=rf"the shipped {kind} are missing: .*reinstall"):
         find()

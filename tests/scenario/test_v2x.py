@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import script_agents
-from ethbrake_marl.envs import make_engine
-from ethbrake_marl.evaluation import worlds_sha256
-from ethbrake_marl.observations import observe
-from ethbrake_marl.physics.batch import Packed
-from ethbrake_marl.physics.kernel import CLOCK
+from ethbrake_marl.agents.driving import script_agents
+from ethbrake_marl.engine.profiles import identities
+from ethbrake_marl.envs.making import make_engine
+from ethbrake_marl.evaluation.identity import worlds_sha256
+from ethbrake_marl.game.full_state import full_state, state_features
+from ethbrake_marl.game.observations import observe
+from ethbrake_marl.physics.columns import Packed
+from ethbrake_marl.physics.episode import CLOCK
 from ethbrake_marl.physics.messages import CHANNEL, Messages, chance
-from ethbrake_marl.scenario import CHANNELS, full_state, state_features
-from ethbrake_marl.scenario.v2x import PER_LINK, PRESETS, V2X, Channel, Equipage, Equipped, burst_periods
-from ethbrake_marl.search import identities
-from tests.agents.test_knowledge import alter_unreceived
+from ethbrake_marl.scenario.channel import CHANNELS, PER_LINK, PRESETS, V2X, Channel, Equipage, Equipped, burst_periods
+from ethbrake_marl.scenario.tables import worlds_from_state
+from tests.fixtures.knowledge import alter_unreceived
 
 PAPER = eb.load_scenario("paper-random")
 
@@ -324,7 +325,7 @@ def test_full_state__has_the_latency_that_was_drawn() -> None:
 
 def test_initial_state__of_a_channel_without_chance_has_its_news() -> None:
     fixed, given = channel_of("nominal", link_latency_s=0.25, sensing_s=[1, 1]), {"gaps_m": [7, 7]}
-    assert fixed.worlds_from_state({**given, "speeds_mps": [20, 18, 20]}).vehicles.latency_s.tolist() == [
+    assert worlds_from_state(fixed, {**given, "speeds_mps": [20, 18, 20]}).vehicles.latency_s.tolist() == [
         [0.0, 0.25, 0.25]
     ]
 

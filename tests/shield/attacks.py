@@ -14,11 +14,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import drive, make_agent, script_agents
-from ethbrake_marl.physics import Floats, Worlds, advance
-from ethbrake_marl.physics.kernel import CLOCK
-from ethbrake_marl.shield import ShieldedDriver, StepShield, parse_uncertainty
-from ethbrake_marl.shield.step_shield import Decision, certify, seen_columns
+from ethbrake_marl.agents.driving import drive, script_agents
+from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.episode import CLOCK
+from ethbrake_marl.physics.state import Floats, Worlds
+from ethbrake_marl.shield.certify import Decision, certify
+from ethbrake_marl.shield.comparison import seen_columns
+from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shield.step import StepShield
 
 # ---------------------------------------------------------------- lines
 
@@ -68,7 +72,7 @@ def worst_case(rng, engine, shield, k, candidates=8):
     best, action = np.full(n, -1.0), np.ones((n, K))
     for middle in np.linspace(-1.0, 1.0, candidates):
         candidate = middle + rng.uniform(-0.1, 0.1, (n, K)) if K == 1 else rng.uniform(-1.0, 1.0, (n, K))
-        decision = certify(shield.running, as_asked(shield, candidate), shield.backup, shield.bound)
+        decision = certify(shield.memory.running, as_asked(shield, candidate), shield.memory.backup, shield.bound)
         reason = decision.reason.reshape(n, K)
         better = ((reason == 1) | (reason == 2)).any(axis=1) & (decision.bound > best)
         best[better], action[better] = decision.bound[better], np.clip(candidate[better], -1.0, 1.0)
@@ -119,7 +123,7 @@ ADVERSARIES: dict[str, Adversary] = {**TEAM_ADVERSARIES, "trained": trained}
 
 def shape(shield: StepShield) -> tuple[int, int]:
     """Of a decision's proposals: worlds, vehicles."""
-    return len(shield.first_bound), len(shield.vehicles)
+    return len(shield.memory.first_bound), len(shield.vehicles)
 
 
 def as_asked(shield: StepShield, proposed: Floats) -> Floats:
@@ -129,8 +133,8 @@ def as_asked(shield: StepShield, proposed: Floats) -> Floats:
 
 def planned(shield: StepShield) -> Floats:
     """What the plan says now, [n, K]."""
-    plan, (n, K) = shield.backup.plan, shape(shield)
-    return plan[np.arange(n), np.minimum(shield.running.steps, plan.shape[1] - 1)].reshape(n, K)
+    plan, (n, K) = shield.memory.backup.plan, shape(shield)
+    return plan[np.arange(n), np.minimum(shield.memory.running.steps, plan.shape[1] - 1)].reshape(n, K)
 
 
 # ---------------------------------------------------------------- attacks
@@ -150,19 +154,20 @@ class Attack(NamedTuple):
 
 def attack(
     scenario: eb.Scenario, worlds: Worlds, adversary: Adversary, *, hostile="all", harm_count="first", allowance=0.0,
-    cap=None, uncertainty: str | None = None, leak: Leak | None = None, seed=0,
+    cap=None, leak: Leak | None = None, seed=0, uncertain: Any = None,
 ) -> Attack:  # fmt: skip
     """Let the hostile learners propose in every step: ``all``, or ``one``, another one from world to world.
 
     Who is not hostile proposes what the plan says, or brakes fully. A ``leak`` changes the shield before each decision.
-    With an uncertainty the worlds are what the shield is told, and the truth is a corner.
+    ``uncertain`` is a class of shields and an uncertainty: the worlds are what such a shield is told, and the truth is
+    a corner.
     """
     rng, learners = np.random.default_rng(seed), scenario.learners
-    intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
-    truth = worlds if intervals is None else intervals.draw(worlds, rng, corners=True)
-    engine, sound = plain_engine(scenario, truth), leak is None and intervals is None
-    shield = begun(scenario, worlds, harm_count=harm_count, allowance=allowance, cap=cap, uncertainty=intervals)
-    first_bound, told, decision = shield.first_bound.copy(), shield.bound, None
+    truth = worlds if uncertain is None else uncertain[1].draw(worlds, rng, corners=True)
+    engine, sound = plain_engine(scenario, truth), leak is None and uncertain is None
+    kind, settings = (StepShield, {}) if uncertain is None else (uncertain[0], {"uncertainty": uncertain[1]})
+    shield = begun(scenario, worlds, kind, harm_count=harm_count, allowance=allowance, cap=cap, **settings)
+    first_bound, told, decision = shield.memory.first_bound.copy(), shield.bound, None
     rows = np.arange(worlds.n)[:, np.newaxis]
     who, obeys = rows % len(learners) == np.arange(len(learners)), rows % 4 < 2
     accepted, rises, decisions, k = np.zeros(worlds.n, np.int64), 0, 0, 0
@@ -180,16 +185,16 @@ def attack(
         engine.step(decision.applied.reshape(shape(shield)))
         assert not sound or shield.expects(seen_columns(engine.packed)).all()
         k += 1
-    assert not sound or not shield.distrusted.any()
-    over = 0 if cap is None else int((engine.ledger.vehicle_harm(harm_count) > shield.baseline_shares).sum())
+    assert not sound or not shield.memory.distrusted.any()
+    over = 0 if cap is None else int((engine.ledger.vehicle_harm(harm_count) > shield.memory.baseline_shares).sum())
     realised = engine.ledger.world_harm(harm_count)
     return Attack(realised, first_bound, shield.bound, accepted, rises, over, decisions)
 
 
-def begun(scenario: eb.Scenario, worlds: Worlds, **settings) -> StepShield:
+def begun(scenario: eb.Scenario, worlds: Worlds, kind: type[StepShield] = StepShield, **settings) -> StepShield:
     """A shield of all learners in its episodes."""
     learners = scenario.learners
-    shield = StepShield(scenario, learners[0] if len(learners) == 1 else learners, **settings)
+    shield = kind(scenario, learners[0] if len(learners) == 1 else learners, **settings)
     shield.begin(worlds, np.arange(worlds.n))
     return shield
 
@@ -282,16 +287,18 @@ def _of_pairs(change: Callable[[StepShield, np.ndarray], None]) -> Leak:
     """A leak that changes the state of pairs [n, 4, pairs]: 0 gap, 1 hit flag, 2 first-impact harm, 3 total harm."""
 
     def leak(shield, last):
-        states, N = shield.running.states.copy(), shield.running.problem.mass.shape[1]
+        states, N = shield.memory.running.states.copy(), shield.memory.running.problem.mass.shape[1]
         change(shield, states[:, N : N + 4 * (N - 1)].reshape(-1, 4, N - 1))
-        shield.running = shield.running._replace(states=states)
+        shield.memory = shield.memory._replace(running=shield.memory.running._replace(states=states))
 
     return leak
 
 
 def budget_may_rise(percent: float) -> Leak:
     def leak(shield, last):
-        shield.backup = shield.backup._replace(harm=shield.backup.harm * (1.0 + percent / 100.0))
+        shield.memory = shield.memory._replace(
+            backup=shield.memory.backup._replace(harm=shield.memory.backup.harm * (1.0 + percent / 100.0))
+        )
 
     return leak
 
@@ -320,9 +327,9 @@ def belief(name: str, believed: Callable[[np.ndarray], np.ndarray]) -> Leak:
 
     def leak(shield, last):
         if last is None:
-            problem = shield.running.problem
+            problem = shield.memory.running.problem
             changed = problem._replace(**{name: believed(getattr(problem, name).copy())})
-            shield.running = shield.running._replace(problem=changed)
+            shield.memory = shield.memory._replace(running=shield.memory.running._replace(problem=changed))
 
     return leak
 
@@ -341,13 +348,15 @@ def far_pairs_forgotten(shield: StepShield, pairs: np.ndarray) -> None:
 
 def plan_rounded(shield: StepShield, last: Decision | None) -> None:
     """The plan is kept with two decimals; its harm is believed unchanged."""
-    shield.backup = shield.backup._replace(plan=np.round(shield.backup.plan, 2))
+    shield.memory = shield.memory._replace(
+        backup=shield.memory.backup._replace(plan=np.round(shield.memory.backup.plan, 2))
+    )
 
 
 @_of_pairs
 def gaps_blurred(shield: StepShield, pairs: np.ndarray) -> None:
     """Gaps are believed 1 cm longer than they are, from the third step on."""
-    if int(shield.running.steps.max()) == 3:
+    if int(shield.memory.running.steps.max()) == 3:
         pairs[:, 0] += 0.01
 
 
@@ -366,37 +375,6 @@ LEAKS: dict[str, Leak] = {
     "gaps are believed 1 cm longer": gaps_blurred,
 }
 
-# ---------------------------------------------------------------- corners of what a vehicle does not know
-
-# Every quantity of another vehicle that is open is one of two numbers, so each world of the lists is a member of what
-# is certified at its first decision. None of the numbers are round: in a world of equal gaps and equal speeds two
-# impacts fall on one moment, and the last bit decides which of them is first.
-WAYS = ("coast", "drive", "chance")
-ABOVE = 1e-6  # m2/s2; what is told is moved on with rounding
-
-_BASE = eb.load_scenario("cooperation-2-paper").replace(early_impacts="keep")
-NEVER_HEARD = _BASE.replace(
-    gaps_m=[{"choice": [5.13, 9.71]}, {"choice": [5.37, 9.58]}],
-    speeds_mps=[{"choice": [18.23, 21.87]}, {"choice": [18.11, 21.93]}, {"choice": [18.41, 22.19]}],
-    v2x={"preset": "paper", "hears": "front"},
-    mass_t=[4.5, 5.5, {"choice": [3.0, 9.0]}],
-)
-HEARD_LATE = NEVER_HEARD.replace(  # a while after the first decision, by messages 0.6 to 0.9 s old
-    v2x={"preset": "paper", "link_latency_s": 0.6, "persistence": "periodic", "senses": "front", "sensing_s": [3, 3]},
-    latency_s=[0.0, 0.2, 0.6],
-)
-LISTS = {"never heard": NEVER_HEARD, "heard late": HEARD_LATE}
-_INSIDE = {
-    "gaps_m": [{"uniform": [5.13, 9.71]}, {"uniform": [5.37, 9.58]}],
-    "speeds_mps": [{"uniform": [18.23, 21.87]}, {"uniform": [18.11, 21.93]}, {"uniform": [18.41, 22.19]}],
-    "mass_t": [4.5, 5.5, {"uniform": [3.0, 9.0]}],
-}
-INSIDE = {  # the same ranges, and worlds from between the corners
-    **{name: scenario.replace(**_INSIDE) for name, scenario in LISTS.items()},
-    "blocked": NEVER_HEARD.replace(**_INSIDE, v2x={"preset": "blocked", "persistence": "periodic"}),
-    "sensors-only": NEVER_HEARD.replace(**_INSIDE, v2x="sensors-only"),
-}
-
 
 class Hostile:
     """Proposes what does harm: full driving, nothing at all, or chance."""
@@ -413,14 +391,3 @@ class Hostile:
         if self.name == "chance":
             return self.rng.uniform(low, high)
         return high.copy() if self.name == "drive" else np.zeros(worlds.n)
-
-
-def shielded(
-    way: str, scenario: eb.Scenario, n: int, seed: int, *, robust: str | None = "corners"
-) -> tuple[Floats, Floats, int]:
-    """Harm realised and first bound of ``n`` worlds [n] m2/s2, and how many proposals were replaced."""
-    mode = {"mode": "step"} if robust is None else {"mode": "robust", "robust": robust}
-    driver = ShieldedDriver(Hostile(way, seed), scenario, believed=True, **mode)
-    episodes = drive(scenario.sample(n, seed).worlds, driver, scenario, 1)
-    shield = episodes.guarded.shield
-    return episodes.ledger.world_harm("first"), shield.predicted_harm, int(shield.interventions.sum())

@@ -16,15 +16,11 @@ import gymnasium
 import numpy as np
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import Team, episode_engine
-from ethbrake_marl.shield import (
-    HybridShield,
-    MovingAtHorizon,
-    ShieldedDriver,
-    ShieldedEnv,
-    ShieldedVectorEnv,
-    shielded_aec,
-)
+from ethbrake_marl.agents.driving import episode_engine
+from ethbrake_marl.agents.protocol import Team
+from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shield.guard import MovingAtHorizon
+from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from tests.shield.attacks import line
 
 ROWS = 5  # worlds of the batched interfaces
@@ -45,7 +41,7 @@ class Recorder:
     def stepped(self, memory: Any, before: Any, after: Any) -> Any:
         made, ended = memory
         over = after.ended & ~before.ended
-        harm, bound = after.ledger.world_harm("first"), after.guarded.shield.first_bound
+        harm, bound = after.ledger.world_harm("first"), after.guarded.shield.memory.first_bound
         return made + 1, [*ended, *zip(harm[over].tolist(), bound[over].tolist(), strict=True)]
 
 
@@ -119,13 +115,21 @@ class Play:
     def known(self) -> list[Any]:
         """What must not change when nothing happens: bound, plan, trust, place in the episodes."""
         shield = self.shield()
-        held = [shield.bound, shield.backup.plan, shield.distrusted, shield.running.steps, shield.running.states]
+        held = [
+            shield.bound,
+            shield.memory.backup.plan,
+            shield.memory.distrusted,
+            shield.memory.running.steps,
+            shield.memory.running.states,
+        ]
         return [array.tolist() for array in held]
 
     def astray(self) -> int:
         """1 where the shield is not where the engine is, or trusts it no longer."""
         shield, engine = self.shield(), self.engine()
-        return int(not (shield.running.steps == engine.steps)[~engine.ended].all() or shield.distrusted.any())
+        return int(
+            not (shield.memory.running.steps == engine.steps)[~engine.ended].all() or shield.memory.distrusted.any()
+        )
 
     def member_is(self, how: str, asked: Callable[[], Any]) -> Callable[[], None]:
         """A call in which one member fails so, while the others are well."""

@@ -156,12 +156,8 @@ THEIR_OWN = {  # resets by somebody else's hand
     "VecMonitor inside": monitored,
 }
 BRAKED = eb.make_agent("full_brake")
-MODES: dict[str, dict[str, Any]] = {
-    "step": {"shares": True},
-    "episode": {"mode": "episode", "policy": BRAKED},
-    "robust": {"uncertainty": "gaps_m=0.2"},
-    "believed": {"believed": True},
-}
+MODES: dict[str, dict[str, Any]] = {"step": {"shares": True}, "episode": {"mode": "episode", "policy": BRAKED}}
+CODES = {"episode": 0, "step": 1}
 
 
 ONE_WORLD = {"parallel", "aec", "gymnasium", *THEIR_OWN} - {"VecMonitor inside"}  # these take a second for 24 episodes
@@ -173,9 +169,9 @@ def episodes(interface: str, **options: Any) -> Iterator[Episode]:
 
 
 @cache
-def alert_bounds(mode: str) -> dict[int, float]:
+def alert_bounds(**options: Any) -> dict[int, float]:
     """The bounds reported at the alerts of the first worlds of stream 7, by their number, in 64 rows."""
-    env = eb.shield(eb.EthBrakeVectorEnv(64), **MODES[mode])
+    env = eb.shield(eb.EthBrakeVectorEnv(64), **options)
     infos = env.reset(seed=7)[1]
     return dict(zip(infos["world"].tolist(), infos["shield_bound_harm"].tolist(), strict=True))
 
@@ -198,20 +194,26 @@ def test_harm__of_1000_episodes_is_at_most_the_bound_reported_at_the_alert(inter
 
 @pytest.mark.parametrize(("interface", "mode"), [*product(INTERFACES, MODES), *product(THEIR_OWN, ["step"])])
 def test_infos__of_the_first_moment_and_of_the_last_belong_to_their_episode(interface: str, mode: str) -> None:
-    shares_stream = "Sync" not in interface and interface != "DummyVecEnv"  # whose copies have streams of their own
-    for first, last in episodes(interface, **MODES[mode]):
-        assert first["world"] == last["world"] and first["world_seed"] == last["world_seed"]
-        assert not shares_stream or first["shield_bound_harm"] == alert_bounds(mode)[first["world"]]
-        assert last["shield_bound_harm"] <= first["shield_bound_harm"]
-        assert first["shield_proposed_action"] == first["shield_applied_action"] == 0.0
-        assert not first["shield_intervened"] and abs(last["shield_proposed_action"]) == 1.0
-        assert last["shield_applied_action"] == pytest.approx(last["chosen_action"].item(), abs=1e-6)
-        assert eb.ShieldMode(first["shield_mode"]).name.lower() == {"believed": "step"}.get(mode, mode)
+    for first, last in belonging(interface, CODES[mode], MODES[mode]):
         if mode != "episode":
             assert first["shield_reason"] == eb.ShieldReason.NO_DECISION != last["shield_reason"]
         if mode == "step":
             assert last["shield_bound_harm"] == pytest.approx(last["world_first_impact_harm"], abs=1e-9)
             assert last["shield_own_harm"] == last["first_impact_harm"]
+
+
+def belonging(interface: str, code: int, options: dict[str, Any]) -> Iterator[Episode]:
+    """Some episodes in a mode, looked at: infos belong to their episode."""
+    shares_stream = "Sync" not in interface and interface != "DummyVecEnv"  # whose copies have streams of their own
+    for first, last in episodes(interface, **options):
+        assert first["world"] == last["world"] and first["world_seed"] == last["world_seed"]
+        assert not shares_stream or first["shield_bound_harm"] == alert_bounds(**options)[first["world"]]
+        assert last["shield_bound_harm"] <= first["shield_bound_harm"]
+        assert first["shield_proposed_action"] == first["shield_applied_action"] == 0.0
+        assert not first["shield_intervened"] and abs(last["shield_proposed_action"]) == 1.0
+        assert last["shield_applied_action"] == pytest.approx(last["chosen_action"].item(), abs=1e-6)
+        assert first["shield_mode"] == code
+        yield first, last
 
 
 @pytest.mark.parametrize("agents", ["all", "learners"])

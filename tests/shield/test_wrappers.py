@@ -29,8 +29,8 @@ MODES = {
     "episode": {"mode": "episode"},
     "episode:pairwise": {"mode": "episode", "bound": "pairwise"},
     "step": {"mode": "step", "allowance": 1.0, "logging": True},
-    "robust": {"mode": "robust", "uncertainty": "gaps_m=0.2", "harm_count": "total"},
 }
+CODES = {"episode": 0, "episode:pairwise": 0, "step": 1}
 KEYS = {
     "mode", "proposed_action", "applied_action", "intervened", "reason", "bound_harm", "margin", "trusted", "settles",
 }  # fmt: skip
@@ -54,27 +54,30 @@ def rows_told(interface, infos):
 
 @pytest.mark.parametrize("interface", [*MAKERS, eb.shield])
 def test_interfaces__have_the_same_default_mode(interface):
-    for options, mode in (({}, "step"), ({"uncertainty": "gaps_m=0.5"}, "robust")):
-        env = interface(MAKERS.get(interface, eb.EthBrakeEnv)(), **options)
-        assert env.attached.options.mode == mode
-        env.attached.close()
+    env = interface(MAKERS.get(interface, eb.EthBrakeEnv)())
+    assert env.attached.options.mode == "step"
+    env.attached.close()
 
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("interface", MAKERS)
 def test_interfaces__have_every_mode_and_the_penalty_and_tell_the_bound_after_a_reset_already(interface, mode):
+    pays(interface, MODES[mode], CODES[mode], KEYS if mode == "step" else None)
+
+
+def pays(interface, options, code, keys=None):
     paid = []
     for penalty in (0.0, 7.0):
-        env = interface(MAKERS[interface](), eb.make_agent("full_brake"), intervention_penalty=penalty, **MODES[mode])
+        env = interface(MAKERS[interface](), eb.make_agent("full_brake"), intervention_penalty=penalty, **options)
         starts, rewards, intervened = reset(env, interface), [], []
         for _ in range(3):
             _, reward, *_, infos = env.step(DRIVE[interface])
             told = rows_told(interface, infos)
-            assert mode != "step" or set(told[0]) == KEYS
+            assert keys is None or set(told[0]) == keys
             rewards.append(reward["vehicle_2"] if interface is eb.HybridShield else reward)
             intervened.append([bool(each["intervened"]) for each in told])
             for start, step in zip(starts, told, strict=True):
-                assert start.keys() == step.keys() and step["mode"] == eb.ShieldMode[mode.partition(":")[0].upper()]
+                assert start.keys() == step.keys() and step["mode"] == code
         assert all(each["bound_harm"] > 0.0 == each["proposed_action"] and not each["intervened"] for each in starts)
         paid.append(np.array(rewards).reshape(3, -1))
     assert np.any(intervened) and paid[0] - paid[1] == pytest.approx(7.0 * np.array(intervened), abs=1e-5)
@@ -111,7 +114,7 @@ def test_batch__tells_of_every_row_the_episode_that_ended(name, mode):
     ended, intervened, rng = 0, 0, np.random.default_rng(0)
     for _ in range(120):
         running, shield = ~env.attached.engine.ended, env.attached.shield
-        before = shield["bound_harm"].copy() if mode == "episode" else shield.first_bound.copy()
+        before = shield["bound_harm"].copy() if mode == "episode" else shield.memory.first_bound.copy()
         found = env.step(rng.uniform(-1.0, 1.0, (8, 1)).astype(np.float32))
         over, infos = (found[2], found[3]) if name == "sb3" else (found[2] | found[3], found[4])
         for k in np.flatnonzero(over):
@@ -171,9 +174,9 @@ def test_shield__chooses_the_wrapper_of_the_interface(make, kind):
 
 
 def test_shield__is_the_folder_and_the_function_whichever_is_asked_for_first():
-    import ethbrake_marl.shield.guard as guard
+    import ethbrake_marl.shield.options as options
 
-    assert eb.shield.guard is guard and callable(eb.shield)
+    assert eb.shield.options is options and callable(eb.shield)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,308 @@
+"""Simulate many constant decelerations of one vehicle in one world, compiled; used by the coupled search.
+
+The harm equals that of ``physics.advance`` under constant commands, to the bit; the motion is not kept. Three things
+make it cheap. All candidates share the motion until the vehicle's command takes effect, so it is simulated once. A
+simulation ends as soon as no two vehicles can meet any more (``will_stay_apart``). And it is abandoned once its harm,
+which never decreases, has reached a bound.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.e_v2x_bm.samples import Samples, copy_sample
+from ethbrake_marl.physics.constant_motion import accelerate
+from ethbrake_marl.physics.episode import onset_s
+from ethbrake_marl.physics.impact import record_impacts, resolve_impacts
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.motion import BOUND
+from ethbrake_marl.physics.pieces import pieces_to_come
+from ethbrake_marl.physics.rows import FLAG, LISTED, ROW, builds_up, place_forces, place_obstacle, rows_for
+from ethbrake_marl.physics.segment import move_apart, start_events, to_next_event, to_next_impact
+from ethbrake_marl.physics.state import Bools, Floats
+
+DURATION, RESTITUTION, SHARED_S = range(3)  # entries of a line's clock
+
+CLEAR_M, CLEAR_MPS = 1e-6, 1e-6  # margins, a million times the rounding error of a gap or a speed
+
+_DIGIT = 1_000.0  # base in which ``_course`` encodes the number of impacts of each pair
+
+
+class Line(NamedTuple):
+    """One world in which decelerations of one vehicle are simulated, as tables of ``physics.rows``.
+
+    A table has a row per quantity and a column per vehicle, front to rear; an obstacle ahead is column 0.
+    """
+
+    start: Floats  # [rows, N or N + 1] table at the start, with all commands but the controlled vehicle's
+    shared: Floats  # same shape: table at the time when the controlled vehicle's command takes effect
+    table: Floats  # same shape: workspace, in which each simulation runs
+    clock: Floats  # [3] length of a simulation (s), restitution, time from ``start`` to ``shared`` (s)
+    controlled: int  # column of the controlled vehicle
+    vehicles: int  # column of Vehicle 1: 1 behind an obstacle, else 0
+    harm: int  # row of the harm that is minimised: first-impact or total
+    other: int  # row of the other harm, which decides ties
+    no_rows: Floats  # empty list of impacts, so that single impacts are not recorded
+
+
+@compiled(apart=True)
+def make_line(
+    gap: Floats, speed: Floats, hit: Bools, obstacle: float, obstacle_hit: bool, command: Floats, latency: Floats,
+    mass: Floats, limit: Floats, in_force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats,
+    time: float, restitution: float, horizon: float, vehicle: int, total: bool,
+) -> Line:  # fmt: skip
+    """Return the tables of one world of N vehicles, on which ``share_start`` is called next.
+
+    Args:
+        gap: [N - 1] m, bumper to bumper.
+        speed: [N] m/s.
+        hit: [N - 1] whether the pair has had an impact.
+        obstacle: distance from Vehicle 1 to an obstacle ahead, m; infinite: none.
+        obstacle_hit: whether Vehicle 1 has had an impact with it.
+        command: [N] commands, m/s2; the controlled vehicle's is ignored.
+        latency: [N] s since the alert.
+        mass: [N] t.
+        limit: [N] speed limits, m/s.
+        in_force: [N] accelerations in force at the start, m/s2.
+        brake_rate: [N] rates at which brakes build up, m/s3.
+        release_rate: [N] rates at which brakes are released, m/s3.
+        pieces: [N, 2 K] braking profiles with K intervals of constant command, as in ``Vehicles``.
+        time: time of the world, s since the alert.
+        restitution: of every impact, 0 to 1.
+        horizon: end of the simulations, s since the alert.
+        vehicle: index of the controlled vehicle, from 0.
+        total: minimise total harm; if False, first-impact harm.
+
+    """
+    at = 1 if obstacle < math.inf else 0
+    vehicles = speed.shape[0]
+    table = np.zeros((rows_for(pieces.shape[1]), vehicles + at))
+    place_forces(table, in_force, brake_rate, release_rate, pieces)
+    if at == 1:
+        place_obstacle(table, obstacle, 1.0 if obstacle_hit else 0.0)
+        table[ROW.ONSET, 0] = onset_s(0.0, time)
+    for i in range(vehicles):
+        table[ROW.COMMAND, at + i], table[ROW.SPEED, at + i] = command[i], speed[i]
+        table[ROW.MASS, at + i], table[ROW.LIMIT, at + i] = mass[i], limit[i]
+        table[ROW.ONSET, at + i] = onset_s(latency[i], time)
+    for p in range(vehicles - 1):
+        table[ROW.GAP, at + p] = gap[p]
+        table[ROW.HIT, at + p] = 1.0 if hit[p] else 0.0
+    clock = np.array([horizon - time, restitution, 0.0])
+    rows = (ROW.TOTAL_HARM, ROW.FIRST_HARM) if total else (ROW.FIRST_HARM, ROW.TOTAL_HARM)
+    return Line(
+        table, table.copy(), table.copy(), clock, at + vehicle, at, rows[0], rows[1], np.empty((0, LISTED.WIDTH))
+    )
+
+
+@compiled(apart=True, bare=True)
+def share_start(line: Line) -> int:
+    """Simulate in ``line.shared`` until the controlled vehicle's command takes effect; return a status.
+
+    That time is written to ``line.clock``. The status is ``FLAG.DONE``, or the code of the check of the physics that
+    failed.
+    """
+    table, clock = line.shared, line.clock
+    copy_table(line.start, table)
+    start_events(table, builds_up(table))
+    now = 0.0
+    for _ in range(BOUND.MOST_EVENTS):
+        if table[ROW.ACTIVE, line.controlled] == 1.0 or now >= clock[DURATION]:
+            clock[SHARED_S] = now
+            return FLAG.DONE
+        if resolve_impacts(table, clock[RESTITUTION]):
+            record_impacts(table, now, 0, line.no_rows, 0)
+            continue
+        sound, now = to_next_event(table, now, clock[DURATION], builds_up(table))
+        if not sound:
+            return FLAG.PENETRATED
+    return FLAG.STUCK
+
+
+@compiled(apart=True, bare=True)
+def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -> int:
+    """Simulate constant decelerations of the controlled vehicle and write their results into ``samples``.
+
+    Args:
+        line: the world, after ``share_start``; its ``table`` is overwritten.
+        samples: ``at`` holds the decelerations; the other columns are filled in.
+        first: index of the first sample to simulate.
+        end: index after the last one.
+        bound: harm at which a simulation stops, m2/s2. Its harm is then only known to be at least ``bound``, and its
+            other columns are meaningless.
+
+    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+
+    """
+    for s in range(first, end):
+        if s > first and samples.at[s] == samples.at[s - 1]:
+            copy_sample(samples, s - 1, samples, s)
+            continue
+        status = _simulate_one(line, -samples.at[s], bound)
+        if status != FLAG.DONE:
+            return status
+        samples.harm[s] = _sum_row(line, line.harm)
+        samples.other[s] = _sum_row(line, line.other)
+        samples.course[s] = _course(line)
+    return FLAG.DONE
+
+
+@compiled(within=True)
+def _simulate_one(line: Line, command: float, bound: float) -> int:
+    """Simulate one ``command`` (m/s2) in ``line.table``, until the harm reaches ``bound`` at the latest.
+
+    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    """
+    table, duration = line.table, line.clock[DURATION]
+    table[ROW.COMMAND, line.controlled] = command
+    _copy_state(line.start, table)
+    building = builds_up(table)
+    if move_apart(table, duration, building):
+        return FLAG.DONE
+    _copy_state(line.shared, table)
+    now = line.clock[SHARED_S]
+    for _ in range(BOUND.MOST_EVENTS):
+        status, now = to_next_impact(table, line.clock[RESTITUTION], now, duration, building)
+        if status != FLAG.IMPACT:
+            return status
+        record_impacts(table, now, 0, line.no_rows, 0)
+        if _sum_row(line, line.harm) >= bound or will_stay_apart(table):
+            return FLAG.DONE
+    return FLAG.STUCK
+
+
+@compiled(within=True)
+def _copy_state(of: Floats, table: Floats) -> None:
+    """Copy the state of the vehicles and pairs from table ``of`` to ``table``; masses and other parameters stay."""
+    vehicles = table.shape[1]
+    for i in range(vehicles):
+        table[ROW.SPEED, i] = of[ROW.SPEED, i]
+        table[ROW.ACTIVE, i] = of[ROW.ACTIVE, i]
+        table[ROW.FORCE, i] = of[ROW.FORCE, i]
+        if table.shape[0] > ROW.OF_BUILD_UP:
+            table[ROW.NEXT_PIECE, i] = of[ROW.NEXT_PIECE, i]
+            if table[ROW.PIECES, i] < math.inf:
+                table[ROW.COMMAND, i] = of[ROW.COMMAND, i]
+    for p in range(vehicles - 1):
+        table[ROW.GAP, p] = of[ROW.GAP, p]
+        table[ROW.CONTACT_SPEED, p] = of[ROW.CONTACT_SPEED, p]
+        table[ROW.HIT, p] = of[ROW.HIT, p]
+        table[ROW.FIRST_HARM, p] = of[ROW.FIRST_HARM, p]
+        table[ROW.TOTAL_HARM, p] = of[ROW.TOTAL_HARM, p]
+        table[ROW.COUNT, p] = of[ROW.COUNT, p]
+
+
+@compiled(within=True)
+def copy_table(one: Floats, other: Floats) -> None:
+    """Copy every entry of the table ``one`` into the table ``other`` of the same shape."""
+    for row in range(one.shape[0]):
+        for i in range(one.shape[1]):
+            other[row, i] = one[row, i]
+
+
+@compiled(within=True)
+def will_stay_apart(table: Floats) -> bool:
+    """Return whether no pair can have another impact, however long all commands last; False if that is not certain.
+
+    ``table`` is the table of one world (``physics.rows``). Commands must be in full effect, and no vehicle may drive or
+    move backward. Then every vehicle keeps its acceleration until it stands; vehicles that rest against each other have
+    a common one. A pair of a front vehicle f and a rear vehicle r has gap g, closing speed w, speeds v and
+    decelerations d. It has no impact if one of these is true, the last one with margins for rounding:
+
+    * r stands, or both move as one body;
+    * ``w <= 0`` and ``d_r >= d_f``: then w stays at most 0 until r stands;
+    * r would stop behind f, ``g + v_f^2 / (2 d_f) > v_r^2 / (2 d_r)``; the pair does not touch, or separates; and if r
+      closes and brakes harder, the smallest gap is positive too: ``w^2 < 2 (d_r - d_f) g``. (If r brakes less hard, the
+      gap is least at one of its ends: it is concave until f stands, and decreases from then on.)
+    """
+    vehicles, hardest = table.shape[1], 0.0
+    if pieces_to_come(table):
+        return False
+    for i in range(vehicles):
+        if table[ROW.ACTIVE, i] == 0.0 or table[ROW.COMMAND, i] > 0.0 or table[ROW.SPEED, i] < 0.0:
+            return False
+        if builds_up(table) and table[ROW.FORCE, i] != table[ROW.COMMAND, i]:
+            return False
+        hardest = max(hardest, -table[ROW.COMMAND, i])
+    for p in range(vehicles - 1):  # quick test for pairs that may meet
+        closing = table[ROW.SPEED, p + 1] - table[ROW.SPEED, p]
+        if closing > 0.0 and closing * closing >= 2.0 * hardest * table[ROW.GAP, p]:
+            return False
+    accelerate(table)
+    for p in range(vehicles - 1):
+        front, rear = table[ROW.SPEED, p], table[ROW.SPEED, p + 1]
+        gap, closing, harder = (
+            table[ROW.GAP, p],
+            rear - front,
+            table[ROW.ACCELERATION, p] - table[ROW.ACCELERATION, p + 1],
+        )
+        if rear == 0.0 or table[ROW.JOINED, p] == 1.0 or (closing <= 0.0 and harder >= 0.0):
+            continue
+        if not (gap > CLEAR_M or closing < -CLEAR_MPS):
+            return False
+        gap -= CLEAR_M
+        if closing > 0.0 and harder > 0.0 and front > 0.0 and not closing * closing < 2.0 * harder * gap:
+            return False
+        if not gap + _way_to_stop(front, table[ROW.ACCELERATION, p]) > _way_to_stop(
+            rear, table[ROW.ACCELERATION, p + 1]
+        ):
+            return False
+    return True
+
+
+@compiled(within=True)
+def _way_to_stop(speed: float, acceleration: float) -> float:
+    """Return the distance in which a vehicle with this speed (m/s) stops, m; ``acceleration`` (m/s2) <= 0.
+
+    It is infinite for a moving vehicle with acceleration 0.
+    """
+    return speed * speed / (2.0 * abs(acceleration)) if speed > 0.0 else 0.0
+
+
+@compiled(within=True)
+def _course(line: Line) -> float:
+    """Return a number that encodes how many impacts each pair, and the obstacle, had in ``line.table``."""
+    course, digit, table = 0.0, 1.0, line.table
+    for p in range(line.vehicles, table.shape[1] - 1):
+        course += table[ROW.COUNT, p] * digit
+        digit *= _DIGIT
+    return course + table[ROW.COUNT, 0] * digit if line.vehicles == 1 else course
+
+
+@compiled(within=True)
+def _sum_row(line: Line, row: int) -> float:
+    """Sum a row of ``line.table`` over the pairs and the obstacle, in the order in which NumPy sums a row."""
+    table, first, total = line.table, line.vehicles, 0.0
+    eights = (table.shape[1] - 1 - first) // 8
+    if eights > 0:
+        total = _sum_eights(table, row, first, first + 8 * eights)
+    for p in range(first + 8 * eights, table.shape[1] - 1):
+        total += table[row, p]
+    return total + table[row, 0] if line.vehicles == 1 else total
+
+
+@compiled(apart=True, bare=True)
+def _sum_eights(table: Floats, row: int, first: int, end: int) -> float:
+    """Sum ``table[row, first:end]``, a multiple of eight entries, in NumPy's order.
+
+    Each of the eight positions in a block is summed separately, then the eight sums are added pairwise.
+    """
+    return (
+        (_sum_place(table, row, first, end) + _sum_place(table, row, first + 1, end))
+        + (_sum_place(table, row, first + 2, end) + _sum_place(table, row, first + 3, end))
+    ) + (
+        (_sum_place(table, row, first + 4, end) + _sum_place(table, row, first + 5, end))
+        + (_sum_place(table, row, first + 6, end) + _sum_place(table, row, first + 7, end))
+    )
+
+
+@compiled(apart=True, bare=True)
+def _sum_place(table: Floats, row: int, first: int, end: int) -> float:
+    """Sum every eighth entry of ``table[row, first:end]``, beginning with the first."""
+    total = table[row, first]
+    for p in range(first + 8, end, 8):
+        total += table[row, p]
+    return float(total)

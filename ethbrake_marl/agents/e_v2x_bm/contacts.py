@@ -1,0 +1,338 @@
+"""First contact of a single pair in closed form, and the decelerations that avoid it.
+
+Symbols, for a pair on its own (docs/proofs/constant-deceleration.md derives every formula):
+
+=============  ===============================================================
+l, f           leader (front vehicle), follower (rear vehicle)
+gap            bumper to bumper at the start [m], >= 0
+v_l, v_f       speeds at the start [m/s], >= 0
+a_l, a_f       decelerations [m/s2], >= 0, held to standstill
+onset_l/_f     start of braking after the start [s]; before it a vehicle coasts
+tau            time from the leader's onset to the follower's [s], >= 0
+lead           time from the follower's onset to the leader's [s], > 0
+w              closing speed ``v_f - v_l`` [m/s]
+=============  ===============================================================
+
+Only + - * / and sqrt are used, so a world gives the same bits in any batch.
+"""
+
+from __future__ import annotations
+
+import math
+
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.motion import BOUND
+
+TOUCH_SQUARED = (
+    BOUND.TOUCH_SPEED_MPS * BOUND.TOUCH_SPEED_MPS
+)  # contact at or below this squared closing speed: no impact
+
+_NONE = -1.0
+
+
+@compiled
+def stopping_time(speed: float, deceleration: float) -> float:
+    """Return the time in which a vehicle stops, s; 0 at rest, inf without braking.
+
+    It is ``speed / deceleration``, in m/s and m/s2.
+    """
+    if speed == 0.0:
+        return 0.0
+    return speed / deceleration
+
+
+@compiled
+def stopping_distance(speed: float, deceleration: float) -> float:
+    """Return the distance in which a vehicle stops, m; 0 at rest, inf without braking.
+
+    It is ``speed^2 / (2 deceleration)``, in m/s and m/s2.
+    """
+    if speed == 0.0:
+        return 0.0
+    return speed * speed / (2.0 * deceleration)
+
+
+@compiled
+def contact_while_coasting(gap: float, v_l: float, a_l: float, v_f: float, tau: float) -> float:
+    """Return the squared closing speed if the pair meets while the follower coasts, else -1. [m2/s2]
+
+    Regimes A (the leader still moves) and A' (it stands) of docs/proofs/constant-deceleration.md.
+
+    Args:
+        gap: gap at the start, m.
+        v_l: speed of the leader (front vehicle) at the start, m/s.
+        a_l: its deceleration, held from the start to standstill, m/s2, >= 0.
+        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        tau: time until which the follower coasts, s.
+
+    """
+    w = v_f - v_l
+    stop_l = stopping_time(v_l, a_l)
+    squared = w * w + 2.0 * a_l * gap
+    time = math.inf
+    if w > 0.0:
+        time = 2.0 * gap / (w + math.sqrt(squared))
+    elif a_l > 0.0:
+        time = (math.sqrt(squared) - w) / a_l
+    if time <= min(tau, stop_l):
+        return squared
+    if stop_l < tau and gap + stopping_distance(v_l, a_l) <= v_f * tau:
+        return v_f * v_f
+    return _NONE
+
+
+@compiled
+def contact_while_both_brake(gap: float, v_l: float, a_l: float, v_f: float, a_f: float, tau: float) -> float:
+    """Return the squared closing speed if the pair meets while both brake and move, else -1. [m2/s2]
+
+    Regime B of docs/proofs/constant-deceleration.md.
+
+    Args:
+        gap: gap at the start, m.
+        v_l: speed of the leader (front vehicle) at the start, m/s.
+        a_l: its deceleration, held from the start to standstill, m/s2, >= 0.
+        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        a_f: its deceleration, held from ``tau`` to standstill, m/s2, >= 0.
+        tau: time until which the follower coasts, s.
+
+    """
+    stop_l = stopping_time(v_l, a_l)
+    if not stop_l > tau:
+        return _NONE
+    w_t = v_f - v_l + a_l * tau
+    g_t = gap - (v_f - v_l) * tau - 0.5 * a_l * tau * tau
+    q = a_f - a_l
+    squared = w_t * w_t - 2.0 * q * g_t
+    after = math.inf
+    if w_t > 0.0:
+        if squared >= 0.0:
+            after = 2.0 * g_t / (w_t + math.sqrt(squared))
+    elif q < 0.0:
+        after = (math.sqrt(max(squared, 0.0)) - w_t) / -q
+    if after < math.inf and tau + after <= min(stop_l, tau + stopping_time(v_f, a_f)):
+        return squared
+    return _NONE
+
+
+@compiled
+def contact_leader_first(gap: float, v_l: float, a_l: float, v_f: float, a_f: float, tau: float) -> float:
+    """Return the squared closing speed at the first contact if the leader brakes first; 0 without contact. [m2/s2]
+
+    Args:
+        gap: gap at the start, m.
+        v_l: speed of the leader (front vehicle) at the start, m/s.
+        a_l: its deceleration, held from the start to standstill, m/s2, >= 0.
+        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        a_f: its deceleration, held from ``tau`` to standstill, m/s2, >= 0.
+        tau: time until which the follower coasts, s.
+
+    """
+    squared = contact_while_coasting(gap, v_l, a_l, v_f, tau)
+    if squared < 0.0:
+        squared = contact_while_both_brake(gap, v_l, a_l, v_f, a_f, tau)
+    if squared >= 0.0:
+        return squared
+    room = gap + stopping_distance(v_l, a_l) - v_f * tau
+    outlasts = tau + stopping_time(v_f, a_f) > stopping_time(v_l, a_l)
+    if outlasts and stopping_distance(v_f, a_f) > room:  # regime C: the leader stands
+        return v_f * v_f - 2.0 * a_f * room
+    return 0.0
+
+
+@compiled
+def contact_before_leader_brakes(gap: float, w: float, a_f: float, lead: float) -> float:
+    """Return the squared closing speed if a braking follower meets a leader that still coasts; else -1. [m2/s2]
+
+    The pair meets at ``s = 2 gap / (w + sqrt(w^2 - 2 a_f gap)) <= lead``. A touch is ignored: the pair separates again.
+
+    Args:
+        gap: gap at the start, m.
+        w: closing speed at the start, follower minus leader, m/s.
+        a_f: deceleration of the follower, held from the start, m/s2, >= 0.
+        lead: time until which the leader coasts, s.
+
+    """
+    squared = w * w - 2.0 * a_f * gap
+    if w > 0.0 and squared > TOUCH_SQUARED and 2.0 * gap / (w + math.sqrt(squared)) <= lead:
+        return squared
+    return _NONE
+
+
+@compiled
+def closing_speed_squared(
+    gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, a_f: float, onset_f: float
+) -> float:
+    """Return the squared closing speed at the pair's first impact; 0 without one, or for a mere touch. [m2/s2]
+
+    Args:
+        gap: gap at the start, m.
+        v_l: speed of the leader (front vehicle) at the start, m/s.
+        a_l: its deceleration, held from ``onset_l`` to standstill, m/s2, >= 0.
+        onset_l: time until which it coasts, s.
+        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        a_f: its deceleration, held from ``onset_f`` to standstill, m/s2, >= 0.
+        onset_f: time until which it coasts, s.
+
+    """
+    w = v_f - v_l
+    both_coast = min(onset_l, onset_f)
+    if w > 0.0 and gap <= w * both_coast:
+        squared = w * w
+    elif onset_l <= onset_f:
+        squared = contact_leader_first(gap - w * both_coast, v_l, a_l, v_f, a_f, onset_f - onset_l)
+    else:
+        lead = onset_l - onset_f
+        gap = gap - w * both_coast
+        squared = contact_before_leader_brakes(gap, w, a_f, lead)
+        if squared < 0.0:
+            squared = 0.0
+            if v_f > a_f * lead:
+                gap = max(gap - (w - 0.5 * a_f * lead) * lead, 0.0)
+                squared = contact_leader_first(gap, v_l, a_l, v_f - a_f * lead, a_f, 0.0)
+    return squared if squared > TOUCH_SQUARED else 0.0
+
+
+@compiled
+def least_behind_braking(gap: float, v_l: float, a_l: float, v_f: float, tau: float) -> float:
+    """Return the smallest deceleration of the follower that avoids the leader; inf if none does. [m/s2]
+
+    The case of ``least_to_spare_front`` in which the leader brakes first.
+
+    Args:
+        gap: gap at the start, m.
+        v_l: speed of the leader (front vehicle) at the start, m/s.
+        a_l: its deceleration, held from the start to standstill, m/s2, > 0.
+        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        tau: time until which the follower coasts, s, >= 0.
+
+    """
+    coasting = contact_while_coasting(gap, v_l, a_l, v_f, tau)
+    if coasting > TOUCH_SQUARED:
+        return math.inf
+    if v_f == 0.0 or coasting >= 0.0:
+        return 0.0
+    room = gap + stopping_distance(v_l, a_l) - v_f * tau
+    if not room > 0.0:
+        return math.inf
+    to_stop = v_f * v_f / (2.0 * room)
+    if tau + v_f / to_stop >= stopping_time(v_l, a_l):
+        return to_stop
+    w_t = v_f - v_l + a_l * tau
+    g_t = gap - (v_f - v_l) * tau - 0.5 * a_l * tau * tau
+    return a_l + w_t * w_t / (2.0 * g_t)
+
+
+@compiled
+def least_behind_coasting(gap: float, v_l: float, a_l: float, v_f: float, lead: float) -> float:
+    """Return the smallest deceleration of the follower that avoids the leader; inf if none does. [m/s2]
+
+    The case of ``least_to_spare_front`` in which the follower brakes first, from the start.
+
+    Args:
+        gap: gap at the start, m.
+        v_l: speed of the leader (front vehicle) at the start, m/s.
+        a_l: its deceleration, held from ``lead`` to standstill, m/s2, > 0.
+        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        lead: time until which the leader coasts, s, > 0.
+
+    """
+    if v_f == 0.0:
+        return 0.0
+    w = v_f - v_l
+    graze = 0.0
+    if w > 0.0 and 2.0 * gap <= w * lead:
+        graze = w * w / (2.0 * gap)
+    to_stop = v_f * v_f / (2.0 * (gap + v_l * lead + stopping_distance(v_l, a_l)))
+    if v_f / to_stop >= lead + stopping_time(v_l, a_l):
+        return max(graze, to_stop)
+    if graze > 0.0:
+        return graze
+    return (w * w + 2.0 * a_l * (gap - w * lead)) / (2.0 * gap - a_l * lead * lead)
+
+
+@compiled
+def least_to_spare_front(gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, onset_f: float) -> float:
+    """Return the smallest constant deceleration of the follower that avoids the leader; inf if none does. [m/s2]
+
+    At any time the follower's position decreases with its deceleration, so every larger deceleration avoids the leader
+    too. The limit is either the stopping distance or, if the follower would stop first, a grazing contact of two moving
+    vehicles.
+
+    Args:
+        gap: gap at the start, m.
+        v_l: speed of the leader (front vehicle) at the start, m/s.
+        a_l: its deceleration, held from ``onset_l`` to standstill, m/s2, > 0.
+        onset_l: time until which it coasts, s.
+        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        onset_f: time until which it coasts, s.
+
+    """
+    w = v_f - v_l
+    both_coast = min(onset_l, onset_f)
+    if w > 0.0 and gap <= w * both_coast:
+        return math.inf
+    gap = gap - w * both_coast
+    if onset_l <= onset_f:
+        return least_behind_braking(gap, v_l, a_l, v_f, onset_f - onset_l)
+    return least_behind_coasting(gap, v_l, a_l, v_f, onset_l - onset_f)
+
+
+@compiled
+def most_ahead_of_coasting(gap: float, v_l: float, v_f: float, a_f: float, tau: float) -> float:
+    """Return the largest deceleration of the leader that avoids the follower; inf: all do, -inf: none does. [m/s2]
+
+    The case of ``most_to_spare_rear`` in which the leader brakes first, from the start.
+
+    Args:
+        gap: gap at the start, m.
+        v_l: speed of the leader (front vehicle) at the start, m/s.
+        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        a_f: its deceleration, held from ``tau`` to standstill, m/s2, > 0.
+        tau: time until which the follower coasts, s, >= 0.
+
+    """
+    reach = v_f * tau + stopping_distance(v_f, a_f)
+    touching = gap == 0.0 and v_f == v_l  # pressed together from the start: no impact
+    if reach <= gap or touching:
+        return math.inf
+    if v_l == 0.0:
+        return -math.inf
+    to_stop = v_l * v_l / (2.0 * (reach - gap))
+    if tau + stopping_time(v_f, a_f) >= v_l / to_stop:
+        return to_stop
+    w = v_f - v_l
+    graze = (2.0 * a_f * (gap - w * tau) - w * w) / (a_f * tau * tau + 2.0 * gap)
+    return graze if graze >= 0.0 else -math.inf
+
+
+@compiled
+def most_to_spare_rear(gap: float, v_l: float, onset_l: float, v_f: float, a_f: float, onset_f: float) -> float:
+    """Return the leader's largest constant deceleration that avoids the follower; inf: all do, -inf: none does. [m/s2]
+
+    At any time the leader's position decreases with its deceleration, so every smaller deceleration avoids the follower
+    too. A follower that brakes first is advanced to the leader's onset, because until then nothing depends on the
+    leader's deceleration.
+
+    Args:
+        gap: gap at the start, m.
+        v_l: speed of the leader (front vehicle) at the start, m/s.
+        onset_l: time until which it coasts, s.
+        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        a_f: its deceleration, held from ``onset_f`` to standstill, m/s2, > 0.
+        onset_f: time until which it coasts, s.
+
+    """
+    w = v_f - v_l
+    both_coast = min(onset_l, onset_f)
+    if w > 0.0 and gap <= w * both_coast:
+        return -math.inf
+    gap = gap - w * both_coast
+    if onset_l <= onset_f:
+        return most_ahead_of_coasting(gap, v_l, v_f, a_f, onset_f - onset_l)
+    lead = onset_l - onset_f
+    if contact_before_leader_brakes(gap, w, a_f, lead) >= 0.0:
+        return -math.inf
+    if v_f <= a_f * lead:
+        return math.inf
+    gap = max(gap - (w - 0.5 * a_f * lead) * lead, 0.0)
+    return most_ahead_of_coasting(gap, v_l, v_f - a_f * lead, a_f, 0.0)

@@ -1,0 +1,236 @@
+"""E-V2X-BM coupled: the best constant deceleration of one vehicle in the engine's own physics.
+
+The closed form of ``pairwise`` treats the pairs as independent. Here every candidate is simulated to the horizon with
+velocity exchange, second impacts and resting contact, so the predicted harm is the harm that occurs. Of the three
+baselines only this one may bound a shield. docs/baselines.md says how close the search comes to the true minimum.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.e_v2x_bm.constants import make_line
+from ethbrake_marl.agents.e_v2x_bm.pairwise import CANDIDATES, closed_form, find_breakpoints, onset_s, optimise_pairwise
+from ethbrake_marl.agents.e_v2x_bm.search import make_room, search_line
+from ethbrake_marl.agents.protocol import Agent, Source, fixed_commands
+from ethbrake_marl.agents.registry import variants_of
+from ethbrake_marl.agents.settings import AgentSettings
+from ethbrake_marl.engine.memory import Memory, is_state_free
+from ethbrake_marl.engine.scripts import Script
+from ethbrake_marl.errors import InvalidInput, renumbered
+from ethbrake_marl.game.harm import HarmCount, check_harm_count
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.jit import by_parts, compiled
+from ethbrake_marl.physics.rows import FLAG
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+
+_MANY = 200  # smallest number of worlds for which a search is cached and uses several threads
+
+_REMEMBERED = 32  # cached searches; a shield around another agent repeats the baseline's search
+
+_FOUND: dict[bytes, Floats] = {}  # SHA-256 of a search's arguments -> its result
+
+
+class CoupledOptimum(NamedTuple):
+    """The best constant deceleration of one vehicle found in each of n worlds."""
+
+    deceleration_mps2: Floats  # [n] best deceleration a*, in [0, braking capacity]
+    harm: Floats  # [n] the harm that was minimised, with a*: one of the two below (m2/s2)
+    first_impact_harm: Floats  # [n] harm of each pair's first impact, with a* (m2/s2)
+    total_harm: Floats  # [n] harm of all impacts, with a* (m2/s2)
+
+
+def optimise_coupled(
+    worlds: Worlds,
+    vehicle: int,
+    *,
+    harm_count: HarmCount = "first",
+    horizon_s: float = 8.0,
+    others_mps2: Floats | None = None,
+) -> CoupledOptimum:
+    """Return the constant deceleration of ``vehicle`` with the least simulated harm until ``horizon_s``.
+
+    If the closed form (``optimise_pairwise``) finds decelerations that avoid both neighbours, and the middle one is
+    harmless in the simulation, it is taken. Otherwise an even grid of decelerations, and those at which the closed
+    form's harm has a kink, are simulated. The harm may jump where the number of impacts changes; these places and the
+    best local minima are located to 1e-9 m/s2. At a jump the result lies on the side of less harm. Among equals the
+    other harm decides, then the middle one is taken. The result of a world does not depend on its batch.
+
+    Args:
+        worlds: n worlds of N vehicles.
+        vehicle: index of the controlled vehicle, from 0.
+        harm_count: impacts whose harm is minimised: ``first`` (each pair's first) or ``total`` (all).
+        horizon_s: end of the simulations, s.
+        others_mps2: constant commands of the other vehicles, [n, N] m/s2; the controlled vehicle's column is ignored.
+            None: all brake fully.
+
+    Raises ``InvalidInput`` for an unknown ``vehicle`` or ``harm_count`` or commands beyond capacity; ``PhysicsError``
+    with the worlds in which some candidate could not be simulated.
+
+    """
+    check_harm_count(harm_count)
+    capacity = worlds.vehicles.braking_capacity_mps2
+    command = -capacity if others_mps2 is None else np.array(others_mps2, dtype=np.float64)
+    # The closed form assumes that the others brake with full capacity, so their capacity is set to their command. The
+    # closed form cannot represent a vehicle that coasts or drives; it keeps its capacity.
+    braking = np.where(command < 0.0, -command, capacity)
+    braking[:, vehicle] = capacity[:, vehicle]
+    told = replace(worlds, vehicles=replace(worlds.vehicles, braking_capacity_mps2=braking))
+    best = closed_form(told, vehicle).deceleration_mps2  # only a first guess if brakes build up
+    command[:, vehicle] = -best
+    _, impacts = advance(worlds, command, until_s=horizon_s)
+    first = impacts.first_impact_harm.sum(axis=1) + impacts.obstacle_first_harm
+    total = impacts.total_harm.sum(axis=1) + impacts.obstacle_total_harm
+    hit = np.flatnonzero(total > 0.0)
+    if hit.size:
+        found = _minimise(worlds, told, command, vehicle, hit, harm_count, horizon_s)
+        harms = (first, total) if harm_count == "first" else (total, first)
+        for column, values in zip((best, *harms), found, strict=True):
+            column[hit] = values
+    return CoupledOptimum(best, first if harm_count == "first" else total, first, total)
+
+
+def _minimise(
+    worlds: Worlds, told: Worlds, command: Floats, vehicle: int, rows: Ints, harm_count: HarmCount, horizon_s: float
+) -> Floats:
+    """Search the best deceleration in some worlds; return it, its harm and its harm under the other count, [3, m].
+
+    Args:
+        worlds: n worlds.
+        told: the same worlds for the closed form, with the capacities of other vehicles set to their braking commands.
+        command: commands of all vehicles, [n, N] m/s2; the controlled vehicle's is ignored.
+        vehicle: index of the controlled vehicle, from 0.
+        rows: [m] indices of the worlds to search.
+        harm_count: impacts whose harm is minimised.
+        horizon_s: end of the simulations, s.
+
+    """
+    v = worlds.vehicles
+    lines = (
+        worlds.gaps_m, worlds.speeds_mps, worlds.time_s, worlds.pair_hit, worlds.obstacle_gap_m, worlds.obstacle_hit,
+        command, told.vehicles.braking_capacity_mps2, onset_s(worlds, vehicle), v.latency_s, v.mass_t,
+        v.speed_limit_mps, worlds.command_mps2, v.brake_rate_mps3, v.release_rate_mps3, v.pieces, v.restitution,
+    )  # fmt: skip
+    question = hashlib.sha256(repr((vehicle, harm_count, horizon_s, worlds.speeds_mps.shape)).encode())
+    for column in (rows, *lines):
+        question.update(np.ascontiguousarray(column).tobytes())
+    key = question.digest()
+    if key in _FOUND:
+        return _FOUND[key].copy()
+
+    def search(part: slice) -> tuple[Floats, Ints]:
+        some = rows[part]
+        found, status = np.empty((3, some.size)), np.empty(some.size, np.int64)
+        _search_worlds(*lines, vehicle, some, harm_count == "total", horizon_s, found, status)
+        return found, status
+
+    parts = by_parts(search, rows.size, (os.cpu_count() or 1) if rows.size >= _MANY else 1)
+    found, status = (np.concatenate(each, axis=-1) for each in zip(*parts, strict=True))
+    if (status != FLAG.DONE).any():
+        with renumbered(rows):
+            raise FLAG.failure(status, worlds.time_s[rows], np.full(rows.size, horizon_s))
+    if rows.size >= _MANY:
+        _FOUND[key] = found.copy()
+        for old in list(_FOUND)[:-_REMEMBERED]:
+            _FOUND.pop(old, None)
+    return found
+
+
+@compiled
+def _search_worlds(
+    gaps: Floats, speeds: Floats, time: Floats, hit: Bools, obstacle: Floats, obstacle_hit: Bools, command: Floats,
+    capacity: Floats, onset: Floats, latency: Floats, mass: Floats, limit: Floats, in_force: Floats, brake_rate: Floats,
+    release_rate: Floats, pieces: Floats, restitution: Floats, vehicle: int, rows: Ints, total: bool, horizon: float,
+    found: Floats, status: Ints,
+) -> None:  # fmt: skip
+    """Search the best deceleration of ``vehicle`` (index) in the worlds with the indices ``rows`` [m].
+
+    Writes the deceleration, its harm and its harm under the other count to ``found`` [3, m], and the status of the
+    physics (``FLAG.DONE`` if sound) to ``status`` [m]. ``capacity`` and ``onset`` [n, N] are braking capacities (m/s2)
+    and times until a vehicle may brake (s). The other arguments are those of ``make_line``, for n worlds along a new
+    first axis.
+    """
+    room, at, best = make_room(), np.empty(CANDIDATES), np.empty(3)
+    for m in range(rows.shape[0]):
+        k = rows[m]
+        line = make_line(
+            gaps[k], speeds[k], hit[k], obstacle[k], obstacle_hit[k], command[k], latency[k], mass[k], limit[k],
+            in_force[k], brake_rate[k], release_rate[k], pieces[k], time[k], restitution[k], horizon, vehicle, total,
+        )  # fmt: skip
+        find_breakpoints(at, vehicle, gaps[k], speeds[k], capacity[k], onset[k])
+        status[m] = search_line(line, room, at, capacity[k, vehicle], best)
+        for c in range(3):
+            found[c, m] = best[c]
+
+
+Mode = Literal["coupled", "pairwise"]
+
+
+class EV2XBM:
+    """Agent that brakes with the constant deceleration of least harm.
+
+    Mode ``coupled`` minimises the harm in the engine's physics until ``horizon_s`` under ``harm_count``. It assumes
+    that the others follow their scripts, and that vehicles without a script (learners) brake fully. Mode ``pairwise``
+    is the paper's closed form: all others brake fully, and no velocities are exchanged. The memory holds
+    ``deceleration_mps2`` [n], which is a*, and ``predicted_harm`` [n] (m2/s2). Raises ``InvalidInput`` for an unknown
+    mode or count, and, when an episode begins in mode ``coupled``, for another vehicle's script whose command is not
+    fixed at the alert.
+    """
+
+    def __init__(self, mode: Mode = "coupled", *, harm_count: HarmCount = "first", horizon_s: float = 8.0) -> None:
+        if mode not in ("coupled", "pairwise"):
+            raise InvalidInput(f"e_v2x_bm mode {mode!r}: must be 'coupled' or 'pairwise'")
+        check_harm_count(harm_count)
+        self.name = "e_v2x_bm" if mode == "coupled" else "e_v2x_bm:pairwise"
+        self.knows = Source.MODEL if mode == "coupled" else Source.STATE
+        self._mode, self._harm_count, self._horizon_s = mode, harm_count, horizon_s
+
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        """Choose each world's best deceleration a* at the alert and return it in the memory.
+
+        Args:
+            alert: n worlds at the alert.
+            vehicle: index of the controlled vehicle (0 = front).
+            scripts: index of each scripted vehicle -> its script.
+
+        """
+        if self._mode == "pairwise":
+            closed = optimise_pairwise(alert, vehicle)
+            return {"deceleration_mps2": closed.deceleration_mps2, "predicted_harm": closed.harm}
+
+        def is_fixed(script: Script) -> bool:
+            """Return whether the script's command is fixed at the alert without knowing the choice of ``vehicle``."""
+            chooses_first = isinstance(script, EV2XBM) and (script._mode == "pairwise" or vehicle not in scripts)
+            return is_state_free(script) or chooses_first
+
+        others = fixed_commands(
+            scripts, alert, f"agent {self.name!r}", vehicle=vehicle, is_fixed=is_fixed,
+            advice=f" before vehicle_{vehicle + 1} chooses; take e_v2x_bm:pairwise, which needs nobody's command, for"
+            " one of the two",
+        )  # fmt: skip
+        coupled = optimise_coupled(
+            alert, vehicle, harm_count=self._harm_count, horizon_s=self._horizon_s, others_mps2=others
+        )
+        return {"deceleration_mps2": coupled.deceleration_mps2, "predicted_harm": coupled.harm}
+
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        """Return the command ``-a*`` chosen at the alert, [n] m/s2, and the unchanged memory."""
+        return -memory["deceleration_mps2"], memory
+
+
+def make_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
+    """Make E-V2X-BM with the horizon and harm count of ``settings``.
+
+    ``argument`` is ``pairwise``, ``coupled`` or None, which means ``coupled``.
+    """
+    if argument not in (None, "coupled", "pairwise"):
+        then = "".join(f", then {variant!r}" for variant in variants_of("e_v2x_bm"))
+        raise InvalidInput(f"agent {settings.spec!r}: the argument must be 'coupled' or 'pairwise'{then}")
+    mode: Mode = "pairwise" if argument == "pairwise" else "coupled"
+    return EV2XBM(mode, harm_count=settings.harm_count, horizon_s=settings.horizon_s)

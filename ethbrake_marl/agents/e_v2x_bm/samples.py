@@ -1,0 +1,161 @@
+"""Samples of one world's harm at several decelerations, compiled: sort, merge, bound in between, select.
+
+A world has about 560 samples, in increasing order of the deceleration.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Floats, Ints
+
+STEEPER = 2.0  # assumed factor by which harm may fall faster between samples than next to them
+
+NARROWEST_MPS2 = 1e-9  # decelerations closer than this count as equal
+
+TIE = 1e-9  # harms (m2/s2) closer than this count as equal
+
+
+class Samples(NamedTuple):
+    """Decelerations of one vehicle in one world and the harm that a simulation gave for each."""
+
+    at: Floats  # [k] decelerations (m/s2)
+    harm: Floats  # [k] the harm that is minimised, first-impact or total (m2/s2)
+    other: Floats  # [k] the other harm, which decides ties (m2/s2)
+    course: Floats  # [k] code of how many impacts each pair had; the harm may jump where it changes
+
+
+@compiled
+def make_samples(most: int) -> Samples:
+    """Return uninitialised space for ``most`` samples."""
+    return Samples(np.empty(most), np.empty(most), np.empty(most), np.empty(most))
+
+
+@compiled(bare=True)
+def copy_sample(one: Samples, k: int, other: Samples, to: int) -> None:
+    """Write sample number ``k`` of ``one`` to place ``to`` of ``other``."""
+    other.at[to] = one.at[k]
+    other.harm[to] = one.harm[k]
+    other.other[to] = one.other[k]
+    other.course[to] = one.course[k]
+
+
+@compiled(bare=True)
+def merge(one: Samples, n: int, other: Samples, m: int, into: Samples) -> None:
+    """Merge two lists sorted by deceleration into one: the first ``n`` of ``one``, the first ``m`` of ``other``.
+
+    The result is written to the first ``n + m`` places of ``into``.
+    """
+    i, j = 0, 0
+    for to in range(n + m):
+        if j == m or (i < n and one.at[i] <= other.at[j]):
+            copy_sample(one, i, into, to)
+            i += 1
+        else:
+            copy_sample(other, j, into, to)
+            j += 1
+
+
+@compiled(bare=True)
+def put_in_order(samples: Samples, n: int) -> None:
+    """Sort the first ``n`` samples in place by deceleration; fast if they are few or nearly sorted."""
+    for k in range(1, n):
+        at, harm, other, course = samples.at[k], samples.harm[k], samples.other[k], samples.course[k]
+        to = k
+        while to > 0 and samples.at[to - 1] > at:
+            copy_sample(samples, to - 1, samples, to)
+            to -= 1
+        samples.at[to], samples.harm[to], samples.other[to], samples.course[to] = at, harm, other, course
+
+
+@compiled(bare=True)
+def bound_cells(samples: Samples, n: int, bounds: Floats) -> None:
+    """Write an estimate of the least harm between each two neighbouring samples to ``bounds`` [n - 1], m2/s2.
+
+    The first ``n`` samples are used; they must be sorted by deceleration. If the harm falls towards an interval, from
+    the sample before it or from the sample after it, it is assumed to go on falling inside, ``STEEPER`` times as steep.
+    """
+    before, slope = 0.0, _slope(samples, 0)
+    for k in range(n - 1):
+        after = _slope(samples, k + 1) if k < n - 2 else 0.0
+        reach = STEEPER * (samples.at[k + 1] - samples.at[k])
+        from_left = samples.harm[k] + reach * min(before, 0.0)
+        from_right = samples.harm[k + 1] - reach * max(after, 0.0)
+        bounds[k] = min(from_left, from_right)
+        before, slope = slope, after
+
+
+@compiled(bare=True)
+def _slope(samples: Samples, k: int) -> float:
+    """Return the slope of the harm between samples ``k`` and ``k + 1``, m2/s2 per m/s2."""
+    width = samples.at[k + 1] - samples.at[k]
+    return float((samples.harm[k + 1] - samples.harm[k]) / max(width, NARROWEST_MPS2))
+
+
+@compiled(bare=True)
+def least_harm(samples: Samples, n: int) -> float:
+    """Return the smallest harm among the first ``n`` samples, m2/s2."""
+    least = math.inf
+    for k in range(n):
+        least = min(least, samples.harm[k])
+    return least
+
+
+@compiled(bare=True)
+def find_smallest(values: Floats, n: int, places: Ints) -> None:
+    """Write the indices of the smallest of the first ``n`` values to ``places``, in increasing order of value.
+
+    As many as ``places`` is long, which must be at most ``n``. Equal values keep their order.
+    """
+    found = 0
+    for k in range(n):
+        if found == places.shape[0] and not values[k] < values[places[found - 1]]:
+            continue
+        to = found if found < places.shape[0] else found - 1
+        while to > 0 and values[places[to - 1]] > values[k]:
+            places[to] = places[to - 1]
+            to -= 1
+        places[to] = k
+        found = min(found + 1, places.shape[0])
+
+
+@compiled(bare=True)
+def find_minima(samples: Samples, n: int, depth: Floats, places: Ints) -> None:
+    """Write the indices of the lowest local minima of the first ``n`` samples to ``places``, lowest harm first.
+
+    ``depth`` [n or more] is filled with the harm at a local minimum, infinity elsewhere. If there are fewer minima than
+    places, the remaining places get the first other samples.
+    """
+    for k in range(n):
+        falls = k == 0 or samples.harm[k] < samples.harm[k - 1]
+        rises = k == n - 1 or samples.harm[k] <= samples.harm[k + 1]
+        depth[k] = samples.harm[k] if falls and rises else math.inf
+    find_smallest(depth, n, places)
+
+
+@compiled(bare=True)
+def choose(samples: Samples, n: int, room: Floats) -> float:
+    """Return the deceleration of least harm among the first ``n`` samples, m/s2.
+
+    Among equals, the least ``other`` harm decides, then the middle one of the rest is taken. ``room`` [n or more] is a
+    workspace, overwritten. Sorted samples make it faster.
+    """
+    least, rest = least_harm(samples, n) + TIE, math.inf
+    for k in range(n):
+        if samples.harm[k] <= least:
+            rest = min(rest, samples.other[k])
+    rest += TIE
+    good = 0
+    for k in range(n):
+        if samples.harm[k] <= least and samples.other[k] <= rest:
+            to = good
+            while to > 0 and room[to - 1] > samples.at[k]:
+                room[to] = room[to - 1]
+                to -= 1
+            room[to] = samples.at[k]
+            good += 1
+    return float(room[(good - 1) // 2])

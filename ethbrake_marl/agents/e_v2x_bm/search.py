@@ -1,0 +1,319 @@
+"""The coupled search in one world, compiled: even grid, finer grid, borders, local minima, one safety step.
+
+``coupled`` says what is searched for; docs/baselines.md gives the reasons for these steps.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, cast
+
+import numpy as np
+
+from ethbrake_marl.agents.e_v2x_bm.constants import Line, share_start, simulate
+from ethbrake_marl.agents.e_v2x_bm.pairwise import CANDIDATES
+from ethbrake_marl.agents.e_v2x_bm.samples import (
+    NARROWEST_MPS2,
+    Samples,
+    bound_cells,
+    choose,
+    copy_sample,
+    find_minima,
+    find_smallest,
+    least_harm,
+    make_samples,
+    merge,
+    put_in_order,
+)
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.rows import FLAG
+from ethbrake_marl.physics.state import Floats, Ints
+
+GRID = 161  # first step: number of evenly spaced decelerations from 0 to the capacity
+
+CELLS = 24  # largest number of grid cells (intervals between two neighbours of the grid) that are refined
+
+INSIDE = 16  # samples inside a refined cell
+
+BORDERS = 6  # largest number of borders (decelerations at which the number of impacts changes) that are located
+
+MINIMA = 6  # number of local minima that are refined
+
+_JUMP = 1e-6  # change of harm (m2/s2) within 1e-9 m/s2 that only a jump explains
+
+_LOOKED = GRID + CANDIDATES + CELLS * INSIDE
+
+_NARROWED = _LOOKED + 2 * BORDERS
+
+_MOST = _NARROWED + MINIMA
+
+_FEW = 6
+
+# Loop bounds, not as literals: numba would compile all physics again for each literal.
+_ZERO, _ONE, _FIVE, _GRID_END, _CANDIDATES_END = (cast(int, np.int64(k)) for k in (0, 1, 5, GRID, CANDIDATES))
+
+_SHARES = np.linspace(0.0, 1.0, GRID)
+
+_SHARES_INSIDE = np.arange(1, INSIDE + 1) / (INSIDE + 1)
+
+_FIFTHS = np.arange(1, 5) / 5  # new samples between the two sides of a border
+
+
+class Room(NamedTuple):
+    """Workspace of a search, reused for every world of a batch.
+
+    A *cell* is the interval between two neighbouring decelerations of the grid. A *border* is a deceleration at which
+    the number of impacts changes.
+    """
+
+    one: Samples  # the grid; later all samples so far
+    two: Samples  # all samples so far; at the end with borders and minima
+    new: Samples  # the samples that a step adds
+    few: Samples  # a handful of samples around one place
+    values: Floats  # one number per sample: bounds or depths
+    cells: Ints  # [CELLS] index of the sample at the left end of each refined cell
+    borders: Ints  # [BORDERS] index of the sample before each border
+    minima: Ints  # [MINIMA] index of each local minimum among the samples
+
+
+@compiled
+def make_room() -> Room:
+    """Return uninitialised workspace for searches."""
+    return Room(
+        make_samples(_MOST), make_samples(_MOST), make_samples(_MOST), make_samples(_FEW), np.empty(_MOST),
+        np.empty(CELLS, np.int64), np.empty(BORDERS, np.int64), np.empty(MINIMA, np.int64),
+    )  # fmt: skip
+
+
+@compiled(apart=True, bare=True)
+def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, out: Floats) -> int:
+    """Find the best constant deceleration of a line's controlled vehicle.
+
+    Args:
+        line: the world, from ``make_line``.
+        room: workspace, overwritten.
+        breakpoints: [CANDIDATES] decelerations that are simulated in addition to an even grid, m/s2.
+        capacity: braking capacity of the vehicle, m/s2.
+        out: [3] receives the deceleration (m/s2), its harm, and its harm under the other count (m2/s2).
+
+    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+
+    """
+    status = share_start(line)
+    if status == FLAG.DONE:
+        status = look_evenly(line, room, breakpoints, capacity)
+    if status == FLAG.DONE:
+        status = look_inside(line, room)
+    if status == FLAG.DONE:
+        status = locate_borders(line, room)
+    if status == FLAG.DONE:
+        status = narrow_minima(line, room)
+    if status == FLAG.DONE:
+        status = step_back(line, room.few, choose(room.two, _MOST, room.values), capacity, out)
+    return status
+
+
+@compiled(apart=True, bare=True)
+def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) -> int:
+    """Step 1: simulate an even grid of decelerations and the ``breakpoints`` [CANDIDATES] (m/s2) in the world ``line``.
+
+    The grid is left in ``room.one``, grid and breakpoints sorted in ``room.two``. ``capacity`` is the largest
+    deceleration, m/s2. Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    """
+    grid, new = room.one, room.few
+    for k in range(GRID):
+        grid.at[k] = capacity * _SHARES[k]
+    for k in range(CANDIDATES):
+        new.at[k] = breakpoints[k]
+    put_in_order(new, CANDIDATES)
+    status = simulate(line, grid, _ZERO, _GRID_END, math.inf)
+    if status == FLAG.DONE:
+        status = simulate(line, new, _ZERO, _CANDIDATES_END, math.inf)
+    merge(grid, GRID, new, CANDIDATES, room.two)
+    return status
+
+
+@compiled(apart=True, bare=True)
+def look_inside(line: Line, room: Room) -> int:
+    """Step 2: simulate more decelerations in the intervals of the grid that may contain the least harm.
+
+    These are intervals in which the number of impacts changes, or whose estimated harm is below every sample so far.
+    Leaves ``_LOOKED`` samples in ``room.one``; if there are fewer, the last one is repeated. Returns a status:
+    ``FLAG.DONE``, or the code of the check of the physics that failed.
+    """
+    grid, looked, new, cells, bounds = room.one, room.two, room.new, room.cells, room.values
+    best = least_harm(looked, GRID + CANDIDATES)
+    bound_cells(grid, GRID, bounds)
+    for k in range(GRID - 1):
+        if not (bounds[k] < best or grid.course[k] != grid.course[k + 1]):
+            bounds[k] = math.inf
+    find_smallest(bounds, GRID - 1, cells)
+    found = 0
+    while found < CELLS and bounds[cells[found]] < math.inf:
+        found += 1
+    _put_in_order(cells, found)
+    for c in range(found):
+        low = grid.at[cells[c]]
+        width = grid.at[cells[c] + 1] - low
+        for k in range(INSIDE):
+            new.at[INSIDE * c + k] = low + width * _SHARES_INSIDE[k]
+    status = simulate(line, new, _ZERO, INSIDE * found, math.inf)
+    number = GRID + CANDIDATES + INSIDE * found
+    merge(looked, GRID + CANDIDATES, new, INSIDE * found, grid)
+    for k in range(number, _LOOKED):
+        copy_sample(grid, number - 1, grid, k)
+    return status
+
+
+@compiled(bare=True)
+def _put_in_order(places: Ints, n: int) -> None:
+    """Sort the first ``n`` entries of ``places`` in place."""
+    for k in range(1, n):
+        place, to = places[k], k
+        while to > 0 and places[to - 1] > place:
+            places[to] = places[to - 1]
+            to -= 1
+        places[to] = place
+
+
+@compiled(apart=True, bare=True)
+def locate_borders(line: Line, room: Room) -> int:
+    """Step 3: locate the decelerations at which the number of impacts changes, if less harm may be found there.
+
+    Between two such borders the harm is smooth, so harm that falls towards a border is least there. Each located border
+    ends up between two samples 1e-9 m/s2 apart. Leaves all samples in ``room.two``. Returns a status: ``FLAG.DONE``, or
+    the code of the check of the physics that failed.
+    """
+    looked, new, few, places, bounds = room.one, room.new, room.few, room.borders, room.values
+    best = least_harm(looked, _LOOKED)
+    bound_cells(looked, _LOOKED, bounds)
+    for k in range(_LOOKED - 1):
+        if not (bounds[k] < best and looked.course[k] != looked.course[k + 1]):
+            bounds[k] = math.inf
+    find_smallest(bounds, _LOOKED - 1, places)
+    for b in range(BORDERS):
+        copy_sample(looked, places[b], few, 0)
+        copy_sample(looked, places[b] + 1, few, 5)
+        if bounds[places[b]] < math.inf:
+            status = _cut(line, few)
+            if status != FLAG.DONE:
+                return status
+        copy_sample(few, 0, new, 2 * b)
+        copy_sample(few, 5, new, 2 * b + 1)
+    put_in_order(new, 2 * BORDERS)
+    merge(looked, _LOOKED, new, 2 * BORDERS, room.two)
+    return FLAG.DONE
+
+
+@compiled(bare=True)
+def _cut(line: Line, few: Samples) -> int:
+    """Bring samples 0 and 5 of ``few``, on the two sides of a border, to a distance of 1e-9 m/s2.
+
+    A border is a deceleration at which the number of impacts changes. Each round divides the distance by five. Returns
+    a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    """
+    while few.at[5] - few.at[0] > NARROWEST_MPS2:
+        low, width = few.at[0], few.at[5] - few.at[0]
+        for k in range(4):
+            few.at[1 + k] = low + width * _FIFTHS[k]
+        status = simulate(line, few, _ONE, _FIVE, math.inf)
+        if status != FLAG.DONE:
+            return status
+        border, least = 0, math.inf
+        for k in range(5):
+            lower = min(few.harm[k], few.harm[k + 1])
+            if few.course[k] != few.course[k + 1] and lower < least:
+                border, least = k, lower
+        copy_sample(few, border + 1, few, 5)  # copy this one first: sample 1 may move to 0
+        copy_sample(few, border, few, 0)
+    return FLAG.DONE
+
+
+@compiled(apart=True, bare=True)
+def narrow_minima(line: Line, room: Room) -> int:
+    """Step 4: locate the lowest local minima of the harm to 1e-9 m/s2, and append them to ``room.two``.
+
+    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    """
+    found, minima, last = room.two, room.minima, _NARROWED - 1
+    find_minima(found, _NARROWED, room.values, minima)
+    for m in range(MINIMA):
+        middle, to = minima[m], _NARROWED + m
+        copy_sample(found, middle, found, to)
+        if room.values[middle] < math.inf:
+            low, high = found.at[max(middle - 1, 0)], found.at[min(middle + 1, last)]
+            status = _narrow(line, room.few, low, high, found, to)
+            if status != FLAG.DONE:
+                return status
+    return FLAG.DONE
+
+
+@compiled(bare=True)
+def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, to: int) -> int:
+    """Narrow an interval around a local minimum of the harm to 1e-9 m/s2; return a status.
+
+    Both sides are divided in three in each round. If no new sample is lower, the middle stays.
+
+    Args:
+        line: the world.
+        few: workspace.
+        low: lower end of the interval, m/s2.
+        high: upper end, m/s2.
+        found: samples; number ``to`` is the minimum inside the interval, and is replaced by better ones.
+        to: index of this sample.
+
+    """
+    while high - low > NARROWEST_MPS2:
+        middle = found.at[to]
+        left, right = (middle - low) / 3, (high - middle) / 3
+        few.at[0], few.at[1], few.at[2], few.at[3] = low + left, middle - left, middle + right, high - right
+        first, end = 0 if left > 0.0 else 2, 4 if right > 0.0 else 2  # the middle itself is known
+        status = simulate(line, few, first, end, found.harm[to])
+        if status != FLAG.DONE:
+            return status
+        pick, least = -1, found.harm[to]
+        for k in range(first, end):
+            if few.harm[k] < least:
+                pick, least = k, few.harm[k]
+        if pick < 0:
+            low, high = few.at[1], few.at[2]
+            continue
+        low, high = (
+            low if pick == 0 else few.at[0] if pick == 1 else middle if pick == 2 else few.at[2],
+            few.at[1] if pick == 0 else middle if pick == 1 else few.at[3] if pick == 2 else high,
+        )
+        copy_sample(few, pick, found, to)
+    return FLAG.DONE
+
+
+@compiled(apart=True, bare=True)
+def step_back(line: Line, around: Samples, best: float, capacity: float, out: Floats) -> int:
+    """Step 5: if ``best`` (m/s2) lies within 1e-9 m/s2 of a jump of the harm, move it to the lower side.
+
+    An engine advances the same motion step by step, which changes its last bits. Directly at a jump these bits would
+    decide on which side the harm is.
+
+    Args:
+        line: the world.
+        around: workspace.
+        best: best deceleration found, m/s2.
+        capacity: braking capacity of the vehicle, m/s2.
+        out: [3] receives the deceleration, its harm, and its harm under the other count.
+
+    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+
+    """
+    for k in range(5):
+        around.at[k] = min(max(best + NARROWEST_MPS2 * (k - 2.0), 0.0), capacity)
+    status = simulate(line, around, _ZERO, _FIVE, math.inf)
+    pick, least, middle = 1, math.inf, 0.0
+    for k in range(3):
+        worst = max(max(around.harm[k], around.harm[k + 1]), around.harm[k + 2])
+        if worst < least:
+            pick, least = k, worst
+        if k == 1:
+            middle = worst
+    if middle - least < _JUMP:
+        pick = 1
+    out[0], out[1], out[2] = around.at[pick + 1], around.harm[pick + 1], around.other[pick + 1]
+    return status

@@ -1,0 +1,426 @@
+"""Policies of other libraries as agents; each becomes one function ``(observation, state) -> (action, state)``."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.agents.foreign_wrappers import normalisation, training_environment
+from ethbrake_marl.agents.protocol import Source
+from ethbrake_marl.engine.memory import Memory, checked_memory, map_memory, take_memory
+from ethbrake_marl.engine.scripts import Script
+from ethbrake_marl.errors import AgentFailed, InvalidInput, describe_error, naming_extras
+from ethbrake_marl.game.actions import LARGEST, action_to_command
+from ethbrake_marl.game.full_state import Appended, full_state, row_features
+from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec, choose_observation, observe
+from ethbrake_marl.game.observed import observation_for
+from ethbrake_marl.physics.state import Floats, Ints, Worlds
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+
+State = Any  # memory of a policy: arrays whose first axis is the world, or tuples, lists and mappings of such arrays
+
+Infer = Callable[[Observations, State], tuple[Any, State]]  # (observations [n, F], memory) -> (actions, new memory)
+
+Begin = Callable[[int], State]  # number of episodes -> memory at their start
+
+_KINDS = (
+    "a function of observations, an object with predict, a torch module, an ONNX session or the path of an .onnx file"
+)
+
+
+def adapt_policy(policy: Any, name: str, features: int, initial_state: Begin | None) -> tuple[Infer, Begin | None]:
+    """Return two functions for a policy: ``(observations, state) -> (actions, state)``, and ``n -> initial state``.
+
+    Args:
+        policy: a policy of one of the kinds that ``policy_agent`` accepts.
+        name: name of the agent in error messages.
+        features: number F of features in an observation.
+        initial_state: for a function or torch module with a memory: makes the memory of n episodes at their start.
+
+    The second result is None for a policy without a memory. Raises ``InvalidInput`` if ``policy`` is not a policy.
+
+    """
+    if isinstance(policy, str | os.PathLike):
+        policy = _open_onnx(Path(policy), name)
+    if not (hasattr(policy, "run") and hasattr(policy, "get_inputs")) and not hasattr(policy, "predict"):
+        if _is_torch_module(policy):
+            return _ask_torch(policy, name, initial_state is not None), initial_state
+        if callable(policy):
+            call = policy if initial_state else lambda seen, _: (_without_memory(policy(seen)), None)
+            return call, initial_state
+        raise InvalidInput(f"agent {name!r}: {policy!r:.80} is no policy; must be {_KINDS}")
+    if initial_state is not None:
+        raise InvalidInput(
+            f"agent {name!r}: initial_state is for a function (observation, state) -> (action, state); write one"
+            " around this model"
+        )
+    return (_ask_onnx(policy), None) if hasattr(policy, "run") else _ask_model(policy, name, features)
+
+
+def _without_memory(action: Any) -> Any:
+    if isinstance(action, tuple):
+        raise InvalidInput(
+            f"gave a tuple of {len(action)} in place of an action; a policy with a memory gives (action, state), and"
+            " needs initial_state"
+        )
+    return action
+
+
+def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | None]:
+    """Adapt a model with a method ``predict`` (Stable-Baselines3, sb3-contrib), as ``adapt_policy`` does.
+
+    A memory that it returns (recurrent models) is kept. Which axis of the memory counts the worlds is found by
+    predicting for two worlds and for three.
+
+    Args:
+        model: the model.
+        name: name of the agent in error messages.
+        features: number of features in an observation.
+
+    """
+
+    def predict(seen: Observations, **memory: Any) -> tuple[Any, State]:
+        statistics = normalisation(model)
+        given = seen if statistics is None else statistics.normalize_obs(seen)
+        found = model.predict(given, deterministic=True, **memory)
+        return found if isinstance(found, tuple) else (found, None)
+
+    def world_axis(two: Any, three: Any) -> int:
+        shapes = np.shape(two), np.shape(three)
+        found = [axis for axis, sizes in enumerate(zip(*shapes, strict=True)) if sizes == (2, 3)]
+        if len(found) != 1:
+            raise InvalidInput(f"its state has arrays of shape {shapes[0]} for two worlds and {shapes[1]} for three")
+        return found[0]
+
+    try:
+        like, of_three = (predict(np.zeros((n, features), np.float32))[1] for n in (2, 3))
+        axes = map_memory(world_axis, like, of_three)
+    except Exception as error:
+        raise InvalidInput(f"agent {name!r}: predict on {features} features: {describe_error(error)}") from error
+    if like is None:
+        return lambda seen, _: (predict(seen)[0], None), None
+
+    def infer(seen: Observations, state: State) -> tuple[Any, State]:
+        begins, memory = state
+        kept = None if begins.all() else map_memory(lambda array, axis: np.moveaxis(array, 0, axis), memory, axes)
+        action, memory = predict(seen, state=kept, episode_start=begins)
+        after = map_memory(lambda array, axis: np.moveaxis(to_array(array), axis, 0), memory, axes)
+        return action, (np.zeros(len(seen), np.bool_), after)
+
+    def begin(n: int) -> State:
+        shaped = map_memory(lambda array, axis: np.moveaxis(to_array(array), axis, 0), like, axes)
+        return np.ones(n, np.bool_), map_memory(lambda array: np.zeros((n, *array.shape[1:]), array.dtype), shaped)
+
+    return infer, begin
+
+
+def _ask_onnx(session: Any) -> Infer:
+    given, names = session.get_inputs()[0].name, [output.name for output in session.get_outputs()]
+    wanted = "action" if "action" in names else names[0]
+    return lambda seen, _: (session.run([wanted], {given: seen})[0], None)
+
+
+def _ask_torch(module: Any, name: str, with_state: bool) -> Infer:
+    torch = sys.modules["torch"]
+    for layer in module.modules():
+        if layer.training and isinstance(
+            layer, torch.nn.modules.dropout._DropoutNd | torch.nn.modules.batchnorm._NormBase
+        ):
+            raise InvalidInput(
+                f"agent {name!r}: {type(layer).__name__} is in training mode, where it draws, or mixes the worlds of a"
+                " batch; call eval() of the module first"
+            )
+
+    def call(seen: Observations, state: State) -> tuple[Any, State]:
+        parameter = next(iter(module.parameters()), None)
+        with torch.no_grad():
+            given = torch.from_numpy(np.array(seen)).to("cpu" if parameter is None else parameter.device)
+            return module(given, state) if with_state else (module(given), None)
+
+    return call
+
+
+def _is_torch_module(policy: Any) -> bool:
+    """Return whether ``policy`` is a torch module. Never imports torch: without torch in memory, nothing is one."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(policy, torch.nn.Module)
+
+
+def _open_onnx(path: Path, name: str) -> Any:
+    if path.suffix != ".onnx" or not path.is_file():
+        what = (
+            "there is no such file" if path.suffix == ".onnx" else f"a path must be that of an .onnx file, not {path}"
+        )
+        raise InvalidInput(f"agent {name!r}: policy {str(path)!r}: {what}")
+    with naming_extras():
+        import onnxruntime
+    return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+
+
+def weights_sha256(policy: Any) -> str | None:
+    """Return the SHA-256 of an .onnx file (given by its path), or of the present weights of a torch or SB3 model.
+
+    The statistics of a ``VecNormalize`` count as weights. Returns None for any other policy, whose weights cannot be
+    read.
+    """
+    if isinstance(policy, str | os.PathLike):
+        return hashlib.sha256(Path(policy).read_bytes()).hexdigest() if Path(policy).is_file() else None
+    module: Any = policy if _is_torch_module(policy) else getattr(policy, "policy", None)
+    if not _is_torch_module(module):
+        return None
+    arrays, statistics = dict(module.state_dict()), normalisation(policy)
+    if statistics is not None and statistics.norm_obs:
+        counted = statistics.obs_rms
+        arrays |= {"mean": counted.mean, "var": counted.var, "clip": statistics.clip_obs, "eps": statistics.epsilon}
+    digest = hashlib.sha256()
+    for name, tensor in arrays.items():
+        array = to_array(tensor)
+        digest.update(f"{name} {array.dtype} {array.shape}\n".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def to_array(value: Any) -> NDArray[Any]:
+    """Return an array, torch tensor or sequence as a NumPy array; masked entries become NaN."""
+    if isinstance(value, np.ma.MaskedArray):
+        return np.ma.filled(value.astype(np.float64), np.nan)
+    return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
+
+
+def policy_agent(
+    policy: Any,
+    *,
+    name: str | None = None,
+    scenario: Scenario | str | None = None,
+    observation: Observation | None = None,
+    initial_state: Callable[[int], State] | None = None,
+    clip: bool = False,
+    appended: Appended | None = None,
+    ignore_wrappers: bool = False,
+) -> PolicyAgent:
+    """Return an agent for a policy of any library: observations [n, F] float32 -> actions [n, 1] in [-1, 1].
+
+    A policy with a memory is a function ``(observation, state) -> (action, state)`` with an ``initial_state``, or a
+    model whose ``predict`` returns a state.
+
+    Args:
+        policy: a function; a model with ``predict`` (Stable-Baselines3: called deterministically, its state kept world
+            by world, its observations normalised by its ``VecNormalize``); a torch module (called without gradients);
+            an ONNX session; or the path of an ``.onnx`` file. Copies of the agent share it.
+        name: name in tables and messages; None: the name of the function or class.
+        scenario: scenario, or its name, whose learners' observation the policy takes.
+        observation: the observation instead, as for ``choose_observation``. None: the scenario's; without a scenario,
+            that of the policy itself, of a Stable-Baselines3 model's environment, or the default.
+        initial_state: makes the memory of ``n`` episodes at their start: an array whose first axis is the world, or
+            tuples and mappings of arrays. None: a function has no memory.
+        clip: clip actions to [-1, 1]; by default an action beyond is an error.
+        appended: what training appended to each observation: ``number`` (the learner's number) or ``state`` (the true
+            state of the line), as for ``make_sb3_vec_env``; needs the scenario with its learners. None: as in the
+            model's training environment, or nothing.
+        ignore_wrappers: accept a model even if wrappers of its training may have changed observations or actions, if
+            its actions have other bounds, or if the statistics of its ``VecNormalize`` are missing.
+
+    Raises ``InvalidInput`` for anything else, for a policy with another number of features, and for a model that was
+    trained under wrappers that may change observations or actions.
+
+    >>> import ethbrake_marl as eb
+    >>> agent = eb.policy_agent(lambda observation: -observation[:, :1].clip(0, 1), name="mine")
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> eb.evaluate(scenario.sample(5, 7), {"mine": agent}, scenario=scenario).worlds.n
+    5
+
+    """
+    scenario = load_scenario(scenario) if isinstance(scenario, str) else scenario
+    of_file = isinstance(policy, str | os.PathLike)
+    named = name or (Path(policy).stem if of_file else str(getattr(policy, "__name__", type(policy).__name__)))
+    trained = training_environment(policy, named, ignore_wrappers=ignore_wrappers)
+    spec = _observation_of(policy, scenario, observation, trained)
+    if appended is None and (appended := getattr(trained, "appended", None)) is not None:
+        scenario = trained.engine.scenario if scenario is None else scenario
+    if appended is not None and scenario is None:
+        raise InvalidInput(f"agent {named!r}: appended = {appended!r} needs the scenario that it was trained in")
+    size = spec.size if scenario is None else len(row_features(spec.features, appended, scenario))
+    shape = getattr(getattr(policy, "observation_space", None), "shape", None)
+    if shape not in (None, (size,)):
+        raise InvalidInput(
+            f"agent {named!r}: the policy takes observations of shape {shape}, here are {size} features;"
+            " give what it was trained on: scenario, observation, or appended (number or state, of make_sb3_vec_env)"
+        )
+    seen = spec if trained is None or ignore_wrappers else trained.engine.observation
+    if [f.name for f in spec.features] != [f.name for f in seen.features]:
+        raise InvalidInput(
+            f"agent {named!r}: the model is trained on other features than {spec}: {seen}; leave"
+            " observation out, and give the scenario it was trained in, or none"
+        )
+    actions = getattr(policy, "action_space", None)
+    low, high = (np.asarray(getattr(actions, end, np.nan)) for end in ("low", "high"))
+    if not (actions is None or ignore_wrappers or (low.tolist() == [-1.0] and high.tolist() == [1.0])):
+        raise InvalidInput(
+            f"agent {named!r}: the policy gives actions in {actions}, here they mean [-1, 1]; write a function around"
+            " it that says what they mean"
+        )
+    infer, begin = adapt_policy(policy, named, size, initial_state)
+    more = None if appended is None or scenario is None else _appending(appended, scenario)
+    agent = PolicyAgent(infer, named, spec, begin, clip, lambda: weights_sha256(policy), more)
+    if appended == "state":
+        agent.knows = Source.STATE
+    return agent
+
+
+def _appending(appended: Appended, scenario: Scenario) -> Callable[[Worlds, int], Observations]:
+    """Return a function ``(worlds, vehicle)`` that computes the K features appended to a vehicle's observation, [n, K].
+
+    ``appended`` is ``number`` (the vehicle's number among the scenario's learners) or ``state`` (the true state of the
+    whole line).
+    """
+
+    def number(worlds: Worlds, vehicle: int) -> Observations:
+        if vehicle not in scenario.learners:
+            raise InvalidInput(f"appended = 'number': vehicle_{vehicle + 1} is no learner of {scenario.name!r}")
+        return np.full((worlds.n, 1), scenario.learners.index(vehicle), np.float32)
+
+    return number if appended == "number" else lambda worlds, _: full_state(worlds, scenario)
+
+
+def _observation_of(policy: Any, scenario: Scenario | None, given: Observation | None, trained: Any) -> ObservationSpec:
+    if given is not None:
+        return choose_observation(given, None if scenario is None else scenario.time_step_s)
+    if scenario is not None:
+        return observation_for(scenario)
+    own = getattr(policy, "observation", None) if trained is None else trained.engine.observation
+    return own if isinstance(own, ObservationSpec) else ObservationSpec()
+
+
+class PolicyAgent:
+    """Agent that drives one vehicle by a policy of any library; made by ``policy_agent``."""
+
+    knows = Source.MESSAGES
+
+    def __init__(
+        self,
+        infer: Infer,
+        name: str,
+        observation: ObservationSpec,
+        initial_state: Callable[[int], State] | None,
+        clip: bool,
+        weights_sha256: Callable[[], str | None],
+        more: Callable[[Worlds, int], Observations] | None = None,
+    ) -> None:
+        self.name = name
+        self.weights_sha256 = weights_sha256  # hash of the policy's present weights; None if they cannot be read
+        self.observation = observation
+        self._infer, self._initial_state, self._clip = infer, initial_state, clip
+        self._more = more  # what follows the own observation
+
+    def policy_sha256(self) -> str | None:
+        """Return the hash of the policy's present weights; None if they cannot be read."""
+        return self.weights_sha256()
+
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        """Return the agent's memory before the first decision, with the policy's initial state.
+
+        Args:
+            alert: n worlds at the alert.
+            vehicle: index of the controlled vehicle (0 = front).
+            scripts: the scripts of the line; not used.
+
+        """
+        n, state = alert.n, None
+        try:
+            if self._initial_state is not None:
+                state = take_memory(checked_memory(self._initial_state(n), n), np.arange(n))
+        except Exception as error:
+            raise AgentFailed(self.name, None, f"initial_state({n}): {describe_error(error)}") from error
+        return {"steps": np.zeros(n, np.int64), "state": state}
+
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        """Return the commanded acceleration of ``vehicle``, [n] m/s2, and the agent's new memory.
+
+        Raises ``AgentFailed`` naming world and step if the policy raises, or returns a wrong shape, a value that is not
+        a number, or one outside [-1, 1].
+        """
+        seen = observe(worlds, vehicle, self.observation).astype(np.float32, copy=False)
+        if self._more is not None:
+            seen = np.concatenate([seen, self._more(worlds, vehicle)], axis=1, dtype=np.float32)
+        steps = memory["steps"]
+        action, state = self._ask(seen, memory["state"], worlds, steps)
+        values = self._checked(action, seen, worlds, steps)
+        return action_to_command(values, worlds.vehicles, vehicle), {"steps": steps + 1, "state": state}
+
+    def _ask(self, seen: Observations, state: State, worlds: Worlds, steps: Ints) -> tuple[NDArray[Any], State]:
+        try:
+            return self._answer(seen, state, np.arange(worlds.n))
+        except Exception as error:
+            k = self._find_failing(seen, state)
+            first, last = steps.min(initial=10**9) + 1, steps.max(initial=0) + 1  # over all running episodes
+            where = f"step {first}" if first >= last else f"steps {first} to {last}"
+            where = where if k is None else _moment_text(k, worlds, steps)
+            reason = f"{where}: observations of shape {seen.shape}: {describe_error(error)}"
+            raise AgentFailed(self.name, k, reason) from error
+
+    def _answer(self, seen: Observations, state: State, rows: Ints) -> tuple[NDArray[Any], State]:
+        """Return the policy's raw actions for the worlds with the indices ``rows``, and its new memory of these worlds.
+
+        ``seen`` [n, F] and ``state`` are observations and the policy's memory of all worlds.
+        """
+        if self._initial_state is None:
+            return to_array(self._infer(seen[rows], None)[0]), None
+        action, state = self._infer(seen[rows], take_memory(state, rows))
+        return to_array(action), checked_memory(state, len(rows))
+
+    def _find_failing(self, seen: Observations, state: State) -> int | None:
+        """Return the index of a world for which the policy alone raises, found by bisection; None if there is none.
+
+        ``seen`` [n, F] and ``state`` are observations and the policy's memory of all worlds.
+        """
+
+        def fails(rows: Ints) -> bool:
+            try:
+                self._answer(seen, state, rows)
+            except Exception:
+                return True
+            return False
+
+        rows = np.arange(len(seen))
+        while len(rows) > 1:
+            halves = (rows[: len(rows) // 2], rows[len(rows) // 2 :])
+            found = next((half for half in halves if fails(half)), None)
+            if found is None:
+                return None
+            rows = found
+        return int(rows[0])
+
+    def _checked(self, action: NDArray[Any], seen: Observations, worlds: Worlds, steps: Ints) -> Floats:
+        """Return a policy's raw actions as [n] in [-1, 1]; raise ``AgentFailed`` for wrong shapes or values.
+
+        ``seen``, ``worlds`` and ``steps`` [n] (steps taken) are used in the message only.
+        """
+        n, what = worlds.n, f"gave {action.dtype} of shape {action.shape} for observations of shape {seen.shape}"
+        if action.shape != (n, 1) or action.dtype.kind not in "fiu":
+            first = len(action) if action.shape[1:] in ((), (1,)) and action.ndim and len(action) < n else 0
+            raise self._refusal(first, worlds, steps, f"{what}; one number per world is needed, shape ({n}, 1)")
+        values: Floats = action[:, 0].astype(np.float64)
+        if not np.isfinite(values).all():
+            k = int(np.argmin(np.isfinite(values)))
+            raise self._refusal(k, worlds, steps, f"{what}, in which stands {values[k]}; must be in [-1, 1]")
+        inside = np.abs(values) <= LARGEST
+        if not (self._clip or inside.all()):
+            k = int(np.argmin(inside))
+            right = "must be in [-1, 1]; with clip=True the nearest is meant"
+            raise self._refusal(k, worlds, steps, f"{what}, in which stands {values[k]:g}; {right}")
+        return values.clip(-1.0, 1.0)
+
+    def _refusal(self, k: int, worlds: Worlds, steps: Ints, reason: str) -> AgentFailed:
+        return AgentFailed(self.name, k, f"{_moment_text(k, worlds, steps)}: {reason}")
+
+
+def _moment_text(k: int, worlds: Worlds, steps: Ints) -> str:
+    return f"step {steps[k] + 1} ({worlds.time_s[k]:.2f} s)"

@@ -1,0 +1,55 @@
+"""A trained policy as an agent: observe, infer, command that acceleration. Deterministic."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from ethbrake_marl.agents.protocol import ByPolicy, Source
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.game.actions import action_to_command
+from ethbrake_marl.game.observations import Observations, ObservationSpec, observe
+from ethbrake_marl.physics.state import Floats, Worlds
+
+TRAINED_POLICY = "trained policy"  # name of a run's own policy in tables and figures
+
+
+class LearnedPolicy(Protocol):
+    """Interface of a policy that an agent needs; ``ethbrake_marl.policies.policy.Policy`` implements it."""
+
+    @property
+    def observation(self) -> ObservationSpec:
+        """The observation that the policy takes: its features and their order."""
+        ...
+
+    def __call__(self, observation: Observations, /) -> Observations:
+        """Return the action of each observation: [n, F] -> [n, 1] in [-1, 1]; rows do not influence each other."""
+        ...
+
+
+class LearnedAgent(ByPolicy):
+    """Agent that drives one vehicle by the deterministic action of a ``policy``; it has no memory between steps.
+
+    ``name`` stands in tables and error messages.
+
+    >>> import ethbrake_marl as eb
+    >>> eb.LearnedAgent(eb.load_shipped("ppo"), name="mine").name
+    'mine'
+
+    """
+
+    knows = Source.MESSAGES
+
+    def __init__(self, policy: LearnedPolicy, name: str = "learned") -> None:
+        self.policy = policy
+        self.name = name
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """Return the commanded acceleration of ``vehicle`` (index, 0 = front) in each of n worlds, [n] m/s2."""
+        action = self.policy(observe(worlds, vehicle, self.policy.observation)).astype(np.float64)
+        if action.shape != (worlds.n, 1):
+            raise InvalidInput(
+                f"{self.name}: actions of shape {action.shape}; one per world is needed, ({worlds.n}, 1)"
+            )
+        return action_to_command(action[:, 0], worlds.vehicles, vehicle)

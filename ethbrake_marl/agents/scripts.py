@@ -1,0 +1,65 @@
+"""Scripts as agents: full braking, coasting, a constant command, a profile; and the baseline E-V2X-BM."""
+
+from __future__ import annotations
+
+from ethbrake_marl.agents.e_v2x_bm.coupled import make_e_v2x_bm
+from ethbrake_marl.agents.protocol import Agent, Source
+from ethbrake_marl.agents.settings import AgentSettings
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics.state import Floats, Worlds
+from ethbrake_marl.registry import Part
+from ethbrake_marl.scenario.roles import ScriptSpec
+
+
+class StateFree:
+    """Agent with a fixed command: ``full_brake``, ``coast``, ``constant:a`` (deceleration in m/s2) or a ``profile``.
+
+    ``spec`` is one of these. A profile is a list of intervals of constant command: this agent commands the first, and
+    the engine applies the later ones (``Worlds.play_pieces``). ``full_brake`` for every vehicle is the paper's
+    non-ethical strategy. Raises ``InvalidInput`` for any other script and for a constant beyond the vehicle's capacity.
+    """
+
+    state_free = True
+    knows = Source.SENSORS
+
+    def __init__(self, spec: str) -> None:
+        if not ScriptSpec.parse(spec).is_state_free():
+            raise InvalidInput(f"agent {spec!r}: must be full_brake, coast or constant:a")
+        self.name, self.braking_pieces = spec, ScriptSpec.parse(spec).pieces
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """Return the constant command of ``vehicle`` (index, 0 = front) in each of n worlds, [n] m/s2."""
+        vehicles = worlds.vehicles
+        command = ScriptSpec.parse(self.name).command(
+            vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
+        )
+        assert command is not None
+        return command
+
+
+def make_script(argument: str | None, settings: AgentSettings) -> Agent:
+    """Return the script that ``settings.spec`` names, such as ``constant:3.5``; ``argument`` is ignored."""
+    return StateFree(settings.spec)
+
+
+COAST = Part(make_script, form="coast", about="nothing at all", knows=Source.SENSORS)
+
+FULL_BRAKE = Part(
+    make_script, form="full_brake", about="full braking, the paper's non-ethical strategy", knows=Source.SENSORS
+)
+
+CONSTANT = Part(
+    make_script, form="constant:A", about="this deceleration in m/s2; negative drives", knows=Source.SENSORS
+)
+
+PROFILE = Part(make_script, form="profile:0=A,S=B", about="in pieces; of roles alone", knows=Source.SENSORS)
+
+E_V2X_BM = Part(
+    make_e_v2x_bm,
+    form="e_v2x_bm[:pairwise]",
+    about="the best constant deceleration in this simulation; pairwise: the paper's closed form, from the true state",
+    knows=Source.MODEL,
+)
+
+# Agents of ``--agents ladder``, beginning without any decision; extensions add agents as ``ladder.NAME``.
+LADDER = ("coast", "full_brake", "e_v2x_bm:pairwise", "e_v2x_bm")

@@ -1,0 +1,299 @@
+"""The engine's compiled step: actions to commands, motion, ends of episodes, and the reward that vehicles share.
+
+Each of n worlds is a row of the arrays ``state`` and ``params``, whose columns ``physics.columns`` defines. The array
+``clock`` [n, 4] holds the time of the first decision, the numbers of steps, and whether the episode has ended.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.game.actions import command_of
+from ethbrake_marl.game.rewards import RewardParams
+from ethbrake_marl.physics.columns import Packed, columns
+from ethbrake_marl.physics.episode import onset_s, stands, step_end_s
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.motion import BOUND, command_acts
+from ethbrake_marl.physics.pieces import force_at
+from ethbrake_marl.physics.rows import FLAG, LISTED, ROW, place_forces, place_obstacle, rows_for
+from ethbrake_marl.physics.segment import advance_table
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+
+# columns of ``clock``
+START = 0  # time of the first decision (s)
+
+STEP = 1  # number of steps taken
+
+LAST_STEP = 2  # number of the step that ends at the horizon
+
+ENDED = 3  # 1 after the episode has ended, else 0
+
+CLOCK_WIDTH = 4
+
+# rows of ``outcome``: results of the step in each world
+STEP_FIRST_HARM = 0  # first-impact harm of the step (m2/s2)
+
+STEP_TOTAL_HARM = 1  # total harm of the step (m2/s2)
+
+TERMINATED = 2  # 1 if the step ended the episode at rest, else 0
+
+TRUNCATED = 3  # 1 if the step ended the episode at the horizon, else 0
+
+SAFE_END = 4  # 1 if the episode ended without any impact, else 0
+
+FAILED = 5  # status code of the kernel if the world could not be advanced, else 0
+
+OUTCOME_ROWS = 6
+
+# indices of ``settings``
+TIME_STEP, HORIZON, HARM_WEIGHT, HARM_IS_TOTAL, TERMINAL_WEIGHT = range(5)
+
+BAD_ACTION = -1
+
+
+class Step(NamedTuple):
+    """Results of one step of n worlds with N vehicles."""
+
+    reward: Floats  # [n, N] reward of each vehicle
+    outcome: Floats  # [OUTCOME_ROWS, n] raw results of the compiled step; use the properties to read them
+    params: RewardParams  # settings of the reward
+    further: dict[str, Floats]  # name -> unweighted reward term that the compiled step does not know, [n] or [n, N]
+
+    @property
+    def terminated(self) -> Bools:
+        """Whether this step ended the episode because the line is at rest and no command would move a vehicle, [n]."""
+        return self._is(TERMINATED)
+
+    @property
+    def truncated(self) -> Bools:
+        """Whether this step ended the episode at the horizon, or because the world could not be advanced, [n]."""
+        return self._is(TRUNCATED)
+
+    @property
+    def ended(self) -> Bools:
+        """Whether this step ended the episode, for either reason, [n]."""
+        return self.terminated | self.truncated
+
+    @property
+    def failed(self) -> Ints:
+        """Status code of the physics for each world that could not be advanced, 0 for the others, [n]."""
+        return np.asarray(self.outcome[FAILED], np.int64)
+
+    @property
+    def safe_end(self) -> Bools:
+        """Whether this step ended the episode and the whole episode had no impact, [n]."""
+        return self._is(SAFE_END)
+
+    @property
+    def first_impact_harm(self) -> Floats:
+        """Harm that the step added to the whole line, counting each pair's first impact only, [n] m2/s2."""
+        return np.asarray(self.outcome[STEP_FIRST_HARM], np.float64)
+
+    @property
+    def total_harm(self) -> Floats:
+        """Harm that the step added to the whole line, counting every impact, [n] m2/s2."""
+        return np.asarray(self.outcome[STEP_TOTAL_HARM], np.float64)
+
+    @property
+    def shared(self) -> dict[str, Floats]:
+        """Unweighted reward terms that are the same for all vehicles of a world: name -> value, [n]."""
+        return self.params.shared(self.counted_harm, self.outcome[SAFE_END])
+
+    @property
+    def terms(self) -> dict[str, Floats]:
+        """Every unweighted reward term: name -> value, [n] if it is the same for all vehicles, otherwise [n, N]."""
+        return self.shared | self.further
+
+    @property
+    def counted_harm(self) -> Floats:
+        """Harm that the step added to the whole line, counting the impacts that the reward counts, [n] m2/s2."""
+        return self.first_impact_harm if self.params.harm_count == "first" else self.total_harm
+
+    def _is(self, row: int) -> Bools:
+        return np.asarray(self.outcome[row] == 1.0, np.bool_)
+
+
+@compiled(apart=True, bare=True)
+def place_row(table: Floats, state: Floats, params: Floats, k: int, pieces: Floats) -> None:
+    """Add to the ``table`` of world ``k`` what is needed only if brakes take time to build up.
+
+    These are accelerations in force and rates of build-up, from row ``k`` of ``state`` and ``params``, and the braking
+    profiles ``pieces`` [N, 2 K]. A separate function, because it would slow down the loop for worlds without build-up.
+    """
+    column, N = columns(state), pieces.shape[0]
+    command, brake_rate, release_rate = column.command, column.brake_rate, column.release_rate
+    place_forces(
+        table, state[k, command : command + N], params[k, brake_rate : brake_rate + N],
+        params[k, release_rate : release_rate + N], pieces,
+    )  # fmt: skip
+
+
+@compiled
+def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to functions costs more than the work
+    state: Floats, params: Floats, clock: Floats, actions: Floats, learners: Ints, settings: Floats, no_rows: Floats,
+    builds_up: bool, pieces: Floats, wanted: Floats, reward: Floats, outcome: Floats,
+) -> tuple[int, int]:  # fmt: skip
+    """Advance every running world by one step.
+
+    An action outside [-1, 1] moves nothing. A world that cannot be advanced keeps its state; its episode is cut off
+    there, without a reward, and marked in ``outcome``.
+
+    Args:
+        state: [n, S] motion and harm of the worlds, changed in place.
+        params: [n, K] parameters of the vehicles.
+        clock: [n, CLOCK_WIDTH] changed in place.
+        actions: [n, L] actions of the learners.
+        learners: [L] indices of the learners.
+        settings: [5] ``TIME_STEP``, ``HORIZON``, ``HARM_WEIGHT``, ``HARM_IS_TOTAL``, ``TERMINAL_WEIGHT``.
+        no_rows: ``NO_ROWS``, so that no single impact is recorded.
+        builds_up: must be True if brakes build up in any world, or if a script follows a profile.
+        pieces: [N, 2 K] braking profiles with K intervals of constant command; used only if ``builds_up``.
+        wanted: [n, N] commands, m/s2; the learners' are written.
+        reward: [n, N] written.
+        outcome: [OUTCOME_ROWS, n] written.
+
+    Returns the row of a world and its error (``BAD_ACTION``, or the status of a world that could not be advanced), or
+    ``(-1, FLAG.DONE)``.
+
+    """
+    n, N = wanted.shape
+    for k in range(n):
+        for c in range(learners.shape[0]):
+            if not -1.0 <= actions[k, c] <= 1.0:
+                return k, BAD_ACTION
+    column = columns(state)
+    speed, command, previous, gap, harm = column.speed, column.command, column.previous, column.gap, column.harm
+    braking, driving, latency, mass, limit = column.braking, column.driving, column.latency, column.mass, column.limit
+    P, obstacle = N - 1, column.obstacle
+    worst, worst_status = -1, FLAG.DONE
+    at = 1 if state.shape[1] > obstacle else 0  # vehicle i is in column at + i; an obstacle is in column 0
+    table = np.zeros((rows_for(pieces.shape[1]) if builds_up else ROW.OF_SEGMENT, N + at))
+    for k in range(n):
+        if clock[k, ENDED] == 1.0:
+            for f in range(OUTCOME_ROWS):
+                outcome[f, k] = 0.0
+            for i in range(N):
+                reward[k, i] = 0.0
+            continue
+        for c in range(learners.shape[0]):
+            i = learners[c]
+            wanted[k, i] = command_of(actions[k, c], params[k, braking + i], params[k, driving + i])
+        clock[k, STEP] += 1.0
+        at_horizon = clock[k, STEP] >= clock[k, LAST_STEP]
+        time = state[k, column.time]
+        until = step_end_s(clock[k, STEP], clock[k, LAST_STEP], clock[k, START], settings[TIME_STEP], settings[HORIZON])
+        if at == 1:
+            place_obstacle(table, min(state[k, obstacle], BOUND.FAR_AWAY_M), state[k, obstacle + 1])
+        for i in range(N):
+            table[ROW.SPEED, at + i] = state[k, speed + i]
+            table[ROW.COMMAND, at + i] = wanted[k, i]
+            table[ROW.MASS, at + i] = params[k, mass + i]
+            table[ROW.LIMIT, at + i] = params[k, limit + i]
+            table[ROW.ONSET, at + i] = onset_s(params[k, latency + i], time)
+            state[k, previous + i] = state[k, command + i]
+            if not builds_up:
+                state[k, command + i] = wanted[k, i] if command_acts(params[k, latency + i], until) else 0.0
+        if builds_up:
+            place_row(table, state, params, k, pieces)
+        for p in range(P):
+            table[ROW.GAP, at + p] = state[k, gap + p]
+            table[ROW.HIT, at + p] = state[k, gap + P + p]
+        status = advance_table(table, params[k, column.restitution], until - time, time, k, no_rows, 0)[1]
+        outcome[FAILED, k] = 0.0
+        if status != FLAG.DONE:
+            worst, worst_status = k, status
+            for f in range(OUTCOME_ROWS):
+                outcome[f, k] = 0.0
+            outcome[TRUNCATED, k], outcome[FAILED, k] = 1.0, status
+            clock[k, ENDED] = 1.0
+            clock[k, STEP] -= 1.0
+            for i in range(N):
+                state[k, command + i] = state[k, previous + i]
+                reward[k, i] = 0.0
+            continue
+        state[k, column.time] = until
+        at_rest = True
+        for i in range(N):
+            state[k, speed + i] = table[ROW.SPEED, at + i]
+            at_rest = at_rest and stands(table[ROW.SPEED, at + i], wanted[k, i])
+        if builds_up:
+            for i in range(N):
+                state[k, command + i] = force_at(table, at + i, wanted[k, i], params[k, latency + i], until)
+                at_rest = at_rest and state[k, command + i] <= 0.0
+        impacts, first_harm, total_harm = 0.0, 0.0, 0.0
+        if at == 1 and state[k, obstacle] < math.inf:
+            state[k, obstacle] = table[ROW.GAP, 0]
+            state[k, obstacle + 1] = table[ROW.HIT, 0]
+            state[k, obstacle + 2] += table[ROW.FIRST_HARM, 0]
+            state[k, obstacle + 3] += table[ROW.TOTAL_HARM, 0]
+            state[k, obstacle + 4] += table[ROW.COUNT, 0]
+            first_harm = table[ROW.FIRST_HARM, 0]
+            total_harm = table[ROW.TOTAL_HARM, 0]
+            impacts = state[k, obstacle + 4]
+        for p in range(P):
+            state[k, gap + p] = table[ROW.GAP, at + p]
+            state[k, gap + P + p] = table[ROW.HIT, at + p]
+            state[k, harm + p] += table[ROW.FIRST_HARM, at + p]
+            state[k, harm + P + p] += table[ROW.TOTAL_HARM, at + p]
+            state[k, harm + 2 * P + p] += table[ROW.COUNT, at + p]
+            first_harm += table[ROW.FIRST_HARM, at + p]
+            total_harm += table[ROW.TOTAL_HARM, at + p]
+            impacts += state[k, harm + 2 * P + p]
+        outcome[STEP_FIRST_HARM, k] = first_harm
+        outcome[STEP_TOTAL_HARM, k] = total_harm
+        over = at_rest or at_horizon
+        clock[k, ENDED] = 1.0 if over else 0.0
+        outcome[TERMINATED, k] = 1.0 if at_rest else 0.0
+        outcome[TRUNCATED, k] = 1.0 if over and not at_rest else 0.0
+        outcome[SAFE_END, k] = 1.0 if over and impacts == 0.0 else 0.0
+        shared = settings[TERMINAL_WEIGHT] if outcome[SAFE_END, k] == 1.0 else 0.0
+        shared -= settings[HARM_WEIGHT] * (total_harm if settings[HARM_IS_TOTAL] == 1.0 else first_harm)
+        for i in range(N):
+            reward[k, i] = shared
+    return worst, worst_status
+
+
+NO_ROWS = np.empty((0, LISTED.WIDTH))  # an empty list of impacts, so that none are recorded
+
+
+class Rules(NamedTuple):
+    """Settings that all steps of an engine share, and the compiled step that uses them."""
+
+    learners: Ints  # [L] indices of the learners
+    settings: Floats  # [5] TIME_STEP, HORIZON, HARM_WEIGHT, HARM_IS_TOTAL, TERMINAL_WEIGHT
+    builds_up: bool  # whether brakes take time to build up in some world, or a script follows a braking profile
+    pieces: Floats  # [N, 2 K] braking profiles with K intervals of constant command, as in ``Vehicles``; K may be 0
+
+    def step(
+        self, worlds: Packed, clock: Floats, actions: Floats, wanted: Floats, reward: Floats, outcome: Floats
+    ) -> int:
+        """Advance every running world by one step and return a status.
+
+        Args:
+            worlds: rows of n worlds, changed in place.
+            clock: [n, CLOCK_WIDTH] changed in place.
+            actions: [n, L] actions of the learners in [-1, 1].
+            wanted: [n, N] commands, m/s2; the learners' are written.
+            reward: [n, N] written.
+            outcome: [OUTCOME_ROWS, n] written.
+
+        The status is ``FLAG.DONE``, ``BAD_ACTION`` (nothing was moved), or the code of the failed check of some world.
+
+        """
+        _, status = step_worlds(
+            *worlds, clock, actions, self.learners, self.settings, NO_ROWS, self.builds_up, self.pieces, wanted,
+            reward, outcome,
+        )  # fmt: skip
+        return status
+
+    def unpack(self, packed: Packed) -> Worlds:
+        """Return packed worlds as ``Worlds`` in new arrays, whose vehicles follow the braking profiles ``pieces``."""
+        worlds = packed.worlds()
+        if self.pieces.shape[1] == 0:
+            return worlds
+        pieces = np.repeat(self.pieces[np.newaxis], worlds.n, axis=0)
+        return replace(worlds, vehicles=replace(worlds.vehicles, pieces=pieces))

@@ -1,0 +1,277 @@
+"""Memories of scripts: trees of arrays with one row per world, and checked calls of scripts."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.engine.scripts import Script
+from ethbrake_marl.errors import AgentFailed, EthBrakeError, InvalidInput, count_of, describe_error
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+
+Memory = Any  # of a script, for n worlds: None, an array [n, ...], or a tuple or mapping of memories
+
+_SHAPES = (
+    "one that remembers has begin(alert, vehicle, scripts) -> memory and act(worlds, memory, vehicle) -> (command,"
+    " memory); one that remembers nothing has no begin, and act(worlds, vehicle) -> command"
+)
+
+
+def map_memory(function: Callable[..., Any], memory: Memory, *others: Memory) -> Memory:
+    """Return a memory in which every array is replaced by ``function(array, ...)``.
+
+    ``others`` are memories of the same form; their corresponding arrays are passed as further arguments.
+    """
+    if memory is None:
+        return None
+    if isinstance(memory, Mapping):
+        return {key: map_memory(function, part, *(other[key] for other in others)) for key, part in memory.items()}
+    if isinstance(memory, tuple | list):
+        return tuple(map_memory(function, *parts) for parts in zip(memory, *others, strict=True))
+    return function(memory, *others)
+
+
+def take_memory(memory: Memory, rows: Ints) -> Memory:
+    """Return the memory of the worlds with the indices ``rows``, in new arrays."""
+    return map_memory(lambda array: array[rows], memory)
+
+
+def renew_memory(memory: Memory, rows: Ints, part: Memory) -> Memory:
+    """Return a copy of ``memory`` in which the worlds ``rows`` have the memory ``part``.
+
+    Parts that ``part`` lacks or has as None keep their old values. Raises ``InvalidInput`` if ``part`` has keys that
+    ``memory`` lacks.
+    """
+    if part is None:
+        return memory
+    if memory is None or (isinstance(part, Mapping) and not part.keys() <= memory.keys()):
+        raise InvalidInput("agent: what begins anew remembers other things than what began before")
+    if isinstance(part, Mapping):
+        return {key: renew_memory(of, rows, part.get(key)) for key, of in memory.items()}
+    if isinstance(part, tuple | list):
+        return tuple(renew_memory(old, rows, new) for old, new in zip(memory, part, strict=True))
+    renewed = memory[np.arange(len(memory))]
+    renewed[rows] = part
+    return renewed
+
+
+def checked_memory(memory: Memory, n: int, what: str = "state") -> Memory:
+    """Return ``memory`` if it is valid; otherwise raise ``InvalidInput``.
+
+    Every array must have ``n`` rows. Arrays of objects are also refused, because a copy still holds the same objects.
+    Keys of mappings must be identifiers, because a snapshot joins them with dots. ``what`` names the memory in the
+    message.
+    """
+
+    def check(array: Any) -> Any:
+        shape = tuple(getattr(array, "shape", ()))
+        if not shape or shape[0] != n:
+            raise InvalidInput(
+                f"{what}: {type(array).__name__} of shape {shape}; its first axis must be the {n} worlds"
+            )
+        if array.dtype.hasobject:
+            raise InvalidInput(f"{what}: an array of objects; it must hold numbers, truths or texts")
+        return array
+
+    parts = [memory]
+    for part in parts:
+        if isinstance(part, Mapping):
+            for key in part:
+                if not (isinstance(key, str) and key.isidentifier()):
+                    raise InvalidInput(f"{what}: key {key!r}; must be a name, for instance 'asked_s'")
+            parts += part.values()
+        elif isinstance(part, tuple | list):
+            parts += part
+    return map_memory(check, memory)
+
+
+Arrays = dict[str, NDArray[Any]]
+
+
+def flat(memory: Memory) -> Arrays:
+    """Return the arrays of a memory as one mapping from path to array.
+
+    For ``{"a": x, "b": (y, z)}`` the result is ``{"a": x, "b.0": y, "b.1": z}``. An empty array stands for None.
+    """
+    if isinstance(memory, Mapping | tuple):
+        parts = memory.items() if isinstance(memory, Mapping) else enumerate(memory)
+        return {f"{key}.{name}" if name else str(key): array for key, of in parts for name, array in flat(of).items()}
+    return {"": np.zeros(0) if memory is None else np.array(memory)}
+
+
+def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
+    """Return a copy of the memory that ``flat`` wrote to ``arrays`` under the path ``place``, such as ``script.2``.
+
+    Raises ``InvalidInput`` if there is nothing under this path.
+    """
+    if place in arrays:
+        return np.array(arrays[place]) if arrays[place].shape != (0,) else None
+    inner = dict.fromkeys(name[len(place) + 1 :].partition(".")[0] for name in arrays if name.startswith(f"{place}."))
+    if not inner:
+        raise InvalidInput(f"engine snapshot: {place} is nothing; the memory of that vehicle's script is needed")
+    parts = {name: unflat(arrays, f"{place}.{name}") for name in inner}
+    return tuple(parts[str(k)] for k in range(len(parts))) if "0" in parts else parts
+
+
+def _check_kept(before: Memory, after: Memory, who: str) -> None:
+    """Raise ``InvalidInput`` if a call of ``act`` changed the keys, shapes or dtypes of a memory.
+
+    Such a change would make it impossible to restart single rows. ``before`` and ``after`` are the memory before and
+    after the call. ``who`` begins the message.
+    """
+    began, told = (map_memory(lambda array: (array.dtype, *array.shape[1:]), each) for each in (before, after))
+    if began != told:
+        raise InvalidInput(
+            f"{who}: act gave a memory of another form ({told}) than it was given ({began}); keys, shapes and dtypes"
+            " are those of begin"
+        )
+
+
+def is_state_free(script: Script) -> bool:
+    """Return whether the script's command never changes during an episode (its attribute ``state_free``)."""
+    return bool(getattr(script, "state_free", False))
+
+
+def is_ours(script: Script) -> bool:
+    """Return whether the script's class belongs to this package.
+
+    Scripts of others get read-only worlds and copies of their memory.
+    """
+    return type(script).__module__.startswith("ethbrake_marl.")
+
+
+def begin_script(script: Script, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+    """Return the memory of a script after episodes have started; None for a script without a memory.
+
+    Args:
+        script: the script.
+        alert: worlds of these episodes, at t = 0.
+        vehicle: index of its vehicle (0 = front).
+        scripts: index of each scripted vehicle -> its script.
+
+    Raises ``InvalidInput`` naming the script for whatever a user's script raises, and for an invalid memory.
+
+    """
+    begin = getattr(script, "begin", None)
+    if begin is None:
+        return None
+    try:
+        if is_ours(script):
+            return begin(alert, vehicle, scripts)
+        if len(inspect.signature(script.act).parameters) == 2:
+            raise InvalidInput(f"{_who(script, vehicle)}: has begin, and act without a memory; {_SHAPES}")
+        with _as_it_was(script, vehicle):
+            return checked_memory(
+                begin(alert.read_only(), vehicle, scripts), alert.n, f"{_who(script, vehicle)}: memory"
+            )
+    except Exception as error:
+        raise _named(error, script, "begin", alert, vehicle) from error
+
+
+def ask_script(script: Script, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+    """Return a script's command for ``vehicle`` (index, 0 = front), [n] m/s2, and its new memory.
+
+    ``memory`` is its memory for these worlds; None for a script without. Raises ``AgentFailed`` naming script, world,
+    moment and shape for a command that is not one number per world, and ``InvalidInput`` naming the script for whatever
+    a user's script raises, or if it changes its own attributes.
+    """
+    remembers = hasattr(script, "begin")
+    try:
+        if is_ours(script):
+            answer = script.act(worlds, memory, vehicle) if remembers else script.act(worlds, vehicle)
+        else:
+            own = (take_memory(memory, np.arange(worlds.n)),) if remembers else ()
+            with _as_it_was(script, vehicle):
+                answer = script.act(worlds.read_only(), *own, vehicle)
+            if remembers:
+                if not (isinstance(answer, tuple) and len(answer) == 2):
+                    raise InvalidInput(f"{_who(script, vehicle)}: act gave {type(answer).__name__}; {_SHAPES}")
+                who = f"{_who(script, vehicle)}: memory"
+                _check_kept(memory, checked_memory(answer[1], worlds.n, who), who)
+    except Exception as error:
+        raise _named(error, script, "act", worlds, vehicle) from error
+    command, memory = answer if remembers else (answer, None)
+    given = np.asarray(command)
+    if given.shape != (worlds.n,) or given.dtype.kind not in "fiub":
+        short = given.ndim > 0 and len(given) < worlds.n
+        row = len(given) if short else 0
+        raise AgentFailed(
+            getattr(script, "name", type(script).__name__),
+            row if worlds.n else None,
+            f"vehicle_{vehicle + 1} at {worlds.time_s[row : row + 1].min(initial=np.inf):.2f} s: gave {given.dtype} of"
+            f" shape {given.shape}; one number per world is needed, shape ({worlds.n},)",
+        )
+    return command, memory
+
+
+@contextmanager
+def _as_it_was(script: Script, vehicle: int) -> Iterator[None]:
+    """Raise ``InvalidInput`` if a script changes its own attributes, which all episodes share, in the block.
+
+    For use in a ``with`` statement.
+    """
+    before = dict(getattr(script, "__dict__", {}))
+    yield
+    for name in {**before, **getattr(script, "__dict__", {})}:
+        is_cached = name not in before and isinstance(getattr(type(script), name, None), cached_property)
+        if not is_cached and (name not in before or getattr(script, name, None) is not before[name]):
+            raise InvalidInput(f"{_who(script, vehicle)}: keeps something in its attribute {name!r}; {_SHAPES}")
+
+
+def _who(script: Script, vehicle: int) -> str:
+    return f"agent {getattr(script, 'name', type(script).__name__)!r} of vehicle_{vehicle + 1}"
+
+
+def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle: int) -> Exception:
+    """Return the exception to raise in place of ``error``, which a script raised.
+
+    It is an ``InvalidInput`` that names the script; ``error`` itself if it is a package's error or from a package's
+    script.
+
+    Args:
+        error: the exception.
+        script: the script.
+        what: name of the method that raised it.
+        worlds: the worlds that the method was given.
+        vehicle: index of the script's vehicle.
+
+    """
+    if isinstance(error, EthBrakeError) or is_ours(script):
+        return error
+    who = _who(script, vehicle)
+    moment = f"{count_of(worlds.n, 'world')} at {worlds.time_s.min(initial=np.inf):.2f} s"
+    return InvalidInput(f"{who}: {what} on {moment}: {describe_error(error)}")
+
+
+def within_capacity(
+    command_mps2: Floats, worlds: Worlds, vehicle: int, script: Script, due: Bools | None = None
+) -> Floats:
+    """Return a script's command if it is within the vehicle's capacities; otherwise raise ``AgentFailed``.
+
+    Args:
+        command_mps2: commanded accelerations, [n] m/s2.
+        worlds: n worlds.
+        vehicle: index of the vehicle (0 = front).
+        script: the script, for the message.
+        due: [n] worlds in which the command is checked; None: all.
+
+    """
+    low, high = -worlds.vehicles.braking_capacity_mps2[:, vehicle], worlds.vehicles.driving_capacity_mps2[:, vehicle]
+    good = (command_mps2 >= low) & (command_mps2 <= high)
+    if due is not None:
+        good |= ~due
+    if not good.all():
+        k = int(np.argmin(good))
+        raise AgentFailed(
+            getattr(script, "name", type(script).__name__),
+            k,
+            f"vehicle_{vehicle + 1} at {worlds.time_s[k]:.2f} s: command {command_mps2[k]:g} m/s2; must be in"
+            f" [{low[k]:g}, {high[k]:g}]",
+        )
+    return command_mps2

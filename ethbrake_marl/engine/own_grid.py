@@ -1,0 +1,196 @@
+"""Scripts that decide on a time grid of their own, at moments between the engine's steps.
+
+A script's own grid begins when the latency of its vehicle has elapsed; the engine's steps begin with the first decision
+of its *deciders*, the learners or the evaluated agents.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.engine.compiled_step import (
+    ENDED,
+    FAILED,
+    LAST_STEP,
+    OUTCOME_ROWS,
+    START,
+    STEP,
+    TERMINAL_WEIGHT,
+    TRUNCATED,
+    Rules,
+)
+from ethbrake_marl.engine.memory import Memory, ask_script, renew_memory, take_memory, within_capacity
+from ethbrake_marl.engine.scripts import Script
+from ethbrake_marl.engine.state import State
+from ethbrake_marl.physics.columns import Columns, Packed
+from ethbrake_marl.physics.episode import Decisions
+from ethbrake_marl.physics.messages import hear_rows
+from ethbrake_marl.physics.rows import FLAG
+from ethbrake_marl.physics.state import Bools, Floats, Ints
+
+ROUNDING = 1e-9  # of a time step: two moments that are closer than this are the same
+
+Stop = tuple[Floats, Floats]  # state [n, S] of all worlds at a script's decision, and the commands [n, N] until then
+
+
+class Way(NamedTuple):
+    """The first part of a step, up to the last decision of a script that decides at times of its own in between."""
+
+    reward: Floats  # [n, N] reward of this part
+    harm: Floats  # [2, n] harm of the line in this part: first-impact harm, total harm (m2/s2)
+    stopped: Bools  # [n] whether the world was moved to such a decision
+    failed: Ints  # [n] status of the physics if the world could not be advanced, else 0
+    in_force: Floats  # [n, N] accelerations in force when the step began (m/s2)
+    memories: dict[int, Memory]  # vehicle index -> new memory of its script
+    stops: tuple[Stop, ...]  # the worlds at each of the decisions, in order
+
+    def add_to(self, motion: Floats, column: Columns, reward: Floats, outcome: Floats) -> None:
+        """Add this first part of a step to the results of the rest of the step, in place.
+
+        Args:
+            motion: [n, S] state of the worlds after the step.
+            column: columns of ``motion``.
+            reward: [n, N] reward of the rest.
+            outcome: [OUTCOME_ROWS, n] outcome of the rest.
+
+        """
+        reward += self.reward
+        outcome[: len(self.harm)] += self.harm
+        motion[self.stopped, column.previous : column.gap] = self.in_force[self.stopped]
+        lost = self.failed != 0
+        outcome[TRUNCATED, lost], outcome[FAILED, lost] = 1.0, self.failed[lost]
+
+
+class OwnGrid:
+    """Scripts with a memory that decide within an engine's steps.
+
+    Each decides when the latency of its vehicle has elapsed, and every time step from then on. An engine's step goes
+    from one decision of its deciders (the learners or the evaluated agents) to the next, so a script of another vehicle
+    decides within the step.
+
+    Args:
+        scripts: vehicle index -> its script.
+        time_step_s: time between two decisions of a script, s.
+        horizon_s: time at which an episode is truncated, s.
+
+    """
+
+    def __init__(self, scripts: Mapping[int, Script], time_step_s: float, horizon_s: float) -> None:
+        self.scripts = dict(scripts)
+        self._time_step_s, self._horizon_s = time_step_s, horizon_s
+
+    def drive_step(self, state: State, rules: Rules, actions: Floats) -> Way:
+        """Let the scripts decide within the step that begins, and return this first part of the step.
+
+        ``state`` is changed in place: each world is moved to its last decision that changed a command. ``rules``
+        advance the worlds, under the learners' ``actions`` [n, L].
+        """
+        column = state.packed.column
+        in_force = state.motion[:, column.command : column.previous].copy()
+        steps, last, start_s = (state.clock[:, at] for at in (STEP, LAST_STEP, START))
+        until_s = Decisions(start_s, self._time_step_s).at(steps + 1.0)
+        until_s = np.where(steps + 1.0 >= last, self._horizon_s, until_s)
+        way = self._decide(state, rules, ~state.ended, until_s, actions)
+        state.clock[way.failed != 0, ENDED] = 1.0
+        return way._replace(in_force=in_force)
+
+    def drive_to_start(self, state: State, rules: Rules, rows: Ints, start_s: Floats) -> Way:
+        """Let the scripts decide from the alert to the first step of new episodes, and return this part.
+
+        Learners and deciders coast until then, and others see them coast.
+
+        Args:
+            state: all running episodes, with the new ones at the alert; these are moved to their first step, in place.
+            rules: how worlds are advanced.
+            rows: rows of the new episodes.
+            start_s: times at which their first steps begin, [len(rows)] s.
+
+        Raises ``PhysicsError`` naming the worlds that could not be advanced.
+
+        """
+        n, time_s = len(state.motion), state.time_s
+        running, until_s, no_actions = np.zeros(n, np.bool_), time_s.copy(), np.empty((n, 0))
+        running[rows], until_s[rows] = True, start_s
+        way = self._decide(state, rules, running, until_s, no_actions)
+        ahead, _, outcome = self._look_ahead(state, rules, until_s, until_s, no_actions)
+        failed = np.where(way.failed != 0, way.failed, outcome[FAILED].astype(np.int64))
+        if failed.any():
+            raise FLAG.failure(np.where(failed == 0, FLAG.DONE, failed), time_s, until_s)
+        state.motion[rows], state.params[rows] = ahead.state[rows], ahead.params[rows]
+        return way
+
+    def _decide(self, state: State, rules: Rules, running: Bools, until_s: Floats, actions: Floats) -> Way:
+        """Make all decisions of the scripts before ``until_s`` [n], and return this part of the step.
+
+        Only the ``running`` [n] worlds of ``state`` are advanced, in place. A world is moved to a decision only if that
+        changes a command, because the rounding of the motion depends on where it is interrupted. ``rules`` advance the
+        worlds; ``actions`` [n, L] are the learners'.
+        """
+        motion, params, _, wanted_so_far, *_ = state
+        (n, N), column = wanted_so_far.shape, state.packed.column
+        vehicles, step_s = list(self.scripts), self._time_step_s
+        memories, stops = state.memories, list[Stop]()
+        reward, harm = np.zeros((n, N)), np.zeros((2, n))
+        stopped, failed = np.zeros(n, np.bool_), np.zeros(n, np.int64)
+        first_s = params[:, column.latency : column.mass][:, vehicles].T
+        made = np.maximum(Decisions(first_s, step_s).before(motion[:, column.time]), 0.0)
+        due = np.where(running, np.maximum(Decisions(first_s, step_s).before(until_s), 0.0), made)
+        while (made < due).any():
+            next_s = np.where(made < due, first_s + made * step_s, np.inf)
+            moment = next_s.min(axis=0)
+            asked = next_s <= moment + ROUNDING * step_s
+            asked &= made < due
+            now = motion[:, column.time]
+            moment = np.where((moment < np.inf) & (moment > now + ROUNDING * step_s), moment, now)
+            ahead, reward_ahead, outcome = self._look_ahead(state, rules, moment, until_s, actions)
+            worlds, wanted = rules.unpack(ahead), wanted_so_far.copy()
+            for (vehicle, script), here in zip(self.scripts.items(), asked, strict=True):
+                if here.any():
+                    before, idle = memories[vehicle], np.flatnonzero(~here)
+                    command, after = ask_script(script, worlds, before, vehicle)
+                    command = np.where(here, command, 0.0)
+                    wanted[here, vehicle] = within_capacity(command, worlds, vehicle, script, here)[here]
+                    memories = memories | {vehicle: renew_memory(after, idle, take_memory(before, idle))}
+            changed = (wanted != wanted_so_far)[:, vehicles] & (made > 0.0).T  # the first waits for the latency anyway
+            stopping = (moment > now) & changed.any(axis=1) & (outcome[FAILED] == 0.0)
+            failed[:] = np.where(outcome[FAILED] != 0.0, outcome[FAILED], failed)
+            if stopping.any():
+                motion[stopping], params[stopping] = ahead.state[stopping], ahead.params[stopping]
+                stops.append((motion.copy(), wanted_so_far.copy()))
+                reward[stopping] += reward_ahead[stopping]
+                harm[:, stopping] += outcome[: len(harm), stopping]
+                stopped[stopping] = True
+            wanted_so_far[:] = wanted
+            made += asked
+            made = np.where(failed != 0, due, made)
+        return Way(reward, harm, stopped, failed, np.empty(0), memories, tuple(stops))
+
+    def _look_ahead(
+        self, state: State, rules: Rules, until_s: Floats, decision_s: Floats, actions: Floats
+    ) -> tuple[Packed, Floats, Floats]:
+        """Return copies of the worlds at ``until_s``, their reward [n, N] and outcome [OUTCOME_ROWS, n] up to then.
+
+        Args:
+            state: the worlds; only the learners' commands in ``wanted`` are changed.
+            rules: how worlds are advanced.
+            until_s: [n] times, s; a world that is not before its time stays.
+            decision_s: [n] time of the deciders' next decision, which periodic messages need, s.
+            actions: [n, L] actions of the learners; L may be 0.
+
+        """
+        n, wanted = len(state.motion), state.wanted
+        clock, settings = np.zeros(state.clock.shape), rules.settings.copy()
+        clock[:, START], clock[:, STEP], clock[:, LAST_STEP] = until_s, -1.0, np.inf  # a step from -1 to 0 ends there
+        clock[:, ENDED] = ~(until_s > state.time_s)
+        settings[TERMINAL_WEIGHT] = 0.0
+        reward, outcome = np.empty(wanted.shape), np.empty((OUTCOME_ROWS, n))
+        ahead = Packed(state.motion.copy(), state.params.copy())
+        rules = rules._replace(settings=settings, learners=rules.learners[: actions.shape[1]])
+        rules.step(ahead, clock, actions, wanted, reward, outcome)
+        if ahead.has_messages:
+            time_s = ahead.state[:, ahead.column.time]
+            hear_rows(state.motion.copy(), ahead.params, wanted, time_s, decision_s, self._time_step_s, rules.pieces)
+        return ahead, reward, outcome

@@ -1,0 +1,355 @@
+"""Command profiles of whole episodes and their harm: the optimisation problem that searches and shields solve.
+
+A *profile* holds the commands of the controlled vehicles from the first decision to the horizon, in at most K phases. A
+*phase* is an interval of constant command that ends at a decision.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.game.harm import HarmCount, check_harm_count
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.columns import Packed
+from ethbrake_marl.physics.episode import CLOCK, Decisions, Episode, follow_whole, harm_so_far
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.rows import ROW, place_rates, rows_for
+from ethbrake_marl.physics.state import Bools, Floats, Ints, UInt64s, Worlds
+
+MOST_PHASES = 12
+
+
+class SearchWorld(NamedTuple):
+    """One world of a ``ProfileProblem``, prepared for running candidate profiles."""
+
+    episode: Episode  # working memory in which the world is simulated (``physics.episode``)
+    bounds: Floats  # [C, 2] smallest and largest command of each controlled vehicle (m/s2)
+    random: UInt64s  # [1] state of the world's random generator
+
+
+@compiled
+def copy_rows(rows: Floats, to_rows: Floats, n: int) -> None:
+    """Copy the first ``n`` rows of ``rows`` [>= n, c] to those of ``to_rows``, element by element.
+
+    An assignment of slices would take ten times longer to compile, because of its error message.
+    """
+    for k in range(n):
+        for c in range(rows.shape[1]):
+            to_rows[k, c] = rows[k, c]
+
+
+TIME_STEP_S = 0.1  # default time between two decisions
+
+
+class ProfileProblem(NamedTuple):
+    """The problem of choosing command profiles of the controlled vehicles in n worlds. Made by ``profile_problem``.
+
+    If a line has an obstacle, it is vehicle 0 of every column, and the vehicles' indices start from 1.
+    """
+
+    vehicles: Ints  # [C] indices of the controlled vehicles
+    start: Floats  # [n, S] state at the first decision, as ``physics.episode.save`` stores it
+    clock: Floats  # [n, CLOCK.WIDTH] times and numbers of the decisions, and settings; see ``physics.episode``
+    bounds: Floats  # [n, C, 2] smallest and largest command of the controlled vehicles (m/s2)
+    command: Floats  # [n, N] commands of the other vehicles, 0 for the controlled ones (m/s2)
+    latency: Floats  # [n, N] latencies (s)
+    mass: Floats  # [n, N] masses (t)
+    limit: Floats  # [n, N] speed limits (m/s)
+    brake_rate: Floats  # [n, N] rates at which brakes build up (m/s3)
+    release_rate: Floats  # [n, N] rates at which brakes are released (m/s3)
+    pieces: Floats  # [n, N, 2 K] braking profiles of scripts with K intervals of constant command, as in ``Vehicles``
+    identity: UInt64s  # [n] hash of each world's problem, see ``identities``
+
+    @property
+    def n(self) -> int:
+        """Number of worlds."""
+        return len(self.start)
+
+    def take(self, rows: Ints) -> ProfileProblem:
+        """Return the problem of the worlds with the indices ``rows`` only."""
+        arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._fields[1:]}
+        return self._replace(**arrays)
+
+    def put(self, rows: Ints, new: ProfileProblem) -> ProfileProblem:
+        """Return a copy in which the worlds with the indices ``rows`` are replaced by those of ``new``, in order."""
+        arrays: dict[str, Any] = {name: getattr(self, name).copy() for name in self._fields[1:]}
+        for name, array in arrays.items():
+            array[rows] = getattr(new, name)
+        return self._replace(**arrays)
+
+    @property
+    def last_step(self) -> Ints:
+        """Number of decisions before the horizon, [n]."""
+        return self.clock[:, CLOCK.LAST_STEP].astype(np.int64)
+
+    def constant(self, commands_mps2: Floats) -> Profiles:
+        """Return profiles that hold constant commands.
+
+        ``commands_mps2`` [n, Q, C] are Q constant commands for each world and controlled vehicle. The result has n * Q
+        profiles, in the order of the first two axes. Each is divided into ``MOST_PHASES`` phases, all with the same
+        command, so that a search can change them later.
+        """
+        n, Q, C = commands_mps2.shape
+        borders = np.array([2, 5, 9, 14, 20] + (MOST_PHASES - 5) * [np.iinfo(np.int64).max])
+        ends = np.minimum(borders, self.last_step[:, np.newaxis])
+        shape = (n, Q, MOST_PHASES)
+        repeated = np.broadcast_to(commands_mps2[:, :, np.newaxis], (*shape, C))
+        return Profiles(
+            np.broadcast_to(ends[:, np.newaxis], shape).reshape(n * Q, MOST_PHASES).copy(),
+            repeated.reshape(n * Q, MOST_PHASES, C).copy(),
+        )
+
+    def even_grid(self, number: int) -> Floats:
+        """Return ``number`` evenly spaced commands from each vehicle's smallest to its largest, [n, number, C] m/s2.
+
+        Both ends are included. ``low + (high - low)`` may be an ulp above ``high``, so the result is limited to
+        ``high``.
+        """
+        low, high = self.bounds[:, np.newaxis, :, 0], self.bounds[:, np.newaxis, :, 1]
+        share = np.linspace(0.0, 1.0, number)[:, np.newaxis]
+        return np.asarray(np.minimum(low + share * (high - low), high), np.float64)
+
+    def follow(self, profiles: Profiles) -> tuple[Floats, Floats]:
+        """Return first-impact and total harm of one profile per world, each [n] m2/s2.
+
+        They equal the engine's to the bit. Raises ``InvalidInput`` for profiles that do not fit the problem or exceed a
+        capacity, ``PhysicsError`` naming the worlds in which a check of the physics failed.
+        """
+        self.check(profiles)
+        n = self.n
+        first, total, failed = np.zeros(n), np.zeros(n), np.zeros(n, np.bool_)
+        ends, commands = np.ascontiguousarray(profiles.ends, np.int64), np.ascontiguousarray(profiles.commands_mps2)
+        follow_worlds(self, ends, commands, first, total, failed)
+        if failed.any():
+            raise PhysicsError({k: "its profile could not be followed" for k in np.flatnonzero(failed).tolist()})
+        return first, total
+
+    def check(self, profiles: Profiles) -> None:
+        """Raise ``InvalidInput`` for profiles that do not fit this problem.
+
+        There must be one profile per world, with commands within the capacities, and phases that end in order, the last
+        one at the last decision.
+        """
+        n, C = self.n, len(self.vehicles)
+        K = profiles.ends.shape[-1]
+        if profiles.ends.shape != (n, K) or profiles.commands_mps2.shape != (n, K, C):
+            raise InvalidInput(
+                f"profiles: shapes {profiles.ends.shape} and {profiles.commands_mps2.shape}; ({n}, K) and ({n}, K, {C})"
+                " are needed"
+            )
+        low, high = self.bounds[:, np.newaxis, :, 0], self.bounds[:, np.newaxis, :, 1]
+        good = (profiles.commands_mps2 >= low) & (profiles.commands_mps2 <= high)
+        if not good.all():
+            raise InvalidInput(
+                f"profiles: command {profiles.commands_mps2[~good][0]:g} m/s2 is beyond a vehicle's capacity"
+            )
+        ordered = (np.diff(profiles.ends, axis=1, prepend=0) >= 0).all() and (
+            profiles.ends[:, -1] == self.last_step
+        ).all()
+        if not ordered:
+            raise InvalidInput("profiles: phases must end in order, the last one at the last step")
+
+
+def profile_problem(
+    worlds: Worlds,
+    vehicles: Sequence[int],
+    *,
+    harm_count: HarmCount = "first",
+    horizon_s: float = 8.0,
+    time_step_s: float = TIME_STEP_S,
+    others_mps2: Floats | None = None,
+    deciders: Sequence[int] | None = None,
+    written_out: bool = False,
+) -> ProfileProblem:
+    """Return the problem of choosing whole command profiles of some vehicles with the least harm.
+
+    Args:
+        worlds: n worlds.
+        vehicles: indices of the controlled vehicles (0 = front).
+        harm_count: impacts whose harm is minimised: ``first`` (each pair's first) or ``total`` (all).
+        horizon_s: end of the episodes, s.
+        time_step_s: time between two decisions, s.
+        others_mps2: constant commands of the other vehicles, [n, N] m/s2 (columns of ``vehicles`` are ignored); None:
+            full braking.
+        deciders: indices of vehicles; the first decision is at their smallest latency, or at the worlds' time if that
+            is later. None: ``vehicles``.
+        written_out: describe an obstacle ahead as a vehicle in front (``Worlds.with_obstacle``) even if no world has
+            one; worlds without one get one out of reach. If any world has one, this is always done.
+
+    Raises ``InvalidInput`` for no vehicle, a repeated or unknown one, an unknown harm count, a command beyond capacity,
+    or a horizon before the first decision.
+
+    """
+    chosen = _checked_vehicles(vehicles, worlds.N)
+    check_harm_count(harm_count)
+    if not (0.0 < time_step_s < math.inf and 0.0 < horizon_s < math.inf):
+        raise InvalidInput(f"time_step_s {time_step_s!r}, horizon_s {horizon_s!r}: must be positive numbers of seconds")
+    v = worlds.vehicles
+    command = -v.braking_capacity_mps2 if others_mps2 is None else np.array(others_mps2, np.float64)
+    if command.shape != worlds.speeds_mps.shape:
+        raise InvalidInput(f"others_mps2: shape {command.shape}; {worlds.speeds_mps.shape} is needed")
+    command[:, chosen] = 0.0
+    obstacle = worlds.obstacle_ahead
+    if obstacle.any() or written_out:
+        found = profile_problem(
+            worlds.with_post_ahead(np.full(worlds.n, horizon_s)).with_obstacle(),
+            [i + 1 for i in chosen.tolist()],
+            harm_count=harm_count,
+            horizon_s=horizon_s,
+            time_step_s=time_step_s,
+            others_mps2=np.concatenate([np.zeros((len(command), 1)), command], axis=1),
+            deciders=None if deciders is None else [i + 1 for i in deciders],
+        )
+        if not obstacle.all():  # the identity of a world must not depend on the other worlds
+            free = np.flatnonzero(~obstacle)
+            found.identity[free] = profile_problem(
+                worlds.take(free), vehicles, harm_count=harm_count, horizon_s=horizon_s, time_step_s=time_step_s,
+                others_mps2=command[free], deciders=deciders,
+            ).identity  # fmt: skip
+        return found
+    decide = _checked_vehicles(vehicles if deciders is None else deciders, worlds.N)
+    first = worlds.first_decision_s(decide.tolist())
+    if not (first < horizon_s).all():
+        raise InvalidInput(f"horizon_s {horizon_s:g}: must be after the first decision at {first.max():g} s")
+    clock = np.empty((worlds.n, CLOCK.WIDTH))
+    clock[:, CLOCK.START], clock[:, CLOCK.TIME_STEP], clock[:, CLOCK.HORIZON] = first, time_step_s, horizon_s
+    clock[:, CLOCK.LAST_STEP] = Decisions(first, time_step_s).before(horizon_s)
+    clock[:, CLOCK.RESTITUTION], clock[:, CLOCK.HARM_IS_TOTAL], clock[:, CLOCK.STEPWISE] = (
+        v.restitution,
+        harm_count == "total",
+        0.0,
+    )
+    bounds = np.stack([-v.braking_capacity_mps2[:, chosen], v.driving_capacity_mps2[:, chosen]], axis=2)
+    after, impacts = advance(worlds, command, until_s=first)
+    harm = [impacts.first_impact_harm, impacts.total_harm]
+    start = [after.speeds_mps, after.gaps_m, after.pair_hit, *harm, after.command_mps2]
+    return ProfileProblem(
+        chosen, np.concatenate(start, axis=1), clock, np.ascontiguousarray(bounds), command, v.latency_s, v.mass_t,
+        v.speed_limit_mps, v.brake_rate_mps3, v.release_rate_mps3, v.pieces,
+        identities(worlds, command, clock, chosen),
+    )  # fmt: skip
+
+
+def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -> UInt64s:
+    """Return a hash of each world's problem, [n]: 8 bytes of BLAKE2b over everything that the harm depends on.
+
+    That is the world's state and parameters, the other vehicles' ``command`` [n, N], the times of decisions and the
+    horizon in ``clock`` [n, CLOCK.WIDTH], and the indices ``vehicles`` of the controlled vehicles; but not the harm
+    count.
+    """
+    packed = Packed.of(worlds)
+    (state, params), column = packed, packed.column
+    who = np.zeros((worlds.n, worlds.N))
+    who[:, vehicles] = 1.0
+    parts = [
+        state[:, [column.time]],
+        state[:, column.speed : column.command],
+        state[:, column.gap : column.harm],
+        params[:, : column.brake_rate],  # without messages, which do not affect the harm
+        command,
+        clock[:, [CLOCK.START, CLOCK.TIME_STEP, CLOCK.LAST_STEP, CLOCK.HORIZON]],
+        who,
+    ]
+    rows = np.ascontiguousarray(np.concatenate(parts, axis=1) + 0.0, "<f8")  # + 0.0 turns -0.0 into 0.0
+    slow = worlds.vehicles.build_up  # other worlds keep the hashes of versions without build-up rates
+    forces = np.concatenate(
+        [state[:, column.command : column.previous], params[:, column.brake_rate : column.own_latency]], 1
+    )
+    further = [forces[k].tobytes() if slow[k] else b"" for k in range(worlds.n)]
+    for k in np.flatnonzero(worlds.vehicles.in_pieces):
+        pieces = worlds.vehicles.pieces[k]
+        there = np.isfinite(pieces)  # without the padding, which depends on the other worlds
+        further[k] += there.sum(axis=1).astype("<i8").tobytes() + pieces[there].astype("<f8").tobytes()
+    digests = [hashlib.blake2b(row.tobytes() + further[k], digest_size=8).digest() for k, row in enumerate(rows)]
+    return np.frombuffer(b"".join(digests), "<u8").astype(np.uint64)
+
+
+def _checked_vehicles(vehicles: Sequence[int], N: int) -> Ints:
+    chosen = list(vehicles)
+    if not chosen or len(set(chosen)) != len(chosen) or not all(0 <= i < N for i in chosen):
+        raise InvalidInput(f"vehicles {tuple(chosen)}: at least one is needed, each once, from 0 to {N - 1}")
+    return np.array(chosen, np.int64)
+
+
+class Profiles(NamedTuple):
+    """One profile per world: ``commands_mps2[k, j]`` is in force from decision ``ends[k, j - 1]`` to ``ends[k, j]``.
+
+    Phases after a world's last one are empty: they also end at the last step.
+    """
+
+    ends: Ints  # [n, K] number of the decision at which each phase ends
+    commands_mps2: Floats  # [n, K, C] commands in each phase
+
+    def at(self, step: Ints) -> Floats:
+        """Return the commands in force after decision number ``step`` [n] of each world, [n, C] m/s2.
+
+        Decisions are numbered from 0. The last command continues after the last phase.
+        """
+        phase = np.minimum((self.ends <= step[:, np.newaxis]).sum(axis=1), self.ends.shape[1] - 1)
+        return np.asarray(self.commands_mps2[np.arange(len(phase)), phase], np.float64)
+
+    def take(self, rows: Ints | slice) -> Profiles:
+        """Return the profiles of the worlds with the indices ``rows``."""
+        return Profiles(self.ends[rows], self.commands_mps2[rows])
+
+    @staticmethod
+    def padded(parts: Sequence[Profiles], least: int) -> list[Profiles]:
+        """Return copies of several sets of profiles, all with the same number of phases, at least ``least``.
+
+        The added phases are empty: they end where the last one does.
+        """
+        width = max([least, *(part.ends.shape[1] for part in parts)])
+        return [
+            Profiles(
+                np.pad(part.ends, ((0, 0), (0, width - part.ends.shape[1])), mode="edge"),
+                np.pad(part.commands_mps2, ((0, 0), (0, width - part.ends.shape[1]), (0, 0)), mode="edge"),
+            )
+            for part in parts
+        ]
+
+    def grown(self, n: int) -> Profiles:
+        """Return a copy with ``n`` rows, at least as many as now; the contents of the added rows are meaningless."""
+        more = n - len(self.ends)
+        return Profiles(np.pad(self.ends, ((0, more), (0, 0))), np.pad(self.commands_mps2, ((0, more), (0, 0), (0, 0))))
+
+
+@compiled
+def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> SearchWorld:
+    """Return world number ``k`` of a problem, with working memory of its own.
+
+    ``random`` [n] holds the states of all worlds' random generators; the result refers to entry ``k``.
+    """
+    N = problem.mass.shape[1]
+    table = np.zeros((rows_for(problem.pieces.shape[2]), N))
+    for i in range(N):
+        table[ROW.COMMAND, i], table[ROW.LATENCY, i] = problem.command[k, i], problem.latency[k, i]
+        table[ROW.MASS, i], table[ROW.LIMIT, i] = problem.mass[k, i], problem.limit[k, i]
+    place_rates(table, problem.brake_rate[k], problem.release_rate[k], problem.pieces[k])
+    return SearchWorld(Episode(table, problem.clock[k].copy(), problem.vehicles), problem.bounds[k], random[k : k + 1])
+
+
+@compiled
+def follow_worlds(
+    problem: ProfileProblem, ends: Ints, commands: Floats, first: Floats, total: Floats, failed: Bools
+) -> None:
+    """Simulate one profile in each world; write the harm to ``first`` and ``total`` [n] m2/s2.
+
+    ``ends`` [n, K] and ``commands`` [n, K, C] are the fields of ``Profiles``. ``failed`` [n] is set to True for a world
+    in which a check of the physics failed.
+    """
+    start, no_random = problem.start, np.zeros(problem.start.shape[0], np.uint64)
+    for k in range(start.shape[0]):
+        episode = make_search_world(problem, k, no_random).episode
+        states = np.zeros((ends.shape[1] + 1, start.shape[1]))
+        copy_rows(start[k : k + 1], states, 1)
+        episode.clock[CLOCK.STEPWISE] = 1.0
+        if follow_whole(episode, ends[k], commands[k], states, math.inf)[1] < 0:
+            failed[k] = True
+            continue
+        first[k], total[k] = harm_so_far(episode.table, 0.0), harm_so_far(episode.table, 1.0)

@@ -1,0 +1,83 @@
+"""The random draws behind the worlds of an environment: initial states, vehicle types and scenarios, as columns.
+
+Worlds are pure functions of scenario, seed and number. So nothing is stored while episodes run; the worlds are drawn
+again on request.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics.state import Ints
+from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.schema import as_scenario
+
+_MOST_APART = 1024  # largest distance between the numbers of two worlds that are drawn in one call
+
+Columns = dict[str, NDArray[Any]]
+
+
+def describe_worlds(engine: Engine) -> Columns:
+    """Return the random draw of each running world, as columns: ``{"gap_1_m": [n], "mass_2_t": [n], ...}``.
+
+    There is a column for each quantity of the world at the alert (the moment at which the episode begins), named as in
+    a table of initial states. A mixture adds ``scenario``, vehicle types add ``vehicle_2_type`` for worlds that were
+    drawn. ``world_seed`` and ``world`` are as in the infos.
+
+    Raises ``InvalidInput`` for worlds whose draw is unknown. These are worlds that the caller passed, after a snapshot
+    was restored, and a world that could not be advanced to its first decision, so that another world replaced it.
+    """
+    numbers, given = engine.roster.numbers, engine.roster.given
+    named = {"world_seed": np.full(engine.n, engine.roster.seed), "world": numbers.copy()}
+    own, found = numbers < 0, dict[str, NDArray[Any]]()
+    if own.any():
+        if given is None:
+            raise InvalidInput(
+                "describe_worlds: these episodes go on from a snapshot, which does not keep worlds that were given;"
+                " ask again once they have ended, or after a reset"
+            )
+        found = QUANTITY.columns(given)
+    if not own.all():
+        sample = _drawn_again(engine, numbers[~own])
+        drawn, started = {**sample.kinds, **QUANTITY.columns(sample.worlds)}, found
+        found = {name: np.zeros(engine.n, column.dtype) for name, column in drawn.items()}
+        for name, column in drawn.items():
+            found[name][~own] = column
+            if name in started:
+                found[name][own] = started[name][own]
+    return {**found, **named}
+
+
+def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
+    """Draw the worlds with the numbers ``numbers`` in the training stream again, and return them in this order.
+
+    Raises ``InvalidInput`` if the running worlds of the engine differ from them: a world that could not be advanced to
+    its first decision was replaced by another world.
+    """
+    ordered, places = np.unique(numbers, return_inverse=True)
+    breaks = np.flatnonzero(np.diff(ordered) > _MOST_APART) + 1
+    parts, scenario = [], as_scenario(engine.scenario)
+    for run in np.split(ordered, breaks):
+        first = int(run[0])
+        span = scenario.sample(int(run[-1]) - first + 1, engine.roster.seed, first=first, channel="training")
+        parts.append(span.take(run - first))
+    sample = Sample.join(parts, 0).take(places)
+    rows = np.flatnonzero(engine.roster.numbers >= 0)
+    running, drawn = engine.worlds.vehicles.take(rows), sample.worlds.vehicles
+    same = np.ones(len(rows), np.bool_)
+    rates = ("brake_rate_mps3", "release_rate_mps3")
+    for name in ("mass_t", "braking_capacity_mps2", "driving_capacity_mps2", "latency_s", *rates):
+        same &= (getattr(running, name) == getattr(drawn, name)).all(axis=1)
+    if not same.all():
+        k = int(rows[np.argmin(same)])
+        raise InvalidInput(
+            f"describe_worlds: world {engine.roster.numbers[k]} of seed {engine.roster.seed} could not be advanced to"
+            f" its first decision; another one stands in row {k}"
+        )
+    return sample

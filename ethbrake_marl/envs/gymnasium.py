@@ -1,0 +1,157 @@
+"""Gymnasium's interface: one learner, one world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.envs.infos import OneWorld, Report
+from ethbrake_marl.envs.making import AnyScenario, action_box, feature_box, learner_actions, make_engine, only_learner
+from ethbrake_marl.envs.viewer import Viewer
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec
+from ethbrake_marl.game.rewards import Reward, RewardParams
+from ethbrake_marl.physics.episode import Decisions
+from ethbrake_marl.scenario.schema import Scenario
+
+
+class Specified:
+    """Mixin for environments that ``gymnasium.make`` makes: its ``spec`` stores settings only as plain data for JSON.
+
+    A scenario object, for instance, becomes a mapping, and a path becomes a text.
+    """
+
+    engine: Engine  # the engine that moves the worlds, set by the environment
+    max_episode_steps: int | None = None  # largest number of steps of an episode; None: the horizon limits it alone
+    _spec: EnvSpec | None = None  # the value of ``spec``
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Gymnasium's record of how the environment was made; None if it was not made by an id.
+
+        No episode is longer than its ``max_episode_steps``.
+        """
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None:
+            kwargs = {name: _plain(value) for name, value in spec.kwargs.items()}
+            if kwargs.get("learners") is not None:  # may be an exhausted iterator
+                kwargs["learners"] = [self.engine.scenario.vehicle_names[i] for i in self.engine.learners]
+            scenario = self.engine.scenario
+            from_alert = int(Decisions(np.zeros(1), scenario.time_step_s).before(scenario.horizon_s)[0])
+            spec = replace(spec, kwargs=kwargs, max_episode_steps=self.max_episode_steps or from_alert)
+        self._spec = spec
+
+
+def _plain(setting: Any) -> Any:
+    """Return a setting of an environment as plain data for JSON: a ``Scenario`` as a mapping, a path as a text."""
+    if isinstance(setting, Scenario):
+        return setting.declared()
+    if isinstance(setting, RewardParams):
+        return setting.model_dump(mode="json")
+    if isinstance(setting, ObservationSpec):
+        return asdict(setting)
+    if isinstance(setting, Path):
+        return str(setting)
+    if isinstance(setting, AutoresetMode):
+        return setting.value
+    if isinstance(setting, np.generic | np.ndarray):
+        return setting.tolist()
+    if isinstance(setting, Mapping):
+        return {name: _plain(value) for name, value in setting.items()}
+    return [_plain(value) for value in setting] if isinstance(setting, list | tuple) else setting
+
+
+class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]):
+    """One learner brakes in a line of vehicles that follow their scripts: ``gymnasium.make("EthBrake-v0")``.
+
+    Observation: float32 [F], the features of ``ObservationSpec``. Action: [1] in [-1, 1]; -1 full braking capacity, 0
+    coasts, +1 full driving capacity. Terminated: all vehicles are at rest and no command would move one. Truncated: the
+    horizon is reached. Infos: see docs/infos.md. ``reset(seed=s)`` starts the stream of worlds of seed s; ``reset()``
+    continues in it; ``options={"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}}`` starts from that
+    state. Raises ``InvalidInput`` for more or fewer than one learner, an action outside [-1, 1], and a step without an
+    episode.
+
+    Args:
+        scenario: a shipped name, the path of a YAML file, or a ``Scenario``.
+        render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/watching.md).
+        learners: the one vehicle that learns instead of the scenario's, by name (``vehicle_2``) or index from 0.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        observation: what the learner observes; None: ``observation_for(scenario)``.
+
+    >>> import ethbrake_marl as eb
+    >>> env = eb.EthBrakeEnv("paper-random")
+    >>> observation, info = env.reset(seed=7)
+    >>> observation.shape, info["time_s"]
+    ((27,), 0.5)
+    >>> observation, reward, terminated, truncated, info = env.step([-1.0])
+    >>> reward, terminated, truncated
+    (0.0, False, False)
+
+    """
+
+    metadata: dict[str, Any] = dict(Viewer.METADATA)  # noqa: RUF012  # as Gymnasium declares it
+
+    def __init__(
+        self,
+        scenario: AnyScenario = "paper-random",
+        render_mode: str | None = None,
+        learners: Sequence[str | int] | None = None,
+        reward: Reward = "harm",
+        observation: Observation | None = None,
+    ) -> None:
+        self.engine = make_engine(scenario, 1, learners=learners, reward=reward, observation=observation)
+        self.render_mode, self.viewer = render_mode, Viewer(self.engine, render_mode)
+        self.metadata = {**self.metadata, **self.viewer.metadata}
+        self.learner = only_learner(self.engine)
+        self._column = np.array([self.learner])
+        self._name = self.engine.scenario.vehicle_names[self.learner]
+        self.observation_space = feature_box(self.engine.observations[self.learner].features)
+        self.action_space = action_box()
+        self._running = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Start an episode; return the observation and the info.
+
+        Args:
+            seed: restart the stream of worlds from the first world of this seed; None: continue in the stream.
+            options: ``{"initial_state": ...}`` or ``{"listed_world": {"seed": 7, "number": 3}}`` choose the world; see
+                docs/episodes.md.
+
+        """
+        self._restart(seed, options)
+        self._running = True
+        self.viewer.began()
+        return self._observe(), Report.of(self.engine).plain_infos(self._column)[0]
+
+    def step(self, action: NDArray[Any]) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
+        """Advance by one time step; return observation, reward, terminated, truncated and info.
+
+        ``action`` is [1] in [-1, 1]: -1 full braking capacity, 0 coasts, +1 full driving capacity.
+        """
+        if not self._running:
+            raise InvalidInput("step: no episode is running; call reset first")
+        step = self.engine.step(learner_actions(self.engine, {self._name: action}))
+        self._running = not step.ended[0]
+        if self.render_mode is not None:
+            self.viewer.play()
+        info = Report.of(self.engine, step).plain_infos(self._column)[0]
+        reward = float(step.reward[0, self.learner])
+        return self._observe(), reward, bool(step.terminated[0]), bool(step.truncated[0]), info
+
+    def _observe(self) -> Observations:
+        observation: Observations = self.engine.observe(self.learner)[0].copy()
+        return observation

@@ -1,0 +1,276 @@
+"""PettingZoo's interfaces: all vehicles of one world are agents, acting in parallel, or in turn (AEC)."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.utils.conversions import parallel_to_aec_wrapper
+from pettingzoo.utils.wrappers import OrderEnforcingWrapper
+
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.envs.infos import OneWorld, Report
+from ethbrake_marl.envs.making import AnyScenario, IgnoredAction, action_box, feature_box, learner_actions, make_engine
+from ethbrake_marl.envs.viewer import Viewer
+from ethbrake_marl.errors import InvalidInput, check_whole_number, unknown_name
+from ethbrake_marl.game.actions import checked_action
+from ethbrake_marl.game.full_state import full_state, state_features
+from ethbrake_marl.game.observations import Observation, Observations
+from ethbrake_marl.game.rewards import Reward
+from ethbrake_marl.physics.state import Ints
+
+
+class SeededInside:
+    """Mixin for wrappers: ``np_random`` and ``np_random_seed`` are read from, and set on, the innermost environment."""
+
+    unwrapped: Any  # the innermost environment
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """Random generator of the environment inside; see ``EthBrakeParallelEnv.np_random``."""
+        generator: np.random.Generator = self.unwrapped.np_random
+        return generator
+
+    @np_random.setter
+    def np_random(self, generator: np.random.Generator) -> None:
+        self.unwrapped.np_random = generator
+
+    @property
+    def np_random_seed(self) -> int:
+        """Seed of the environment inside; see ``EthBrakeParallelEnv.np_random_seed``."""
+        seed: int = self.unwrapped.np_random_seed
+        return seed
+
+
+class Ordered(SeededInside, OrderEnforcingWrapper):  # type: ignore[misc]  # PettingZoo is untyped
+    """PettingZoo's ``OrderEnforcingWrapper``, with ``np_random`` of the wrapped environment."""
+
+    def __str__(self) -> str:
+        return str(self.env)
+
+
+class InTurns(SeededInside, parallel_to_aec_wrapper):  # type: ignore[misc]  # PettingZoo is untyped
+    """PettingZoo's wrapper from parallel to AEC, but an invalid action is refused at once, in its agent's own turn.
+
+    The turn stays with that agent, so that it can act again.
+    """
+
+    @classmethod
+    def around(cls, env: ParallelEnv[str, Observations, NDArray[Any]]) -> AECEnv[str, Observations, NDArray[Any]]:
+        """Return the AEC environment of a parallel environment of this package, possibly wrapped.
+
+        PettingZoo's order enforcement is included: methods called before ``reset`` raise an error.
+        """
+        return Ordered(cls(env))
+
+    def step(self, action: Any) -> None:
+        """Take the action [1] of the agent whose turn it is (``agent_selection``).
+
+        After the last agent's action, all vehicles advance by one time step. Raises ``InvalidInput`` for an invalid
+        action of a learner, and for any action but None after the agent's episode has ended.
+        """
+        agent, engine = self.agent_selection, self.env.unwrapped.engine
+        assert isinstance(engine, Engine)
+        if self.terminations[agent] or self.truncations[agent]:
+            if action is not None:
+                raise InvalidInput(f"step: the episode of {agent} is over; only None may follow, or reset")
+        elif engine.scenario.vehicle_names.index(agent) in engine.learners and not (action is None and engine.guard):
+            checked_action(action, (1,), agent)  # behind a shield, an action may be omitted
+        super().step(action)
+
+
+Infos = dict[str, dict[str, Any]]
+
+WhoIsAgent = Literal["all", "learners"]
+
+
+class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
+    """A line of vehicles ``vehicle_1`` (front) ... ``vehicle_N``, all of which are agents from the alert to the end.
+
+    Learners need an action [1] in [-1, 1] in each step: -1 full braking capacity, 0 coasts, +1 full driving capacity.
+    Actions of scripted vehicles are ignored; ``infos[agent]`` shows the commands of their scripts. All agents end at
+    the same time: terminated when all are at rest and no command would move one, truncated at the horizon. ``state()``
+    is the full state of the line, for central critics. Observations, rewards, infos and ``reset`` are as in
+    ``EthBrakeEnv``.
+
+    Args:
+        scenario: a shipped name, the path of a YAML file, its content as a mapping, or a ``Scenario``.
+        render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/watching.md).
+        learners: vehicles that learn instead of the scenario's, by name (``vehicle_2``) or index from 0; any number.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        observation: what every vehicle observes, or a mapping from name to observation; None: the scenario's.
+        agents: ``all`` vehicles, or ``learners`` only, for trainers that learn from every agent.
+        max_cycles: truncates an episode after this many steps; None: only at the horizon.
+
+    >>> import ethbrake_marl as eb
+    >>> env = eb.parallel_env(scenario="paper-random")
+    >>> observations, infos = env.reset(seed=7)
+    >>> while env.agents:
+    ...     observations, rewards, terminations, truncations, infos = env.step({"vehicle_2": [-1.0]})
+    >>> terminations["vehicle_2"], round(infos["vehicle_2"]["world_total_harm"], 2)
+    (True, 39.95)
+
+    """
+
+    metadata: dict[str, Any] = {"name": "ethbrake_v0", "is_parallelizable": True, **Viewer.METADATA}  # noqa: RUF012
+
+    def __init__(
+        self,
+        scenario: AnyScenario = "paper-random",
+        render_mode: str | None = None,
+        learners: Sequence[str | int] | None = None,
+        reward: Reward = "harm",
+        observation: Observation | None = None,
+        agents: WhoIsAgent = "all",
+        max_cycles: int | None = None,
+    ) -> None:
+        if max_cycles is not None:
+            check_whole_number("max_cycles", max_cycles, 1)
+        self.render_mode, self.max_cycles = render_mode, max_cycles
+        self.engine = make_engine(scenario, 1, learners=learners, reward=reward, observation=observation)
+        self.viewer = Viewer(self.engine, render_mode)
+        self.metadata = {**self.metadata, **self.viewer.metadata}
+        names = self.engine.scenario.vehicle_names
+        self._vehicles = _agent_vehicles(self.engine, agents)
+        self.possible_agents = [names[i] for i in self._vehicles.tolist()]
+        self.agents: list[str] = []
+        learners = [names[i] for i in self.engine.learners]
+        self._scripted = [agent for agent in self.possible_agents if agent not in learners]  # emptied after a warning
+        seen = self.engine.observations
+        self._alike = len({seen[i] for i in self._vehicles.tolist()}) == 1
+        self.observation_spaces = {names[i]: feature_box(seen[i].features) for i in self._vehicles.tolist()}
+        self.action_spaces = {agent: action_box() for agent in self.possible_agents}
+        self.state_space = feature_box(state_features(self.engine.scenario))
+
+    def observation_space(self, agent: str) -> Any:
+        """Return the observation space of the agent with this name, a float32 box [F]; the same object on each call."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Any:
+        """Return the action space of the agent with this name, a float32 box [1]; the same object on each call."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Observations], Infos]:
+        """Start an episode; return observations and infos by agent name.
+
+        Args:
+            seed: restart the stream of worlds from the first world of this seed; None: continue in the stream.
+            options: ``{"initial_state": ...}`` or ``{"listed_world": {"seed": 7, "number": 3}}`` choose the world; see
+                docs/episodes.md.
+
+        """
+        self._restart(seed, options)
+        self.agents = self.possible_agents[:]
+        self.viewer.began()
+        return self._observations(), self._infos(Report.of(self.engine))
+
+    def step(
+        self, actions: Mapping[str, Any]
+    ) -> tuple[dict[str, Observations], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
+        """Advance by one time step; return observations, rewards, terminations, truncations and infos by agent name.
+
+        ``actions`` maps agent names to actions [1] in [-1, 1]. Raises ``InvalidInput`` naming the learner whose action
+        is missing or invalid.
+        """
+        if not self.agents:
+            raise InvalidInput("step: no episode is running; call reset first")
+        if not isinstance(actions, (dict, Mapping)):  # dict first, because that check is faster
+            raise InvalidInput(f"step: actions = {actions!r}: must be a mapping such as {{'vehicle_2': [-1.0]}}")
+        for agent in actions:
+            if agent not in self.action_spaces:
+                raise unknown_name("agent", agent, self.possible_agents)
+        if self._scripted:
+            self._warn_of_ignored(actions)
+        step = self.engine.step(learner_actions(self.engine, actions))
+        agents = self.possible_agents
+        (rewards,) = step.reward.take(self._vehicles, axis=1).tolist()
+        terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
+        if self.max_cycles is not None and not terminated:
+            truncated = truncated or int(self.engine.steps[0]) >= self.max_cycles
+        infos = self._infos(Report.of(self.engine, step))
+        if terminated or truncated:
+            self.agents = []
+        if self.render_mode is not None:
+            self.viewer.play()
+        return (
+            self._observations(),
+            dict(zip(agents, rewards, strict=True)),
+            dict.fromkeys(agents, terminated),
+            dict.fromkeys(agents, truncated),
+            infos,
+        )
+
+    def state(self) -> Observations:
+        """Return the full state of all vehicles, float32 [S] within ``state_space``."""
+        self._check_started("state")
+        state: Observations = full_state(self.engine.worlds, self.engine.scenario)[0].copy()
+        return state
+
+    def _warn_of_ignored(self, actions: Mapping[str, Any]) -> None:
+        """Warn once about actions that are ignored because their vehicles follow scripts."""
+        ignored = [agent for agent in self._scripted if actions.get(agent) is not None]
+        if not ignored:
+            return
+        self._scripted = []
+        learners = [self.engine.scenario.vehicle_names[i] for i in self.engine.learners]
+        right = "nobody learns: name learners, for instance learners=['vehicle_2']"
+        if learners:
+            right = f"with agents='learners' the environment has the learners alone: {', '.join(learners)}"
+        text = f"step: actions of {', '.join(ignored)} are ignored, as scripts drive them; {right}"
+        warnings.warn(text, IgnoredAction, stacklevel=3)
+
+    def _observations(self) -> dict[str, Observations]:
+        if not self._alike:
+            each = (self.engine.observe(vehicle)[0] for vehicle in self._vehicles.tolist())
+            return dict(zip(self.possible_agents, each, strict=True))
+        every = self.engine.observe_all(self._vehicles)
+        return {agent: every[0, i] for i, agent in enumerate(self.possible_agents)}
+
+    def _infos(self, told: Report) -> Infos:
+        return dict(zip(self.possible_agents, told.plain_infos(self._vehicles), strict=True))
+
+
+def _agent_vehicles(engine: Engine, agents: WhoIsAgent) -> Ints:
+    """Return the indices of the vehicles that are agents; raise ``InvalidInput`` unless ``agents`` is a known word."""
+    if agents not in get_args(WhoIsAgent):
+        raise InvalidInput(f"agents = {agents!r}: must be 'all' or 'learners'")
+    if agents == "all":
+        return np.arange(engine.scenario.vehicles)
+    if not engine.learners:
+        raise InvalidInput(
+            f"agents = 'learners': nobody learns in {engine.scenario.name!r}; name learners, or take 'all'"
+        )
+    return np.array(engine.learners)
+
+
+parallel_env = EthBrakeParallelEnv
+
+
+def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
+    """Return the environment with agents acting in turn (AEC), front to rear.
+
+    ``scenario`` and ``settings`` are the arguments of ``parallel_env``.
+
+    >>> import ethbrake_marl as eb
+    >>> env = eb.raw_env("paper-random")
+    >>> env.reset(seed=7)
+    >>> env.agent_selection
+    'vehicle_1'
+
+    """
+    return InTurns.around(parallel_env(scenario, **settings))
+
+
+def env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
+    """Return the environment with agents acting in turn (AEC), the same as ``raw_env``.
+
+    ``scenario`` and ``settings`` are the arguments of ``parallel_env``. Actions are not clipped, and nothing ends an
+    episode early: an invalid action raises ``InvalidInput`` in its agent's turn, and the turn stays with that agent.
+    """
+    return raw_env(scenario, **settings)

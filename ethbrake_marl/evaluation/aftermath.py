@@ -1,0 +1,137 @@
+"""Watchers that measure more than harm during episodes: how far Vehicle 1 is shoved, and the paper's sampled harm."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ethbrake_marl.agents.driving import script_agents
+from ethbrake_marl.engine.memory import is_state_free
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.episode import Decisions
+from ethbrake_marl.physics.estimates import move_on
+from ethbrake_marl.physics.paper_map import sample_on
+from ethbrake_marl.physics.state import Floats, Worlds, sum_rows
+from ethbrake_marl.scenario.roles import ScriptSpec
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.task import Task
+
+
+class ShovedFront:
+    """Watcher that measures how far Vehicle 1 ends beyond the point that it would reach undisturbed.
+
+    ``shoved = distance driven - distance driven alone up to the horizon``. For a line at rest, this is the distance
+    from Vehicle 1's own stopping point. Negative where Vehicle 1 ends short of that point, for instance after an
+    obstacle threw it back. Create it with ``of``; the engine calls ``see`` after each step.
+
+    Args:
+        worlds: the n worlds at the alert.
+        own_way_m: [n] distance that Vehicle 1 drives undisturbed until the horizon.
+
+    """
+
+    def __init__(self, worlds: Worlds, own_way_m: Floats) -> None:
+        self._own_way_m = own_way_m
+        self._way_m = np.zeros(worlds.n)
+
+    @classmethod
+    def of(cls, worlds: Worlds, task: Task) -> ShovedFront | None:
+        """Return a watcher for ``worlds`` at the alert, or None if the measure is not defined for the task.
+
+        It is not defined if Vehicle 1 is controlled, if its script depends on the state, or if brakes build up.
+        """
+        script = None if 0 in task.vehicles else task.scenario.scripts.get(0)
+        vehicles = worlds.vehicles
+        command = None if script is None else ScriptSpec.parse(script).command(vehicles.braking_capacity_mps2[:, 0])
+        if command is None or vehicles.build_up.any():
+            return None
+        columns = (worlds.speeds_mps[:, 0], command, vehicles.latency_s[:, 0], vehicles.speed_limit_mps[:, 0])
+        speed, command, latency, limit = (np.array(column, np.float64)[:, np.newaxis] for column in columns)
+        _, way = move_on(speed, command, latency, limit, np.full(speed.shape, task.scenario.horizon_s))
+        return cls(worlds, way[:, 0])
+
+    def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
+        """Add the distance that Vehicle 1 drives in one step.
+
+        It is measured as the change of Vehicle 1's gap to an obstacle, the world's own or one placed out of reach.
+
+        Args:
+            before: the worlds at the beginning of the step.
+            command_mps2: [n, N] commanded accelerations during the step.
+            until_s: [n] time at which the step ends.
+
+        """
+        post = before.with_post_ahead(until_s - before.time_s)
+        after, _ = advance(post, command_mps2, until_s=until_s)
+        self._way_m += post.obstacle_gap_m - after.obstacle_gap_m
+
+    @property
+    def metres(self) -> Floats:
+        """Distance by which Vehicle 1 was shoved in each world so far, [n] m."""
+        shoved: Floats = self._way_m - self._own_way_m
+        return shoved
+
+
+VEHICLE_2 = 1  # index of the vehicle whose latency sets the time of the map's first sample
+
+
+class SampledHarm:
+    """Watcher that computes the harm of the episodes as the paper does, which samples the motion at fixed steps.
+
+    It replays the commands through ``advance_sampled``, the paper's equations of motion. Every world runs to the
+    horizon; after its exact episode has ended, the last commands are held. The agents saw the exact motion and do not
+    decide again. Create it with ``of``; the engine calls ``see`` after each step, and ``finish`` returns the harm.
+
+    Args:
+        worlds: the n worlds at the alert; they are copied.
+        scenario: scenario of the worlds, for time step and horizon.
+
+    """
+
+    def __init__(self, worlds: Worlds, scenario: Scenario) -> None:
+        self._worlds = worlds.copy()
+        self._command = np.zeros(worlds.speeds_mps.shape)
+        self._harm = np.zeros(worlds.n)
+        self._start_s = worlds.first_decision_s([VEHICLE_2])
+        self._step_s, self._horizon_s = scenario.time_step_s, scenario.horizon_s
+        self._samples = -1  # number of the last sample; the first step of the map ends at sample 0
+
+    @classmethod
+    def of(cls, worlds: Worlds, task: Task) -> SampledHarm | None:
+        """Return a watcher for ``worlds`` at the alert, or None if the measure is not defined for the task.
+
+        It is not defined with an obstacle or brakes that build up, which the paper's map does not model, nor if another
+        vehicle than Vehicle 2 decides, because the samples of the map are Vehicle 2's decisions.
+        """
+        obstacle = task.scenario.has_obstacle or worlds.obstacle_ahead.any()
+        if task.vehicles != (VEHICLE_2,) or obstacle or worlds.vehicles.build_up.any():
+            return None
+        if not all(map(is_state_free, script_agents(task.scenario, except_for=VEHICLE_2).values())):
+            return None
+        return cls(worlds, task.scenario)
+
+    def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
+        """Replay one step. Worlds whose episodes have ended keep their last commands.
+
+        Args:
+            before: the worlds at the beginning of the step.
+            command_mps2: [n, N] commanded accelerations during the step.
+            until_s: [n] time at which the step ends; equal to the beginning if the world's episode has ended.
+
+        """
+        running = until_s > before.time_s
+        self._command = np.where(running[:, np.newaxis] | (self._samples < 0), command_mps2, self._command)
+        self._move()
+
+    def _move(self) -> None:
+        """Advance every world to its next sample, or to the horizon if that comes first."""
+        self._samples += 1
+        next_s = np.minimum(Decisions(self._start_s, self._step_s).at(self._samples), self._horizon_s)
+        until_s = np.maximum(next_s, self._worlds.time_s)
+        impacts = sample_on(self._worlds, self._command, until_s, self._step_s)
+        self._harm += sum_rows(impacts.total_harm)
+
+    def finish(self) -> Floats:
+        """Advance every world to the horizon, and return its sampled harm, [n] m2/s2."""
+        while (self._worlds.time_s < self._horizon_s - 1e-6 * self._step_s).any():
+            self._move()
+        return self._harm

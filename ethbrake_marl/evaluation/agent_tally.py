@@ -1,0 +1,174 @@
+"""Sums of one agent's measures over some worlds, and the estimates computed from them.
+
+The sums are exact, so the order of addition does not change a bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.evaluation.measure_sets import BASELINE, Measure, MeasureSet, every_set
+from ethbrake_marl.evaluation.outcome import COLUMN, Outcome, Values
+from ethbrake_marl.evaluation.own_measures import registered_measure
+from ethbrake_marl.evaluation.statistics import Moments, exact_sum, rate
+from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.game.measures import REPORTED
+
+
+@dataclass(frozen=True, slots=True)
+class AgentTally:
+    """Exact sums of one agent's measures over some worlds; tallies of different worlds can be added with ``+``."""
+
+    # True/false measures, by name: number of worlds in which it is true, number of worlds with a value.
+    counts: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    moments: Mapping[str, Moments] = field(default_factory=dict)  # measures that are numbers, by name
+    # Measures that are compared with a baseline, by name: sum over worlds of own value times the baseline's value.
+    products: Mapping[str, Fraction] = field(default_factory=dict)
+
+    def __add__(self, other: AgentTally) -> AgentTally:
+        counts = dict(self.counts)
+        for name, (so, of) in other.counts.items():
+            before = counts.get(name, (0, 0))
+            counts[name] = before[0] + so, before[1] + of
+        moments, products = dict(self.moments), dict(self.products)
+        moments |= {name: moments.get(name, Moments()) + each for name, each in other.moments.items()}
+        products |= {name: products.get(name, Fraction()) + each for name, each in other.products.items()}
+        return AgentTally(counts, moments, products)
+
+    def count(self, name: str) -> int:
+        """Return the number of worlds in which the true/false measure ``name`` is true; 0 for an unknown name."""
+        return self.counts.get(name, (0, 0))[0]
+
+    def share(self, name: str, worlds: int) -> float | None:
+        """Return the share, 0 to 1, of worlds in which the true/false measure ``name`` is true.
+
+        ``worlds`` is the number of evaluated worlds. Returns None if the measure lacks a value in some of them.
+        """
+        so, of = self.counts.get(name, (0, 0))
+        return so / worlds if of == worlds else None
+
+    def sums(self, name: str, worlds: int) -> Moments | None:
+        """Return count, sum and sum of squares of the measure ``name``, whose values are numbers.
+
+        ``worlds`` is the number of evaluated worlds. Returns None if the measure lacks a value in some of them.
+        """
+        moments = self.moments.get(name)
+        return moments if moments is not None and moments.count == worlds else None
+
+
+def tally_agents(
+    outcomes: Mapping[str, Outcome],
+    contexts: Mapping[str, Any],
+    *,
+    baseline: str = BASELINE,
+    objectives: Sequence[str] | None = None,
+) -> dict[str, AgentTally]:
+    """Return the sums of every agent's measures over the same worlds, by the agent's name.
+
+    Args:
+        outcomes: outcome of each agent, by the agent's name.
+        contexts: what each set of measures prepared for these worlds; see ``contexts_of``.
+        baseline: name of the agent to compare with, for sets of measures without a baseline of their own.
+        objectives: objectives such as ``"social:45"``, which weigh a vehicle's own harm against the others'. Also sum
+            the harm that each vehicle bears, and its value under each objective; None: neither.
+
+    """
+    values: dict[str, dict[str, Values]] = {}
+    for agent, outcome in outcomes.items():
+        columns = {
+            measure.name: measure.values(outcome, contexts.get(name))
+            for name, each in every_set(outcome.metrics)
+            for measure in (*each.measures, *each.counted)
+        }
+        values[agent] = {name: column for name, column in columns.items() if column is not None}
+        values[agent] |= {} if objectives is None else outcome.borne(objectives)
+    compared_with = {
+        str(measure.of): each.baseline or baseline
+        for _, each in every_set()
+        for measure in each.measures
+        if measure.against
+    }
+    tallies = {}
+    for agent, own in values.items():
+        truths = {name: column for name, column in own.items() if column.dtype == np.bool_}
+        tallies[agent] = AgentTally(
+            {name: (int(column.sum()), len(column)) for name, column in truths.items()},
+            {name: Moments.of(column) for name, column in own.items() if name not in truths},
+            {
+                name: exact_sum(own[name], values[other][name])
+                for name, other in compared_with.items()
+                if name in own and other in values
+            },
+        )
+    return tallies
+
+
+def estimate_all(
+    tallies: Mapping[str, AgentTally], agent: str, worlds: int, *, baseline: str
+) -> dict[str, Estimate | None]:
+    """Return the estimate (value and 95 % interval) of every measure of one agent, by the measure's name.
+
+    Args:
+        tallies: sums of every agent, by the agent's name.
+        agent: name of the agent.
+        worlds: number of evaluated worlds. A measure that lacks a value in some of them has the estimate None.
+        baseline: name of the agent to compare with; comparisons are None if it was not evaluated.
+
+    """
+    own = tallies[agent]
+    columns = [name.removeprefix(COLUMN) for name in (*own.counts, *own.moments) if name.startswith(COLUMN)]
+    registered = list(REPORTED.values())
+    columns.sort(key=lambda column: registered.index(each) if (each := registered_measure(column)) else len(registered))
+    return {
+        measure.name: _estimate(measure, own, tallies.get(each.baseline or baseline), worlds, each.whole)
+        for _, each in every_set(columns)
+        for measure in each.measures
+    }
+
+
+def _estimate(
+    measure: Measure, own: AgentTally, baseline: AgentTally | None, worlds: int, whole: str | None
+) -> Estimate | None:
+    """Return the estimate of one measure; None if it lacks a value in some of the ``worlds``, or cannot be compared.
+
+    Args:
+        measure: the measure.
+        own: the agent's sums.
+        baseline: the sums of the agent to compare with; None: there is none.
+        worlds: number of evaluated worlds.
+        whole: name of a true/false measure (``MeasureSet.whole``). The agent is compared with the baseline only if this
+            is true in all worlds; None: no such condition.
+
+    """
+    name = measure.name if callable(measure.of) else measure.of
+    if own.share(name, worlds) is not None:
+        return rate(own.count(name), worlds)
+    sums = own.sums(name, worlds)
+    if sums is None or not measure.against:
+        return None if sums is None else sums.estimate
+    other = None if baseline is None else baseline.sums(name, worlds)
+    if other is None or (whole is not None and own.count(whole) != worlds):
+        return None
+    product = own.products[name]
+    return sums.decrease(other, product) if measure.against == "decrease" else sums.minus(other, product).estimate
+
+
+def lower_bounds(tally: AgentTally, worlds: int) -> frozenset[str]:
+    """Return the names of the measures whose means are only lower bounds for one agent.
+
+    ``tally`` holds the agent's sums over ``worlds`` worlds. A set of measures may name a true/false measure
+    (``MeasureSet.whole``) that says whether a world's values are complete. If this is false in some world, the means of
+    the set are lower bounds.
+    """
+
+    def is_partial(each: MeasureSet) -> bool:
+        share = None if each.whole is None else tally.share(each.whole, worlds)
+        return share is not None and share < 1.0
+
+    partial = [each for _, each in every_set() if is_partial(each)]
+    return frozenset(measure.name for each in partial for measure in each.measures if not measure.against)

@@ -1,0 +1,148 @@
+"""Comparison of two results files on the same worlds of the same scenario."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput, count_of
+from ethbrake_marl.evaluation.exploits import MARK, Exploits
+from ethbrake_marl.evaluation.per_world import COMPARED, HARMS, SAME, Result, told_of
+from ethbrake_marl.evaluation.statistics import paired_difference, unpaired_difference
+from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.physics.state import Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Difference between two results in the mean harm per world of one agent: second minus first (m2/s2)."""
+
+    agent: str  # name of the agent, the same in both results
+    policy: Literal["same", "other", "none"]  # trained policies in both results: equal, different, or not any
+    harms: Mapping[str, Estimate]  # harm (``first_impact_harm``, ``total_harm``) -> difference with interval
+    exploits: tuple[Exploits, Exploits]  # behaviour that harm does not count, in the first and in the second result
+
+    @property
+    def marked(self) -> str:
+        """Name of the agent, followed by ‡ if in either result its behaviour does damage that harm does not count."""
+        return f"{self.agent} {MARK}" if any(each.names for each in self.exploits) else self.agent
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain data for JSON: ``agent``, ``policy``, ``exploits``, each harm's difference with its interval."""
+        harms = {f"{name}_difference": estimate for name, estimate in self.harms.items()}
+        exploits = [list(each.names) for each in self.exploits]
+        return {"agent": self.agent, "policy": self.policy, **Estimate.side_by_side(harms), "exploits": exploits}
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Comparison of two results files on the same worlds, agent by agent."""
+
+    differences: tuple[Difference, ...]  # second result minus first, one entry per agent of both
+    unpaired_because: str | None  # reason why the intervals are not paired by world; None: they are paired
+    left_over: tuple[tuple[str, ...], tuple[str, ...]]  # names of agents in the first result only, in the second only
+    # Settings of the agents that differ, by name: value in the first and in the second result; None: not there.
+    other_settings: Mapping[str, tuple[str | None, str | None]]
+    # Versions of packages that differ, by name: version in the first and in the second result; None: not there.
+    other_versions: Mapping[str, tuple[str | None, str | None]]
+
+    @property
+    def exploits_line(self) -> str:
+        """Sentence about agents whose behaviour does damage that harm does not count (``Exploits``).
+
+        It says in which result they do; it is empty if no agent does.
+        """
+        found: dict[str, Exploits] = {}
+        for each in self.differences:
+            first, second = each.exploits
+            same = {each.agent: first}
+            apart = {f"{each.agent} in the first": first, f"{each.agent} in the second": second}
+            found |= same if first == second else apart
+        return Exploits.sentence(found)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the comparison as plain data for JSON, with one object per agent under ``agents``."""
+        return {
+            "intervals": "paired" if self.unpaired_because is None else "unpaired",
+            "unpaired_because": self.unpaired_because,
+            "agents": [difference.to_json() for difference in self.differences],
+            "only_in_first": list(self.left_over[0]),
+            "only_in_second": list(self.left_over[1]),
+            "other_settings": {name: list(both) for name, both in self.other_settings.items()},
+            "other_versions": {name: list(both) for name, both in self.other_versions.items()},
+        }
+
+
+def compare_results(first: Result, second: Result) -> Comparison:
+    """Compare the mean harms of agents of the same name in two results, as second minus first.
+
+    The comparison is paired by world if both results come with a file of every world. Raises ``InvalidInput`` for
+    results of different kinds, on different worlds or scenarios, or without a common agent.
+    """
+    for key, what in SAME.items():
+        told, told_second = (told_of(result.about, key) for result in (first, second))
+        if told != told_second:
+            raise InvalidInput(
+                f"{second.path}: is about {what} than {first.path} ({key} {told_second!s:.12} and {told!s:.12}):"
+                " no comparison"
+            )
+    common = [agent for agent in first.rows if agent in second.rows]
+    left_over = [tuple(agent for agent in one.rows if agent not in common) for one in (first, second)]
+    if not common:
+        agents = " and ".join(f"{', '.join(names)}" for names in left_over)
+        raise InvalidInput(f"{first.path} and {second.path} have no agent in common: {agents}")
+    worlds, because = _worlds_of_both(first, second, common)
+    differences = []
+    for agent in common:
+        one, other = first.rows[agent], second.rows[agent]
+        if worlds is None:
+            sizes = other["episodes"], one["episodes"]
+            harms = {
+                harm: unpaired_difference(second.estimate(agent, harm), sizes[0], first.estimate(agent, harm), sizes[1])
+                for harm in COMPARED[first.about["kind"]]
+            }
+        else:
+            before, after = worlds[agent]
+            harms = {name: paired_difference(after[:, k], before[:, k]) for k, name in enumerate(HARMS)}
+        policies = one["policy_sha256"], other["policy_sha256"]
+        same: Literal["same", "other"] = "same" if policies[0] == policies[1] else "other"
+        exploits = Exploits.of_json(one), Exploits.of_json(other)
+        differences.append(Difference(agent, same if any(policies) else "none", harms, exploits))
+    changed = []
+    for key in ("agent_settings", "versions"):
+        one, other = (each if isinstance(each := of.about.get(key), dict) else {} for of in (first, second))
+        names = [name for name in dict.fromkeys([*one, *other]) if one.get(name) != other.get(name)]
+        changed.append({name: (one.get(name), other.get(name)) for name in names})
+    return Comparison(tuple(differences), because, (left_over[0], left_over[1]), *changed)
+
+
+Worlds = dict[str, tuple[Floats, Floats]]  # agent -> harms [n, 2] of every world, in the first and second result
+
+
+def _worlds_of_both(first: Result, second: Result, common: Sequence[str]) -> tuple[Worlds | None, str | None]:
+    """Return the harms of every world in both results, and None; or None, and the reason why they cannot be paired.
+
+    ``common``: names of the agents that both results have.
+    """
+    try:
+        one, other = first.harms(), second.harms()
+    except InvalidInput as error:
+        return None, f"one row per world is needed of both; {error}"
+    found = {}
+    for agent in common:
+        worlds = sorted(one.get(agent, {}))
+        if len(worlds) != first.rows[agent]["episodes"] or worlds != sorted(other.get(agent, {})):
+            return None, f"the rows per world of {agent} are not those of {count_of(len(worlds), 'same world')}"
+        found[agent] = tuple(np.array([side[agent][world] for world in worlds]) for side in (one, other))
+        for result, harms in zip((first, second), found[agent], strict=True):
+            for name, mean in zip(HARMS, harms.mean(axis=0), strict=True):
+                told = result.rows[agent].get(name)
+                if told is not None and not math.isclose(told, mean, rel_tol=1e-9, abs_tol=1e-9):
+                    raise InvalidInput(
+                        f"{result.path}: {agent}: {name} = {told:g}, but the mean of its worlds is {mean:g}"
+                    )
+    return found, None  # type: ignore[return-value]  # two of them each

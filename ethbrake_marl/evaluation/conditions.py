@@ -1,0 +1,112 @@
+"""Conditions of a result: the scenario, the worlds and the vehicles behind a table, a figure or a report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.errors import count_of
+from ethbrake_marl.physics.state import Worlds
+from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.task import Task
+
+_SYMBOLS = {
+    "gaps_m": ("d", "m"),
+    "speeds_mps": ("v", "m/s"),
+    "braking_capacity_mps2": ("braking capacity", "m/s²"),
+    "driving_capacity_mps2": ("driving capacity", "m/s²"),
+    "latency_s": ("τ", "s"),
+    "mass_t": ("m", "t"),
+    "restitution": ("e", ""),
+    "obstacle_gap_m": ("obstacle at", "m"),
+    "friction": ("friction", ""),
+    "brake_rate_mps3": ("brake rate", "m/s³"),
+    "release_rate_mps3": ("release rate", "m/s³"),
+}
+
+_STAY = "\u00a0"  # a non-breaking space
+
+
+class Conditions(dict[str, Any]):
+    """Dictionary that describes how a result was obtained: scenario, seed, vehicles, scripts, quantities of the worlds.
+
+    ``of`` and ``of_ranges`` create one with the quantities only, ``of_test`` one with all entries.
+    """
+
+    @classmethod
+    def of(cls, worlds: Worlds) -> Conditions:
+        """Return every quantity of the worlds by key: ``{"gaps_m": [7.0, [5.0, 9.0]], "restitution": 0.1}``.
+
+        The value is a list with an entry for each vehicle or pair, or a single entry for a quantity of the whole world.
+        An entry is a number if all worlds agree, else ``[smallest, largest]``.
+        """
+        return cls.of_ranges({key: rule.of(worlds).T for key, rule in QUANTITY.of(worlds).items()})
+
+    @classmethod
+    def of_ranges(cls, ranges: Mapping[str, Iterable[Any]]) -> Conditions:
+        """Return the same dictionary as ``of``, from values instead of worlds.
+
+        Args:
+            ranges: for each quantity's key, one array per vehicle or pair. It may hold the values of all worlds, or
+                just the smallest and the largest one.
+
+        """
+        found = {
+            key: [(float(np.nanmin(each)), float(np.nanmax(each))) for each in entries]
+            for key, entries in ranges.items()
+        }
+        told = {key: [low if low == high else [low, high] for low, high in ends] for key, ends in found.items()}
+        return cls({key: ends[0] if QUANTITY.declared[key].per == "world" else ends for key, ends in told.items()})
+
+    @classmethod
+    def of_test(
+        cls, task: Task, seed: int | None, count: int, because: Mapping[str, str | None], quantities: Mapping[str, Any]
+    ) -> Conditions:
+        """Return all conditions of an evaluation, with the keys that JSON results have under ``parameters``.
+
+        Args:
+            task: the scenario and the controlled vehicles.
+            seed: seed of the list; None for worlds that the caller passed.
+            count: number of worlds.
+            because: key of a set of measures (``MeasureSet.because_key``) -> why the set does not apply to these
+                worlds; None if it applies.
+            quantities: quantities of the worlds, as ``of`` returns them.
+
+        """
+        scenario = task.scenario
+        driven = [scenario.vehicle_names[i] for i in task.vehicles]
+        scripts = {scenario.vehicle_names[i]: script for i, script in scenario.scripts.items()}
+        return cls(
+            scenario=scenario.name,
+            seed=seed,
+            count=count,
+            **({"controlled_vehicle": driven[0]} if len(driven) == 1 else {"controlled_vehicles": driven}),
+            scripts={name: script for name, script in scripts.items() if name not in driven},
+            time_step_s=scenario.time_step_s,
+            horizon_s=scenario.horizon_s,
+            **because,
+            **quantities,
+        )
+
+    @property
+    def line(self) -> str:
+        """Caption in one line: scenario, number of worlds, seed, and the quantities with symbols and units."""
+        seed = "" if self["seed"] is None else f", seed {self['seed']}"
+        return f"{self['scenario']}: {count_of(self['count'], 'world')}{seed}; {self.quantities}"
+
+    @property
+    def quantities(self) -> str:
+        """The quantities in one line, each with symbol and unit: ``d = 7 m; v = (20, 18, 20) m/s; ...``.
+
+        If all vehicles or pairs have the same value, it is written once.
+        """
+        parts = []
+        for key, (symbol, unit) in _SYMBOLS.items():
+            if key in self:
+                entries = [self[key]] if QUANTITY.declared[key].per == "world" else self[key]
+                texts = [f"{e[0]:.3g}–{e[1]:.3g}" if isinstance(e, list) else f"{e:.4g}" for e in entries]
+                told = texts[0] if len(set(texts)) == 1 else f"({f',{_STAY}'.join(texts)})"
+                parts.append(f"{symbol}{_STAY}={_STAY}{told}{f'{_STAY}{unit}' if unit else ''}")
+        return "; ".join(parts)

@@ -1,0 +1,250 @@
+"""``Evaluation``: the outcomes of several agents in the same worlds."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, unknown_name
+from ethbrake_marl.evaluation.conditions import Conditions
+from ethbrake_marl.evaluation.measure_sets import MEASURE_SETS, Silent, contexts_of, silent_because
+from ethbrake_marl.evaluation.outcome import LeftOut, Outcome, none_for_nan
+from ethbrake_marl.evaluation.rescores import Rescored, Rescores
+from ethbrake_marl.evaluation.statistics import mean, rate
+from ethbrake_marl.files.sheet import Column, Sheet
+from ethbrake_marl.game.harm import HARM_COUNTS
+from ethbrake_marl.game.objectives import Declared, scored
+from ethbrake_marl.physics.messages import Messages
+from ethbrake_marl.physics.state import Bools, Ints, Worlds
+from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.task import Task
+
+_SHOWN_AGENTS = 5  # number of agents named in ``repr``
+
+Columns = dict[str, list[Any]]  # columns of a table with one row per agent and world
+
+_TEXTS = {"agent", "scenario", "ended", "knows"}  # columns of texts, in addition to those of sets of measures
+
+_ALWAYS_SHOWN = ("gaps_m", "speeds_mps", "obstacle_gap_m")  # quantities in these tables even if all worlds agree
+
+_LIBRARIES = ("pandas", "polars", "columns")  # kinds of frame, in order of preference
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Outcomes of several agents that drove the same vehicles in the same worlds; row k of every array is world k.
+
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> agents = {name: eb.make_agent(name) for name in ("full_brake", "coast")}
+    >>> evaluation = eb.evaluate(scenario.sample(3, seed=7), agents, scenario=scenario)
+    >>> list(evaluation.outcomes), evaluation.vehicle, evaluation.index
+    (['full_brake', 'coast'], 1, array([0, 1, 2]))
+
+    """
+
+    scenario: Scenario  # scenario of the worlds
+    vehicles: tuple[int, ...]  # indices (0 = front) of the vehicles that the agents controlled; the others ran scripts
+    worlds: Worlds  # the n worlds at the alert
+    index: Ints  # [n] number of each world in the evaluation list of ``seed``, from 0
+    seed: int | None  # seed from which the worlds were drawn; None for worlds that the caller passed
+    outcomes: dict[str, Outcome]  # results of each agent in these worlds, by the agent's name
+    left_out: tuple[LeftOut, ...] = ()  # worlds that failed with some agent; they are in none of the arrays
+    # Groups of the worlds: ``{"scenario": [n names], "vehicle_2_type": [n names]}``. Only a mixture has ``scenario``,
+    # and only a scenario with vehicle types has the types; else it is empty.
+    kinds: Mapping[str, NDArray[np.str_]] = field(default_factory=dict)
+    host: str = ""  # name of the simulator that moved the worlds; "": the physics of this package
+    _computed: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # cache of ``once``
+
+    def __repr__(self) -> str:
+        drivers = [f"{agent!r:.42}" for agent in list(self.outcomes)[:_SHOWN_AGENTS]]
+        more = len(self.outcomes) - len(drivers)
+        drivers += [f"{more} more"] if more else []
+        seed = "" if self.seed is None else f" of seed {self.seed}"
+        return (
+            f"Evaluation({self.scenario.name!r}, {count_of(self.worlds.n, 'world')}{seed}, {self.task.names:.80} driven"
+            f" by {', '.join(drivers)})"
+        )
+
+    @property
+    def vehicle(self) -> int:
+        """Index (0 = front) of the only controlled vehicle; raises ``InvalidInput`` if there are several or none."""
+        return self.task.vehicle
+
+    @property
+    def task(self) -> Task:
+        """The scenario and the controlled vehicles, as a ``Task``."""
+        return Task(self.scenario, self.vehicles)
+
+    def once(self, compute: Callable[[Evaluation], T]) -> T:
+        """Return ``compute(self)``. A later call with the same function returns the stored result."""
+        if compute not in self._computed:
+            self._computed[compute] = compute(self)
+        found: T = self._computed[compute]
+        return found
+
+    @classmethod
+    def join(cls, parts: Sequence[Evaluation]) -> Evaluation:
+        """Join the evaluations of the parts of a list of worlds into the evaluation of the whole list.
+
+        Args:
+            parts: evaluations of the same agents, in the order of their worlds in the list.
+
+        Raises ``PhysicsError`` if every world was left out.
+
+        """
+        left_out = tuple(left for part in parts for left in part.left_out)
+        some = [part for part in parts if part.worlds.n]
+        if not some:
+            raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in left_out})
+        if len(parts) == 1:
+            return parts[0]
+        return replace(
+            some[0],
+            worlds=Worlds.concatenate([part.worlds for part in some]),
+            index=np.concatenate([part.index for part in some]),
+            outcomes={name: Outcome.join([part.outcomes[name] for part in some]) for name in some[0].outcomes},
+            left_out=left_out,
+            kinds={name: np.concatenate([part.kinds[name] for part in some]) for name in some[0].kinds},
+        )
+
+    def take(self, rows: Ints | Bools) -> Evaluation:
+        """Return the same evaluation with some of its worlds only, and an empty ``left_out``.
+
+        Args:
+            rows: row numbers of the worlds to keep, or a mask [n] that is true for them.
+
+        """
+        outcomes = {name: outcome.take(rows) for name, outcome in self.outcomes.items()}
+        kinds = {name: column[rows] for name, column in self.kinds.items()}
+        return replace(
+            self, worlds=self.worlds.take(rows), index=self.index[rows], outcomes=outcomes, left_out=(), kinds=kinds
+        )
+
+    @property
+    def hidden(self) -> Bools:
+        """Whether the V2X channel hides something about the line from a controlled vehicle, for each world: [n] bool.
+
+        It does where messages arrive late, only from time to time, or not at all.
+        """
+        from_each = [self.worlds.vehicles.hide_from(i) | Messages.of(self.worlds).periodic for i in self.vehicles]
+        hidden: Bools = np.logical_or.reduce([np.zeros(self.worlds.n, np.bool_), *from_each])
+        return hidden
+
+    @property
+    def conditions(self) -> Conditions:
+        """Scenario, seed, controlled vehicles and every quantity of the worlds, as plain data for captions and JSON."""
+        because = silent_because(contexts_of(self))
+        return Conditions.of_test(self.task, self.seed, self.worlds.n, because, Conditions.of(self.worlds))
+
+    def per_world(self, objectives: Sequence[Declared] = ()) -> Columns:
+        """Return a table with one row per agent and world, as columns; None stands for a missing value.
+
+        The result maps the name of a column to its values; docs/per-world.md lists the columns. Initial quantities are
+        named ``gap_1_m``, ``speed_1_mps``, ``latency_2_s``, ``restitution``. Each of ``objectives`` (``total``,
+        ``social:45``) adds columns with its value for each vehicle.
+        """
+        n, contexts = self.worlds.n, contexts_of(self)
+        initial: Columns = {"world": self.index.tolist()}
+        initial |= {name: column.tolist() for name, column in self.kinds.items()}
+        for key, rule in QUANTITY.of(self.worlds).items():
+            values = rule.of(self.worlds)
+            if key in _ALWAYS_SHOWN or np.ptp(values, axis=0).any():
+                initial |= {rule.column_of(i): none_for_nan(values[:, i]) for i in range(values.shape[1])}
+        found: Columns = {}
+        for agent, outcome in self.outcomes.items():
+            told = outcome.columns()
+            for name, each in MEASURE_SETS.items():
+                context = contexts[name]
+                for column, of in each.per_world.items():
+                    told[column] = None if isinstance(context, Silent) else of(outcome, context)
+            told |= {name: column for name, column in outcome.borne(objectives).items() if name not in told}
+            columns: Columns = {
+                "agent": [agent] * n,
+                **initial,
+                **{name: [None] * n if column is None else none_for_nan(column) for name, column in told.items()},
+                "knows": [outcome.knows.text] * n,
+                "hidden": self.hidden.astype(int).tolist(),
+            }
+            for left in self.left_out:
+                told_of = {"agent": agent, "world": left.world, "ended": f"left out: {left.agent}: {left.reason}"}
+                columns = {name: [*values, told_of.get(name)] for name, values in columns.items()}
+            found = {name: [*found.get(name, ()), *values] for name, values in columns.items()}
+        return found
+
+    def arrays(self, objectives: Sequence[Declared] = ()) -> dict[str, NDArray[Any]]:
+        """Return the columns of ``per_world`` as arrays, by name.
+
+        NaN stands for a missing number, the empty text for a missing text. Each of ``objectives`` adds columns.
+        """
+        found, of_sets = {}, [each.texts for each in MEASURE_SETS.values()]
+        for name, values in self.per_world(objectives).items():
+            texts = name in _TEXTS.union(*of_sets) or (name.startswith("vehicle_") and name.endswith("_type"))
+            found[name] = np.array([("" if texts else np.nan) if value is None else value for value in values])
+        return found
+
+    def to_frame(self, library: str | None = None) -> Any:
+        """Return a table with one row per agent and world: the columns of ``--per-world``, NaN for a missing number.
+
+        docs/per-world.md lists the columns. The result is a pandas ``DataFrame`` if pandas is installed, else a polars
+        ``DataFrame``, else a mapping from column name to array. ``library`` chooses one of them: ``pandas``, ``polars``
+        or ``columns``. Raises ``UnknownName`` for another name, and ``InvalidInput`` for a library that is not
+        installed.
+        """
+        if library is not None and library not in _LIBRARIES:
+            raise unknown_name("library", library, _LIBRARIES)
+        chosen = library or next((name for name in _LIBRARIES[:-1] if find_spec(name) is not None), _LIBRARIES[-1])
+        if chosen == _LIBRARIES[-1]:
+            return self.arrays()
+        if find_spec(chosen) is None:
+            raise InvalidInput(f"to_frame: {chosen} is not installed: {sys.executable} -m pip install {chosen}")
+        return import_module(chosen).DataFrame(self.arrays())
+
+    def rescore(self, declared: Sequence[Declared] | None = None) -> Rescores:
+        """Return the mean harm of every agent, by vehicle, under several objectives and both counts of harm.
+
+        Args:
+            declared: the objectives, such as ``"total"`` or ``"social:45"``; None: the standard ones
+                (``standard_objectives``).
+
+        """
+        return Rescores(
+            [
+                Rescored(agent, objective, harm_count, tuple(mean(column) for column in values.T))
+                for agent, outcome in self.outcomes.items()
+                for harm_count in HARM_COUNTS
+                for objective, values in scored(outcome.ledger, harm_count, declared).items()
+            ]
+        )
+
+    def _repr_html_(self) -> str:
+        """Return HTML of a table with collisions and harm of each agent, for a notebook."""
+        share = Column("Collisions", digits=1, scale=100.0, unit=" %")
+        rows = [
+            (agent, rate(int(each.collided.sum()), self.worlds.n), mean(each.first_impact_harm), mean(each.total_harm))
+            for agent, each in self.outcomes.items()
+        ]
+        note = "Means per world in m²/s², with their 95 % intervals. eb.summarise tells more."
+        return Sheet(repr(self), ("Agent", share, Column("First-impact harm"), Column("Total harm")), rows, note).html()
+
+    def complete(self) -> Evaluation:
+        """Return this evaluation; raise ``PhysicsError``, naming the worlds, if some worlds were left out."""
+        if self.left_out:
+            raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
+        return self
+
+    def outcome(self, agent: str) -> Outcome:
+        """Return the results of the agent with this name; raise ``InvalidInput`` if it was not evaluated."""
+        if agent not in self.outcomes:
+            raise InvalidInput(f"agent {agent!r} was not evaluated; evaluated: {', '.join(self.outcomes)}")
+        return self.outcomes[agent]

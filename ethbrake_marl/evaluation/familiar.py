@@ -1,0 +1,78 @@
+"""Warnings about trained policies that drive in worlds unlike those of their training."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ethbrake_marl.agents.protocol import Driver, Team
+from ethbrake_marl.errors import Unfamiliar
+from ethbrake_marl.physics.state import Worlds
+from ethbrake_marl.policies.manifest import Manifest
+from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.schema import Scenario
+
+_MOST_BEYOND = 0.05  # share of worlds outside the training's range that is tolerated without a warning
+
+_TRAINED = 2_000  # number of worlds drawn from the training's scenario to find the range of each quantity
+
+
+def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, vehicles: Sequence[int]) -> None:
+    """Warn (``Unfamiliar``) about each trained policy that is to drive in worlds outside the range of its training.
+
+    The training's worlds are drawn from the scenario in the policy's manifest. If that scenario cannot be drawn here,
+    there is no warning. Of the V2X channel, only the latencies are compared.
+
+    Args:
+        agents: agents by name; those that are not trained policies are ignored.
+        worlds: worlds at the alert in which they are to drive.
+        scenario: scenario of these worlds.
+        vehicles: indices (0 = front) of the vehicles that each agent drives.
+
+    """
+    drives: dict[str, tuple[str, Manifest, dict[str, None]]] = {}  # by hash: the first agent, vehicles in order
+    for name, agent in agents.items():
+        for vehicle, driver in Team.of(agent, vehicles).drivers.items():
+            if isinstance(manifest := getattr(driver, "manifest", None), Manifest):
+                drives.setdefault(manifest.manifest_sha256, (name, manifest, {}))[2][f"vehicle_{vehicle + 1}"] = None
+    for name, manifest, vehicles_driven in drives.values():
+        try:
+            trained = Scenario.of_dump(manifest.scenario)
+            before = trained.sample(_TRAINED, 0).worlds
+        except ValueError:
+            continue
+        found = [each for each in vehicles_driven if each not in manifest.learners]
+        if not np.isclose(trained.time_step_s, scenario.time_step_s):
+            found.append("time_step_s")
+        found += [f"{worlds.N} vehicles"] if worlds.N != before.N else _beyond(before, worlds)
+        for i, script in scenario.scripts.items():
+            if str(trained.scripts.get(i, script)) != str(script):
+                found.append(f"{scenario.vehicle_names[i]} by {script}")
+        if found:
+            beyond = f"trained on {trained.name}, and not for what {scenario.name} has: {', '.join(found)}"
+            warnings.warn(f"{name}: {beyond}", Unfamiliar, stacklevel=2)
+
+
+def _beyond(before: Worlds, worlds: Worlds) -> list[str]:
+    """Return descriptions of quantities of ``worlds`` that lie outside the range of the training's worlds ``before``.
+
+    Example: ``["latency_s in 40 % of the worlds", "no friction"]``.
+    """
+    found, known, here = [], QUANTITY.of(before), QUANTITY.of(worlds)
+    for key, rule in here.items():
+        if key not in known:
+            found.append(key)
+            continue
+        values, seen = rule.of(worlds), rule.of(before)
+        low, high = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
+        margin = 0.01 * (high - low) + 1e-9 * np.abs(high)
+        share = ((values < low - margin) | (values > high + margin)).any(axis=1).mean()
+        none = np.isnan(values).any(axis=1).mean()
+        if none > _MOST_BEYOND and not np.isnan(seen).any():
+            found.append(f"no {key} in {100.0 * none:.0f} % of the worlds")
+        if share > _MOST_BEYOND:
+            found.append(f"{key} in {100.0 * share:.0f} % of the worlds")
+    gone = {key: rule.of(before) < rule.high for key, rule in known.items() if key not in here}
+    return found + [f"no {key}" for key, there in gone.items() if there.any(axis=1).all()]  # all had it before

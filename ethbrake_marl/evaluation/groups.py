@@ -1,0 +1,44 @@
+"""Results tables by group of worlds: one table for each scenario of a mixture, or for each type of a vehicle."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.measure_sets import BASELINE
+from ethbrake_marl.evaluation.summary import SummaryTable, summarise
+
+NO_TYPE = "no type"  # group of worlds in which the vehicle has no type
+
+
+def summarise_by(evaluation: Evaluation, by: str, *, baseline: str = BASELINE) -> dict[str, SummaryTable]:
+    """Return one results table (``summarise``) for each group of worlds, by the group's name, in alphabetical order.
+
+    Args:
+        evaluation: evaluation on a mixture, or on a scenario with types of vehicles.
+        by: kind of group: ``scenario``, or a vehicle's type such as ``vehicle_2_type``.
+        baseline: name of the agent to compare with.
+
+    Raises ``InvalidInput`` for worlds without groups, ``UnknownName`` for an unknown ``by``.
+
+    >>> import ethbrake_marl as eb
+    >>> delays = eb.load_scenario("mixture-delays")
+    >>> agents = {"full_brake": eb.make_agent("full_brake")}
+    >>> found = eb.summarise_by(eb.evaluate(delays.sample(30, seed=7), agents, scenario=delays), "scenario")
+    >>> {name: rows[0].episodes for name, rows in found.items()}
+    {'paper-delay-high': 11, 'paper-delay-low': 8, 'paper-delay-middle': 11}
+
+    """
+    if not evaluation.kinds:
+        raise InvalidInput(
+            f"by {by!r}: these worlds have no groups; those of a mixture have scenario, those with vehicle_types"
+            " have vehicle_1_type and so on"
+        )
+    if by not in evaluation.kinds:
+        raise unknown_name("group", by, evaluation.kinds)
+    column = evaluation.kinds[by]
+    return {
+        name or NO_TYPE: summarise(evaluation.take(column == name), baseline=baseline)
+        for name in np.unique(column).tolist()
+    }

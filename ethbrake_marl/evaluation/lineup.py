@@ -1,0 +1,101 @@
+"""Build several agents from their specs, as the command line takes them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from ethbrake_marl.agents.driving import episode_engine, script_agents
+from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.agents.protocol import Agent, Driver, Team
+from ethbrake_marl.agents.registry import agents_of_group, settings_needed, shields_with
+from ethbrake_marl.agents.spec import parse_spec, split_specs
+from ethbrake_marl.engine.memory import ask_script, begin_script
+from ethbrake_marl.errors import AgentFailed, InvalidInput
+from ethbrake_marl.evaluation.familiar import warn_unfamiliar
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.physics.state import Worlds
+from ethbrake_marl.scenario.schema import Scenario
+
+
+def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, *, warn: bool = False) -> None:
+    """Let every agent decide once, so that its errors show before a long evaluation; raise what it would raise.
+
+    An agent that does not depend on the state decides in all worlds, any other only in the first.
+
+    Args:
+        agents: agents or teams by name.
+        worlds: worlds at the alert.
+        scenario: scenario whose learners the agents drive.
+        warn: also warn about policies in worlds unlike those of their training (``warn_unfamiliar``).
+
+    """
+    if warn:
+        warn_unfamiliar(agents, worlds, scenario, scenario.learners)
+    for name, agent in agents.items():
+        team = Team.of(agent, scenario.learners)
+        scripts = script_agents(scenario, except_for=team.drivers)
+        if team.shield is not None:
+            with AgentFailed.naming(name, [script.name for script in scripts.values()]):
+                episode_engine(worlds.take([0]), team, scenario).step({})
+            continue
+        for vehicle, driver in team.drivers.items():
+            tried = worlds if getattr(driver, "state_free", False) else worlds.take([0])
+            with AgentFailed.naming(name, [script.name for script in scripts.values()]):
+                ask_script(driver, tried, begin_script(driver, tried, vehicle, scripts), vehicle)
+
+
+def make_lineup(
+    specs: str | Sequence[str],
+    scenario: Scenario,
+    *,
+    harm_count: HarmCount = "first",
+    uncertainty: object = None,
+    alone: bool = False,
+    bare: bool = False,
+) -> dict[str, Driver]:
+    """Make one agent for each spec, to drive the scenario's learners, and return spec -> agent.
+
+    Args:
+        specs: texts that name agents, as ``make_agent`` takes them (``"full_brake"``, ``"ppo@shipped+step"``): a list,
+            or one text with commas between them. A name of a group, such as ``ladder``, stands for several agents.
+        scenario: the scenario whose learners they drive.
+        harm_count: harm that agents minimise, if they optimise: ``first`` or ``total``.
+        uncertainty: uncertainty for the shields that need one, as ``make_agent`` takes it.
+        alone: refuse teams, which drive several vehicles.
+        bare: refuse agents with a shield, because the caller adds one; with one learner, also refuse teams.
+
+    Raises ``InvalidInput`` for a repeated spec, a missing or unused uncertainty, a team or a shield where none is
+    allowed, and whatever ``make_agent`` raises.
+
+    """
+    listed = split_specs(specs) if isinstance(specs, str) else specs
+    specs = [each for spec in listed for each in agents_of_group(spec) or (spec,)]
+    written = [parse_spec(spec) for spec in specs]
+    for k, each in enumerate(written):
+        if each in written[:k]:
+            raise InvalidInput(f"agent {str(each)!r} is given twice; each agent drives every world once")
+    if uncertainty is not None and not any("uncertainty" in settings_needed(each.shield) for each in written):
+        using = "".join(f"; an agent with +{shield} does: ppo@PATH+{shield}" for shield in shields_with("uncertainty"))
+        raise InvalidInput(f"uncertainty {uncertainty}: nobody uses it{using}")
+    found = {
+        str(each): make_agent(str(each), scenario=scenario, harm_count=harm_count, uncertainty=uncertainty)
+        for each in written
+    }
+    for spec, agent in found.items():
+        if isinstance(agent, Team) and (alone or (bare and len(scenario.learners) == 1)):
+            raise InvalidInput(f"agent {spec!r}: is a team, one agent is needed here: ppo@RUN/policy/vehicle_2")
+        if bare and parse_spec(spec).shield is not None:
+            raise InvalidInput(
+                f"agent {spec!r}: has a shield already; this command puts its own around each agent, so name the agent"
+                " alone, for instance ppo@PATH"
+            )
+    return found
+
+
+def make_agents(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCount = "first") -> dict[str, Agent]:
+    """Make one agent for each spec, to drive a single vehicle, and return spec -> agent; see ``make_lineup``.
+
+    ``specs`` are texts that name agents, such as ``full_brake``. ``harm_count`` is the harm that agents minimise, if
+    they optimise. Raises ``InvalidInput`` for a team.
+    """
+    return make_lineup(specs, scenario, harm_count=harm_count, alone=True)  # type: ignore[return-value]  # no teams

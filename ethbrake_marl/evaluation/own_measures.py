@@ -1,0 +1,64 @@
+"""Measures that the user registered, as evaluations show them: loading, columns and headings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from ethbrake_marl.files.python_file import load_from_file
+from ethbrake_marl.game.impacts import EpisodeImpacts
+from ethbrake_marl.game.measures import MEASURES, REPORTED, NamedMeasure, register_measure
+from ethbrake_marl.registry import Part
+
+LOADED: dict[str, None] = {}  # arguments of ``load_measures`` so far, in order
+
+
+def load_measures(names: Iterable[str]) -> None:
+    """Load measures by name, and show them in every evaluation from now on.
+
+    A name is ``risk``, ``injury``, or the name of a measure of an installed package. ``my_file.py:measure`` runs that
+    Python file, with your permissions, and takes ``measure`` from it: a function, or a ``Part``, which holds a function
+    with the settings of ``register_measure``. Raises ``UnknownName`` with a suggestion, and ``InvalidInput`` for a
+    measure that cannot be loaded.
+    """
+    for name in names:
+        file, colon, own = name.rpartition(":")
+        if colon:
+            part = load_from_file(file, own)
+            given, settings = (part.given, part.settings) if isinstance(part, Part) else ((part,), {})
+            register_measure(own, *given, **settings)
+        else:
+            REPORTED.update({each: MEASURES[each] for each in MEASURES.load(name)})
+        LOADED[name] = None
+
+
+def heading_of(column: str) -> str:
+    measure = registered_measure(column)
+    if measure is None:  # of results that were computed before it was forgotten
+        return column
+    vehicle = column.removeprefix(measure.name).removeprefix("_")
+    return f"{measure.name}{f', vehicle {vehicle}' if vehicle else ''} ({measure.unit})"
+
+
+def registered_measure(column: str) -> NamedMeasure | None:
+    return REPORTED.get(column) or REPORTED.get(column.rpartition("_")[0])
+
+
+def measure_columns(terms: Mapping[str, Any], episodes: EpisodeImpacts | None) -> dict[str, Any]:
+    """Return every reported measure of some episodes as columns [n], by name.
+
+    A measure with one value per vehicle has the columns ``NAME_1``, ``NAME_2`` and so on.
+
+    Args:
+        terms: measures that are computed at each step, summed over the episodes, [n] or [n, N], by name.
+        episodes: impacts of the episodes, from which the other measures are computed; None if there are none.
+
+    """
+    columns: dict[str, Any] = {}
+    for name, measure in REPORTED.items():
+        values = terms[name] if episodes is None or measure.by == "step" else measure.of(episodes)
+        if values.ndim == 1:
+            columns[name] = values
+        else:
+            columns |= {f"{name}_{i + 1}": column.copy() for i, column in enumerate(values.T)}
+    return columns

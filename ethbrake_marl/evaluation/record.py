@@ -1,0 +1,124 @@
+"""Record of one episode at fine time resolution, for figures and viewers.
+
+Between two decisions, the motion follows from the state and the command alone. So the episode is first run as in an
+evaluation; then each step is sampled, and every sample is advanced directly from the beginning of its step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.errors import InvalidInput, count_of
+from ethbrake_marl.evaluation.rollout import controlled_vehicle
+from ethbrake_marl.evaluation.tape import Tape
+from ethbrake_marl.game.harm import HARM_COUNTS, Ledger
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.left_out import ImpactRows
+from ethbrake_marl.physics.state import Floats, Worlds
+from ethbrake_marl.scenario.schema import Scenario
+
+SAMPLE_S = 0.02  # default time between two samples (s)
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeRecord:
+    """One world from the alert to its end, sampled at k times; row 0 is the alert.
+
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> world = scenario.sample(1, seed=7).worlds
+    >>> record = eb.record_episode(world, eb.make_agent("full_brake"), scenario=scenario)
+    >>> record.positions_m.shape, record.impacts.time_s.round(2), record.at_rest
+    ((196, 3), array([2.17, 3.3 ]), True)
+
+    """
+
+    agent: str  # name of the agent
+    scenario: Scenario  # scenario of the world
+    vehicle: int  # index (0 = front) of the controlled vehicle
+    initial: Worlds  # the world at the alert, n = 1
+    time_s: Floats  # [k] time since the alert, ascending
+    gaps_m: Floats  # [k, P] gap of each pair
+    speeds_mps: Floats  # [k, N] speed of each vehicle
+    positions_m: Floats  # [k, N] position of each vehicle along the road; vehicles have no length here
+    command_mps2: Floats  # [k, N] commanded signed acceleration from this time on; 0 before the latency has elapsed
+    impacts: ImpactRows  # all impacts in order of time; their column ``world`` is 0
+    ledger: Ledger  # harm of all impacts of the episode, n = 1
+    at_rest: bool  # whether the line came to rest before the horizon
+
+    def __repr__(self) -> str:
+        first, total = (float(self.ledger.world_harm(harm_count)[0]) for harm_count in HARM_COUNTS)
+        return (
+            f"EpisodeRecord({self.agent!r:.60} on {self.scenario.name!r}, {len(self.time_s)} samples to"
+            f" {self.time_s[-1]:g} s, {count_of(len(self.impacts.time_s), 'impact')}, harm {first:.2f} first-impact,"
+            f" {total:.2f} total)"
+        )
+
+
+def record_episode(
+    world: Worlds, agent: Agent, *, scenario: Scenario, vehicle: int | str | None = None, sample_s: float = SAMPLE_S
+) -> EpisodeRecord:
+    """Record one world from the alert on, exactly as ``evaluate`` runs it.
+
+    Args:
+        world: the world at the alert, n = 1.
+        agent: agent that drives one vehicle; it is not changed.
+        scenario: scenario of the world, whose scripts drive the other vehicles.
+        vehicle: the controlled vehicle, by name (``vehicle_2``) or index (0 = front); None: the scenario's only
+            learner.
+        sample_s: largest time between two samples (s); every decision is a sample, too.
+
+    Raises ``InvalidInput`` for more than one world or ``sample_s`` not above 0.
+
+    """
+    if world.n != 1:
+        raise InvalidInput(
+            f"record_episode: {count_of(world.n, 'world')} given; exactly 1 is needed, for instance worlds.take([0])"
+        )
+    if not (sample_s > 0.0 and math.isfinite(sample_s)):
+        raise InvalidInput(f"record_episode: sample_s = {sample_s}; must be finite and above 0")
+    driven = controlled_vehicle(scenario, vehicle)
+    tape = Tape(world)
+    episodes = drive(world, agent, scenario, driven, watched_by=[tape])
+    samples = list(_samples(tape.steps, sample_s))
+    time, gaps, speeds, positions, command = (np.concatenate(column) for column in zip(*samples, strict=True))
+    return EpisodeRecord(
+        agent.name, scenario, driven, world, time, gaps, speeds, positions, command, tape.episodes().rows,
+        episodes.ledger, bool(episodes.at_rest[0]),
+    )  # fmt: skip
+
+
+def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float) -> Iterator[tuple[Floats, ...]]:
+    """Yield the samples of each step: time [k], gaps [k, P], speeds [k, N], positions [k, N], commands [k, N].
+
+    ``segments`` are the steps of one world, each with the world before, the commands [1, N], and the end time [1]. Two
+    samples of a step are at most ``sample_s`` apart (s). Only the last step includes its end. Worlds hold gaps and
+    speeds, not positions. So Vehicle 1's position is measured as its gap to an obstacle ahead, which is the world's own
+    or one out of reach.
+    """
+    front = 0.0  # position of Vehicle 1 at the start of the segment
+    for number, (before, command, until_s) in enumerate(segments):
+        start, end = float(before.time_s[0]), float(until_s[0])
+        count = max(math.ceil((end - start) / sample_s - 1e-9), 1) if end > start else 0
+        times = np.linspace(start, end, count + 1)
+        post = before.with_post_ahead(np.array([end - start]))
+        copies = post.take(np.zeros(count + 1, np.int64))
+        moved, _ = advance(copies, command, until_s=times)
+        position, gaps, speeds = front + (post.obstacle_gap_m - moved.obstacle_gap_m), moved.gaps_m, moved.speeds_mps
+        wanted = before.vehicles.piece_commands(command, times)
+        in_force = np.where(before.vehicles.latency_s <= times[:, np.newaxis], wanted, 0.0)
+        rows = slice(None) if number == len(segments) - 1 else slice(count)
+        columns = (times, gaps, speeds, line_positions(position, gaps), in_force)
+        yield tuple(column[rows] for column in columns)
+        front = float(position[-1])
+
+
+def line_positions(front: Floats, gaps: Floats) -> Floats:
+    """Return the positions [k, N] of all vehicles, ``front`` [k] being that of Vehicle 1, from the gaps [k, P]."""
+    return np.concatenate([front[:, np.newaxis], front[:, np.newaxis] - np.cumsum(gaps, axis=1)], axis=1)

@@ -1,0 +1,48 @@
+"""Mean harm of agents under several objectives: one row per agent, objective and count of harm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from ethbrake_marl.files.sheet import Column, Estimate, Sheet, terminal_text
+from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
+
+
+@dataclass(frozen=True, slots=True)
+class Rescored:
+    """Mean value of one agent's episodes under one objective, for each vehicle; less is better."""
+
+    agent: str  # name of the agent
+    objective: str  # objective as in scenarios: ``total``, ``own``, ``social:45``
+    harm_count: HarmCount  # impacts that count: each pair's first one (``first``) or all (``total``)
+    each: tuple[Estimate, ...]  # mean per world (m2/s2) of each vehicle, front to rear
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain data for JSON: ``objective``, ``harm_count``, and each vehicle's mean and interval."""
+        each = Estimate.side_by_side({f"vehicle_{i + 1}": estimate for i, estimate in enumerate(self.each)})
+        return {"objective": self.objective, "harm_count": self.harm_count, **each}
+
+
+class Rescores(list[Rescored]):
+    """List of ``Rescored`` rows that ``print`` and a notebook show as two tables: first-impact and total harm."""
+
+    def __str__(self) -> str:
+        return terminal_text(self.sheet("first"), "", self.sheet("total"))
+
+    def _repr_html_(self) -> str:
+        return "\n".join(self.sheet(harm_count).html() for harm_count in HARM_COUNTS)
+
+    def sheet(self, harm_count: HarmCount) -> Sheet:
+        """Return the table of first-impact harm (``first``) or total harm (``total``).
+
+        It has one line per agent and objective, and one column per vehicle.
+        """
+        shown = [row for row in self if row.harm_count == harm_count]
+        vehicles = range(len(shown[0].each) if shown else 0)
+        columns = [Column(f"Vehicle {i + 1}", interval="below") for i in vehicles]
+        names = ["" if k and shown[k - 1].agent == row.agent else row.agent for k, row in enumerate(shown)]
+        lines = [(name, row.objective, *row.each) for name, row in zip(names, shown, strict=True)]
+        title = f"Objectives, {'first-impact' if harm_count == 'first' else 'total'} harm"
+        note = "Means per world in m²/s² (injury:CURVE: injuries in 1,000 lines), with their 95 % intervals."
+        return Sheet(title, ["Agent", "Objective", *columns], lines, note)

@@ -1,0 +1,98 @@
+"""Sums of all agents' measures over some worlds of a list; sums of chunks can be added in any order, bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ethbrake_marl.evaluation.agent_tally import AgentTally, tally_agents
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.identity import HASHES, hash_of_chunks
+from ethbrake_marl.evaluation.measure_sets import contexts_of, silent_because
+from ethbrake_marl.evaluation.outcome import LeftOut
+from ethbrake_marl.evaluation.rescores import Rescored, Rescores
+from ethbrake_marl.game.harm import HARM_COUNTS
+from ethbrake_marl.scenario.fields import QUANTITY
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """Statistics of all agents in some worlds of a list. ``+`` adds those of other worlds of the same list."""
+
+    worlds: int = 0  # number of worlds, without those left out
+    hidden: int = 0  # number of worlds in which the V2X channel hides something from a controlled vehicle
+    worlds_hash: int = 0  # ``hash_of_chunks`` of the worlds
+    # Smallest and largest value of every quantity, one pair for each vehicle, pair or world, by the quantity's key.
+    ranges: Mapping[str, tuple[Range, ...]] = field(default_factory=dict)
+    left_out: tuple[LeftOut, ...] = ()  # worlds that failed with some agent; nothing else counts them
+    agents: Mapping[str, AgentTally] = field(default_factory=dict)  # sums of each agent's measures, by name
+    # ``MeasureSet.because_key`` -> why that set of measures does not apply; None if it applies.
+    silent: Mapping[str, str | None] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, part: Evaluation, objectives: Sequence[str] | None = None, *, long_list: bool = True) -> Tally:
+        """Return the statistics of an evaluation of a part of a list.
+
+        Args:
+            part: outcomes of the agents.
+            objectives: objectives such as ``"social:45"``, which weigh a vehicle's own harm against the others'. Also
+                sum the harm that each vehicle bears, and its value under each objective; None: neither.
+            long_list: omit sets of measures that do not apply to lists of more than 100,000 worlds.
+
+        """
+        worlds = part.worlds
+        if not worlds.n:
+            return cls(left_out=part.left_out)
+        ranges = {
+            name: tuple((float(np.nanmin(c)), float(np.nanmax(c))) for c in rule.of(worlds).T)
+            for name, rule in QUANTITY.of(worlds).items()
+        }
+        contexts = contexts_of(part, long_list=long_list)
+        return cls(
+            worlds.n,
+            int(part.hidden.sum()),
+            hash_of_chunks(worlds, part.index),
+            ranges,
+            part.left_out,
+            tally_agents(part.outcomes, contexts, objectives=objectives),
+            silent_because(contexts),
+        )
+
+    def __add__(self, other: Tally) -> Tally:
+        ranges, agents = dict(self.ranges), dict(self.agents)
+        for name, entries in other.ranges.items():
+            both = zip(ranges.get(name, entries), entries, strict=True)
+            ranges[name] = tuple((min(a[0], b[0]), max(a[1], b[1])) for a, b in both)
+        return Tally(
+            self.worlds + other.worlds,
+            self.hidden + other.hidden,
+            (self.worlds_hash + other.worlds_hash) % HASHES,
+            ranges,
+            tuple(sorted((*self.left_out, *other.left_out))),
+            agents | {name: agents.get(name, AgentTally()) + each for name, each in other.agents.items()},
+            {**self.silent, **{key: why or self.silent.get(key) for key, why in other.silent.items()}},
+        )
+
+    def rescore(self, objectives: Sequence[str], vehicles: int) -> Rescores:
+        """Return the mean value of every agent under each objective, for each vehicle and both counts of harm.
+
+        Args:
+            objectives: objectives that the tally was computed with, such as ``social:45``, which weighs a vehicle's own
+                harm against the others'.
+            vehicles: number of vehicles, N.
+
+        """
+        return Rescores(
+            [
+                Rescored(
+                    name, each, count, tuple(own.moments[f"{each}_{count}_{i + 1}"].estimate for i in range(vehicles))
+                )
+                for name, own in self.agents.items()
+                for count in HARM_COUNTS
+                for each in objectives
+            ]
+        )

@@ -1,0 +1,147 @@
+"""Trial of a scenario before use: whether its scripts can drive, and how often something unusual happens."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+
+from ethbrake_marl.agents.driving import Episodes, script_agents
+from ethbrake_marl.agents.making import find_entry, make_agent, make_role
+from ethbrake_marl.agents.registry import agents_of_group, settings_needed, shield_forms
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine.memory import ask_script, begin_script
+from ethbrake_marl.errors import AgentFailed, InvalidInput, check_one_learner
+from ethbrake_marl.evaluation.identity import LIST_SEED
+from ethbrake_marl.evaluation.lineup import check_agents
+from ethbrake_marl.files.overrides import Override
+from ethbrake_marl.files.yaml import read_yaml
+from ethbrake_marl.physics.state import Ints, Worlds
+from ethbrake_marl.scenario.catalogue import load_scenario, scenario_path
+from ethbrake_marl.scenario.roles import ScriptSpec
+from ethbrake_marl.scenario.schema import Scenario
+
+TRIED_CANDIDATES = 16  # number of candidates of a script that searches, when a scenario is only checked
+
+
+def load_runnable(
+    name_or_path: str, settings: Sequence[Override] = (), *, drives: Literal["nobody", "one", "some"] = "nobody"
+) -> Scenario:
+    """Load a scenario, and try its scripts in one world, because reading the file does not show whether they can drive.
+
+    Args:
+        name_or_path: name of a scenario, or path of a YAML file.
+        settings: settings ``KEY=VALUE`` that override values of the file.
+        drives: number of learners that the scenario must have: exactly one (``one``), at least one (``some``), or any
+            number, also none (``nobody``).
+
+    Raises ``InvalidInput`` naming file, line, role and script if no agent can play the script, and if the number of
+    learners does not fit ``drives``.
+
+    """
+    scenario = load_scenario(name_or_path)
+    if settings:
+        content = {**scenario.model_dump(mode="json", exclude_none=True), **scenario.declared()}
+        scenario = scenario.replace(**Override.put(content, settings))
+    worlds = scenario.replace(early_impacts="keep").sample(1, LIST_SEED).worlds
+    for i, script in scenario.scripts.items():
+        try:
+            agent = make_role(scenario, i, most_candidates=TRIED_CANDIDATES)
+            ask_script(agent, worlds, begin_script(agent, worlds, i, {}), i)
+        except InvalidInput as error:
+            role = scenario.vehicle_names[i]
+            where = f"scenario {name_or_path!r}"
+            if not any(setting.top == "roles" for setting in settings):
+                where = read_yaml(scenario_path(name_or_path)).where(("roles", role))
+            raise InvalidInput(f"{where}: roles.{role} = {script}: {error}") from None
+    learners = [scenario.vehicle_names[i] for i in scenario.learners]
+    if drives == "one":
+        check_one_learner(scenario.name, learners, "give the others a script: --set roles.vehicle_3=full_brake")
+    elif drives == "some" and not learners:
+        raise InvalidInput(
+            f"scenario {scenario.name!r} has no learner to drive; give the scenario that the agents were trained for"
+            " (--scenario), or say which vehicle is driven, for instance --set roles.vehicle_2=learner"
+        )
+    return scenario
+
+
+def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
+    """Drive ``worlds`` of a scenario to their ends, and count those in which something unusual happens.
+
+    The scripts drive (with few candidates if they search); learners brake fully. The result has the keys:
+
+    - ``early_impacts``, ``moving_at_horizon``, ``vehicle_1_late``: number of worlds with an impact before a learner may
+      act, with something moving at the horizon, and with a latency of Vehicle 1;
+    - ``commands_out_of_range``: vehicle -> row -> message, for commands beyond the vehicle's capacities;
+    - ``not_state_free``: vehicle -> script that depends on the state;
+    - ``refused_by``: agent, shield or setting that refuses such scripts -> message.
+
+    Raises ``InvalidInput`` for an error in a script, ``PhysicsError`` for worlds that cannot be advanced.
+    """
+    searches = {
+        scenario.vehicle_names[i]: f"{ScriptSpec.parse(script).name}:{TRIED_CANDIDATES}"
+        for i, script in scenario.scripts.items()
+        if "CANDIDATES" in find_entry(script).form
+    }
+    tried = scenario.replace(roles={**scenario.roles, **searches})
+    braking = {scenario.vehicle_names[i]: "full_brake" for i in scenario.learners}
+    scripts = script_agents(tried.replace(roles={**tried.roles, **braking}))
+    early, moving = np.zeros((2, worlds.n), np.bool_)
+    beyond: dict[str, dict[int, str]] = {}
+
+    def drive_rows(rows: Ints) -> None:
+        some = worlds.take(rows)
+        engine = Engine(scenario, some.n, learners=(), scripts=scripts, deciders=scenario.learners, worlds=some)
+        engine.roster.warns = False  # ``Episodes`` reports failed worlds
+        early[rows] = engine.ledger.count.any(axis=1) | (engine.ledger.obstacle_count > 0)
+        moving[rows] = ~Episodes.of(engine, some).at_rest
+
+    try:
+        drive_rows(np.arange(worlds.n))
+    except AgentFailed:
+        for row in range(worlds.n):
+            try:
+                drive_rows(np.array([row]))
+            except AgentFailed as error:
+                beyond.setdefault(error.reason.partition(" ")[0], {})[row] = str(error.renumbered([row]))
+    odd = {
+        scenario.vehicle_names[i]: script
+        for i, script in scenario.scripts.items()
+        if not ScriptSpec.parse(script).is_state_free()
+    }
+    usual = scenario.replace(roles={**scenario.roles, **dict.fromkeys(odd, "full_brake")})
+    refused, anyway = (_refusals(each, worlds.take([0])) if odd else {} for each in (tried, usual))
+    return {
+        "early_impacts": int(early.sum()),
+        "moving_at_horizon": int(moving.sum()),
+        "vehicle_1_late": int((worlds.vehicles.latency_s[:, 0] > 0.0).sum()),
+        "commands_out_of_range": beyond,
+        "not_state_free": odd,
+        "refused_by": {what: why for what, why in refused.items() if what not in anyway},
+    }
+
+
+def _refusals(scenario: Scenario, worlds: Worlds) -> dict[str, str]:
+    """Return why agents, shields and settings refuse the scenario: agent's spec, ``+SHIELD`` or setting -> message.
+
+    Each of them is actually tried on ``worlds``.
+    """
+
+    def drive_by(spec: str, needs: Mapping[str, Any]) -> None:
+        check_agents(
+            {spec: make_agent(spec, scenario=scenario, most_candidates=TRIED_CANDIDATES, **needs)}, worlds, scenario
+        )
+
+    asked: dict[str, Callable[[], object]] = {spec: partial(drive_by, spec, {}) for spec in agents_of_group("ladder")}
+    for shield in shield_forms():
+        asked[f"+{shield}"] = partial(drive_by, f"full_brake+{shield}", settings_needed(shield))
+    asked["early_impacts: reject"] = lambda: scenario.replace(early_impacts="reject")
+    refused = {}
+    for what, ask in asked.items():
+        try:
+            ask()
+        except InvalidInput as error:
+            refused[what] = str(error)
+    return refused

@@ -1,0 +1,188 @@
+"""A scenario as a TorchRL environment and as a BenchMARL task. Needs the extra ``marl``.
+
+The environment runs ``n`` worlds in one engine. All learners of a world form one group and end together, because
+``done`` belongs to the world. The critic's ``state`` is the full state of the line (``game.full_state.full_state``).
+
+Shapes: ``n`` worlds, ``L`` learners, ``F`` features of an observation, ``S`` features of the state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from benchmarl.environments.common import TaskClass
+from tensordict import TensorDict
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from ethbrake_marl.envs.making import feature_box, make_engine
+from ethbrake_marl.game.full_state import full_state, state_features
+from ethbrake_marl.game.observed import observation_for
+from ethbrake_marl.game.rewards import Reward
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.attach import guard_of
+from ethbrake_marl.shield.options import ShieldOptions
+
+GROUP = "learners"
+
+
+class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is missing
+    """TorchRL environment over ``n`` worlds of ``scenario``.
+
+    Shapes: observation [n, L, F], action and reward [n, L, 1], state [n, S], done [n, 1].
+
+    Args:
+        scenario: the scenario, which has at least one learner.
+        n: number of worlds.
+        seed: seed of the worlds.
+        reward: reward of the learners, as in the other environments: a name such as ``harm``, or weights.
+        horizon_is_end: count an episode that the horizon cuts off as terminated, as in a training recipe.
+        shield: mode of a shield around the learners (``step`` if there are several learners); None: no shield.
+
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        n: int,
+        seed: int,
+        reward: Reward,
+        horizon_is_end: bool = True,
+        shield: str | None = None,
+    ) -> None:
+        super().__init__(device="cpu", batch_size=torch.Size([n]))
+        self.engine = make_engine(scenario, n, reward=reward, observation=observation_for(scenario), seed=seed)
+        if shield is not None:
+            self.engine.protect(guard_of(self.engine, None, ShieldOptions(shield)))
+        self.horizon_is_end = horizon_is_end
+        self._learners = np.array(self.engine.learners, np.int64)
+        rows = (n, len(self._learners))
+        seen = _bound(feature_box(self.engine.observation.features), rows)
+        state = _bound(feature_box(state_features(scenario)), (n,))
+        self.observation_spec = Composite(
+            {GROUP: Composite({"observation": seen}, shape=rows), "state": state}, shape=(n,)
+        )
+        action = Bounded(-1.0, 1.0, shape=(*rows, 1))
+        self.action_spec = Composite({GROUP: Composite({"action": action}, shape=rows)}, shape=(n,))
+        reward_of_each = Composite({"reward": Unbounded(shape=(*rows, 1))}, shape=rows)
+        self.reward_spec = Composite({GROUP: reward_of_each}, shape=(n,))
+        flags = ("done", "terminated", "truncated")
+        flag = {name: Categorical(2, dtype=torch.bool, shape=(n, 1)) for name in flags}
+        self.done_spec = Composite(flag, shape=(n,))
+
+    def _reset(self, tensordict: Any, **settings: Any) -> Any:
+        """Start a new episode in every world, or only in the worlds that the tensordict's ``_reset`` mask marks."""
+        asked = None if tensordict is None else tensordict.get("_reset", None)
+        if asked is None:
+            self.engine.reset()
+        else:
+            self.engine.renew(np.flatnonzero(asked.numpy().reshape(-1)))
+        return TensorDict(self._observe_all(), batch_size=self.batch_size)
+
+    def _step(self, tensordict: Any) -> Any:
+        action = tensordict[GROUP, "action"].numpy()[:, :, 0].clip(-1.0, 1.0)
+        step = self.engine.step(action)
+        reward = torch.from_numpy(step.reward[:, self._learners, np.newaxis].astype(np.float32))
+        terminated, truncated = step.terminated.copy(), step.truncated.copy()
+        if self.horizon_is_end:
+            terminated, truncated = terminated | truncated, np.zeros_like(truncated)
+        content = self._observe_all()
+        content[GROUP]["reward"] = reward
+        for name, flag in (("done", step.ended), ("terminated", terminated), ("truncated", truncated)):
+            content[name] = torch.from_numpy(np.array(flag, np.bool_)[:, np.newaxis])
+        return TensorDict(content, batch_size=self.batch_size)
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Start new episodes in all worlds, with worlds drawn from ``seed``; None changes nothing."""
+        if seed is not None:
+            self.engine.reset(seed=seed)
+
+    def _observe_all(self) -> dict[str, Any]:
+        every = torch.from_numpy(self.engine.observe_all(self._learners).copy())
+        state = torch.from_numpy(full_state(self.engine.worlds, self.engine.scenario))
+        own = TensorDict({"observation": every}, batch_size=every.shape[:2])
+        return {GROUP: own, "state": state}
+
+
+class LineTask(TaskClass):  # type: ignore[misc]
+    """BenchMARL task for one scenario.
+
+    Args:
+        name: name of the task in BenchMARL, such as ``PAPER_RANDOM``.
+        config: ``scenario`` (a shipped name, a YAML file, its content, or a ``Scenario``) and the arguments ``reward``,
+            ``horizon_is_end`` and, optionally, ``shield`` of ``LineEnv``.
+
+    """
+
+    def __init__(self, name: str, config: dict[str, Any]) -> None:
+        super().__init__(name, {**config, "scenario": load_scenario(config["scenario"])})
+
+    def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
+        """Return a function without arguments that makes a ``LineEnv`` with ``num_envs`` worlds.
+
+        ``seed`` is the seed of the worlds (None: 0). BenchMARL also passes ``continuous_actions`` and ``device``, which
+        are unused.
+        """
+        config = self.config
+        settings = config["reward"], config["horizon_is_end"], config.get("shield")
+        return lambda: LineEnv(config["scenario"], num_envs, seed or 0, *settings)
+
+    def supports_continuous_actions(self) -> bool:
+        """Return True: actions are continuous."""
+        return True
+
+    def supports_discrete_actions(self) -> bool:
+        """Return False: there are no discrete actions."""
+        return False
+
+    def max_steps(self, env: Any) -> int:
+        """Return the largest number of decisions in an episode; ``env`` is unused."""
+        scenario: Scenario = self.config["scenario"]
+        return round(scenario.horizon_s / scenario.time_step_s) + 1
+
+    def has_render(self, env: Any) -> bool:
+        """Return False: the environment draws nothing."""
+        return False
+
+    def group_map(self, env: Any) -> dict[str, list[str]]:
+        """Return ``{"learners": names}`` with the names of all learners, which form one group; ``env`` is unused."""
+        scenario = self.config["scenario"]
+        return {GROUP: [scenario.vehicle_names[vehicle] for vehicle in scenario.learners]}
+
+    def observation_spec(self, env: Any) -> Any:
+        """Return the TorchRL spec of the learners' observations in ``env``, without the batch of worlds."""
+        spec = env.full_observation_spec_unbatched.clone()
+        del spec["state"]
+        return spec
+
+    def info_spec(self, env: Any) -> Any:
+        """Return None: the environment has no info entries."""
+        return None
+
+    def state_spec(self, env: Any) -> Any:
+        """Return the TorchRL spec of the critic's state in ``env``, without the batch of worlds."""
+        spec = env.full_observation_spec_unbatched.clone()
+        del spec[GROUP]
+        return spec
+
+    def action_spec(self, env: Any) -> Any:
+        """Return the TorchRL spec of the learners' actions in ``env``, without the batch of worlds."""
+        return env.full_action_spec_unbatched
+
+    def action_mask_spec(self, env: Any) -> Any:
+        """Return None: every action is allowed."""
+        return None
+
+    @staticmethod
+    def env_name() -> str:
+        """Return the name under which BenchMARL lists the tasks."""
+        return "ethbrake"
+
+
+def _bound(box: Any, shape: tuple[int, ...]) -> Any:
+    low, high = (torch.from_numpy(side).expand(*shape, len(side)) for side in (box.low, box.high))
+    return Bounded(low, high, shape=low.shape, dtype=torch.float32)

@@ -1,0 +1,65 @@
+"""Register every shipped scenario that has a learner as a BenchMARL task. Needs the extra ``marl``.
+
+``python -m ethbrake_marl.extensions.benchmarl.tasks algorithm=mappo task=ethbrake/paper_random`` is BenchMARL's own
+command line (Hydra overrides included) with these tasks added. BenchMARL looks for tasks only in its own folder, so
+they must be in its tables before it reads the command line.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from benchmarl.environments import task_config_registry
+from benchmarl.environments.common import Task
+from hydra.core.config_store import ConfigStore
+
+from ethbrake_marl.extensions.benchmarl.task import LineTask
+from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
+
+
+class _Scenarios(Task):  # type: ignore[misc]  # untyped where the extra is missing
+    """BenchMARL's enumeration of tasks, one for each shipped scenario that has a learner."""
+
+    @staticmethod
+    def associated_class() -> type[LineTask]:
+        """Return ``LineTask``, the class that implements all of these tasks."""
+        return LineTask
+
+    def get_from_yaml(self, path: str | None = None) -> LineTask:
+        """Return the task of this shipped scenario, or of the scenario file ``path`` unless it is None.
+
+        The reward is minus the harm, and there is no shield.
+        """
+        return LineTask(self.name, _settings(SCENARIOS[self.name] if path is None else path))
+
+
+def _settings(scenario: str) -> dict[str, Any]:
+    return {"scenario": scenario, "reward": "harm", "horizon_is_end": True, "shield": None}
+
+
+def _task_name(scenario: str) -> str:
+    return scenario.replace("-", "_").upper()
+
+
+_SHIPPED = [entry.name for entry in list_scenarios()]
+
+SCENARIOS = {_task_name(name): name for name in _SHIPPED if load_scenario(name).learners}
+
+EthBrakeTask = _Scenarios("EthBrakeTask", list(SCENARIOS))
+
+
+def register_tasks() -> None:
+    """Add the tasks to BenchMARL's tables as ``ethbrake/paper_random`` and so on. Calling it again changes nothing."""
+    store = ConfigStore.instance()
+    for task in EthBrakeTask:
+        name = task.name.lower()
+        task_config_registry[f"ethbrake/{name}"] = task
+        store.store(group="task/ethbrake", name=name, node=_settings(SCENARIOS[task.name]), package="task")
+
+
+register_tasks()
+
+if __name__ == "__main__":
+    from benchmarl.run import hydra_experiment
+
+    hydra_experiment()

@@ -1,0 +1,614 @@
+"""Upper bound on the harm of a plan over a box of worlds, by branch and bound.
+
+A *plan* holds one action for each decision up to the horizon. The box is halved again and again where its bound is
+largest. ``Q`` numbers describe a box, ``K`` of them are uncertain, ``L`` is the length of a plan.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.engine.profiles import ProfileProblem
+from ethbrake_marl.engine.scripts import Script
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.extensions.certified.affine import (
+    TOUCH_WIDTH,
+    Cell,
+    Forces,
+    Motion,
+    Path,
+    add,
+    between,
+    cut,
+    difference,
+    high,
+    linear,
+    low,
+    negative,
+    new_motion,
+    positive_part,
+    product,
+    radius,
+    reciprocal,
+    since,
+    square,
+)
+from ethbrake_marl.extensions.certified.paths import Stack, most_harm, new_stack
+from ethbrake_marl.extensions.certified.rough import rough_harm
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Floats, Ints, Worlds
+from ethbrake_marl.scenario.schema import Scenario
+
+# groups of a box's numbers: N numbers in each group, P in the last one
+BRAKING, DRIVING, LATENCY, MASS, BRAKE_RATE, RELEASE_RATE, SPEED, GAP = range(8)
+
+LONGEST_PIECE_S = 0.25  # longest piece of time before the first decision
+
+
+class Known(NamedTuple):
+    """Quantities that are the same in all worlds of a box."""
+
+    vehicle: int  # index of the shielded vehicle
+    constant: Floats  # [N] command of each other vehicle, m/s2; NaN: full braking
+    limit: Floats  # [N] speed limits, m/s
+    restitution: float  # coefficient of restitution, 0 to 1
+    begin_s: float  # time at which the worlds begin, s
+    time_step_s: float  # time between two decisions, s
+    horizon_s: float  # time at which the episode ends, s
+
+
+@compiled(apart=True)
+def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
+    """Return the affine form [K + 2] (centre, slopes, remainder) of one number of a box.
+
+    Args:
+        low_: [Q] least values of the box.
+        high_: [Q] largest values of the box.
+        which: index of the number in the box.
+        free: [K] indices of the uncertain numbers, each with a slope of its own.
+
+    """
+    out = np.zeros(free.shape[0] + 2)
+    out[0] = 0.5 * (low_[which] + high_[which])
+    half = 0.5 * (high_[which] - low_[which])
+    for k in range(free.shape[0]):
+        if free[k] == which:
+            out[1 + k] = half
+            half = 0.0
+    out[-1] = half + 1e-15 * abs(out[0])
+    return out
+
+
+@compiled(apart=True)
+def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats) -> tuple[Cell, Floats]:
+    """Return the cell of a box, and the time from the alert to the first piece (s) as an affine form [W].
+
+    A *cell* is the box as affine forms, with the commands cut into pieces (time intervals of constant command). Time
+    counts from the first decision, because that decision falls at a different time in each world if the shielded
+    vehicle's latency is uncertain. The first piece starts before it by the shortest time that any world needs from the
+    alert to the first decision.
+
+    Args:
+        low_: [Q] least values of the box.
+        high_: [Q] largest values of the box.
+        free: [K] indices of the uncertain numbers.
+        known: the certain quantities.
+        plan: [L] action of the shielded vehicle at each decision.
+
+    """
+    N, W = known.limit.shape[0], free.shape[0] + 2
+    P, v = N - 1, known.vehicle
+    speed, gap, brake, onset = np.empty((N, W)), np.empty((P, W)), np.empty((N, W)), np.empty((N, W))
+    share = np.empty((P, 2, W))
+    first = form_of(low_, high_, LATENCY * N + v, free)
+    first[0] -= known.begin_s
+    first = positive_part(first)
+    earliest = known.begin_s + max(low(first), 0.0)
+    first[0] += known.begin_s
+    for i in range(N):
+        speed[i] = form_of(low_, high_, SPEED * N + i, free)
+        brake[i] = form_of(low_, high_, BRAKING * N + i, free)
+        onset[i] = difference(form_of(low_, high_, LATENCY * N + i, free), first)
+    for p in range(P):
+        gap[p] = form_of(low_, high_, GAP * N + p, free)
+        front, rear = form_of(low_, high_, MASS * N + p, free), form_of(low_, high_, MASS * N + p + 1, free)
+        whole = front.copy()
+        add(whole, 1.0, rear)
+        share[p, 0] = product(rear, reciprocal(whole))
+        share[p, 1] = -share[p, 0]
+        share[p, 1, 0] += 1.0
+        share[p, 1, -1] = share[p, 0, -1]
+    drive = form_of(low_, high_, DRIVING * N + v, free)
+    times, action = pieces(known, onset, earliest, plan)
+    first[0] -= earliest
+    build = np.zeros(N, np.bool_)
+    for i in range(N):  # another vehicle only brakes or only drives, so only one of its rates matters
+        down, up = low_[BRAKE_RATE * N + i] < math.inf, low_[RELEASE_RATE * N + i] < math.inf
+        build[i] = (up and (i == v or known.constant[i] > 0.0)) or (down and not known.constant[i] >= 0.0)
+    J, moving = times.shape[0] if build.any() else 0, bool(build.any())
+    forces = Forces(np.zeros((N, J, W)), np.zeros((N, J, W)), np.zeros((N, J, W)), np.zeros((N, J, 2)), build)
+    cell = Cell(
+        speed, gap, brake, drive, share, onset, known.constant, known.limit, v, known.restitution, times, action,
+        forces, moving,
+    )  # fmt: skip
+    for i in range(N):
+        if build[i]:
+            rates = np.full((2, W), math.inf)
+            for k in range(2):
+                if low_[(BRAKE_RATE + k) * N + i] < math.inf:
+                    rates[k] = form_of(low_, high_, (BRAKE_RATE + k) * N + i, free)
+            build_up(cell, i, first, rates)
+    return cell, first
+
+
+@compiled(apart=True)
+def build_up(cell: Cell, i: int, late: Floats, rates: Floats) -> None:
+    """Compute ``cell.forces`` of vehicle ``i``, in place, for the time before the first piece and for every piece.
+
+    The force is 0 at the alert. A *piece* is a time interval of constant command.
+
+    Args:
+        cell: the box of worlds; only its ``forces`` change.
+        i: index of the vehicle.
+        late: affine form [W] (centre, slopes, remainder) of the time from the alert to the first piece, s.
+        rates: [2, W] rates at which the brakes build up (0) and release (1), m/s3.
+
+    """
+    forces, own, force, wanted = cell.forces, i == cell.vehicle, np.zeros_like(late), np.zeros_like(late)
+    last, there = 0.0, True  # last action; whether the force has reached it
+    for j in range(cell.times.shape[0]):
+        begin, end = cell.times[j - 1], cell.times[j]
+        duration = between(end - begin, end - begin, late.shape[0])
+        if j == 0:
+            duration, begin, end = late, 0.0, high(late)
+            early, acts = early_pull(cell, i, late)
+            action = 1.0 if acts and radius(early) + abs(early[0]) > 0.0 else 0.0
+        elif own:
+            action = cell.action[j - 1]
+        else:
+            action = 1.0 if low(cell.onset[i]) < end else 0.0
+            if action == 1.0 and high(cell.onset[i]) > begin:
+                duration = cut(difference(since(cell, i, end), since(cell, i, begin)), 0.0, end - begin)
+        if action != last:
+            there = False
+            wanted = np.zeros_like(late)
+            if not own and not math.isnan(cell.constant[i]):
+                wanted[0] = cell.constant[i]
+            else:
+                add(wanted, action if own else -1.0, cell.drive if own and action > 0.0 else cell.brake[i])
+        last = action
+        rise, gain = forces.rise[i, j], forces.gain[i, j]
+        if there and radius(duration) == 0.0:
+            add(rise, duration[0], wanted)
+            add(gain, 0.5 * duration[0] * duration[0], wanted)
+        else:
+            add(rise, 1.0, product(wanted, duration))
+            add(gain, 0.5, product(wanted, square(duration)))
+        if not there:
+            there = ramp(force, wanted, duration, end - begin, rates, rise, gain, forces.swing[i, j])
+            there &= low(duration) >= end - begin
+        if end > begin:
+            add(forces.mean[i, j], 1.0 / (end - begin), rise)
+
+
+@compiled(apart=True)
+def ramp(
+    force: Floats, wanted: Floats, duration: Floats, longest: float, rates: Floats, rise: Floats, gain: Floats,
+    swing: Floats,
+) -> bool:  # fmt: skip
+    """Move a force towards its target during a time, and add its effect on speed and distance.
+
+    For a difference d to ``wanted`` at the start and e at the end, and a time m during which the force changes, the
+    speed changes by ``m (d + e) / 2`` more than under ``wanted`` alone in the duration t, and the distance by ``m t (d
+    + e) / 2 - m^2 (d + 2 e) / 6``. Returns whether the force has reached ``wanted`` at the end in every world.
+
+    Args:
+        force: affine form [W] (centre, slopes, remainder) of the acceleration at the start, m/s2; becomes the
+            acceleration at the end.
+        wanted: affine form [W] of the acceleration that the command asks for, m/s2.
+        duration: affine form [W] of the time for which the command acts, s.
+        longest: upper limit of ``duration``, s.
+        rates: [2, W] rates at which the brakes build up (0) and release (1), m/s3.
+        rise: affine form [W] of the change of speed, m/s; increased in place.
+        gain: affine form [W] of the distance beyond the starting speed times the time, m; increased in place.
+        swing: [2] receives the largest deviation of the acceleration from its mean where it falls (0) and rises (1),
+            m/s2.
+
+    """
+    start, there = difference(force, wanted), True
+    force[:] = wanted
+    for k in range(2):
+        sign, rate = 1.0 - 2.0 * k, rates[k]
+        more = positive_part(linear(start, sign, 0.0, 0.0))
+        if math.isinf(rate[0]) or high(more) <= 0.0:
+            continue
+        moving, rest = duration.copy(), difference(more, product(rate, duration))
+        if low(rest) < 0.0:
+            rest = positive_part(rest)
+            moving = cut(product(difference(more, rest), reciprocal(rate)), 0.0, high(duration))
+        both = more.copy()
+        add(both, 1.0, rest)
+        speed = product(moving, both)
+        speed *= 0.5
+        speed = cut(speed, 0.0, high(more) * high(duration))
+        add(both, 1.0, rest)
+        way = product(speed, duration)
+        add(way, -1.0 / 6.0, product(square(moving), both))
+        add(rise, sign, speed)
+        add(gain, sign, cut(way, 0.0, 0.5 * high(more) * high(duration) * high(duration)))
+        add(force, sign, rest)
+        there &= high(rest) <= 0.0
+        swing[k] = min(0.5 * high(rate) * longest, high(more))
+    return there
+
+
+@compiled(apart=True)
+def wait(cell: Cell, late: Floats) -> bool:
+    """Advance the speeds and gaps of a cell, in place, from the alert to the first piece (time interval of constant
+    command).
+
+    Returns False if something may disturb the motion until then: a contact, a stop, the speed limit, or a command that
+    takes effect on the way. ``late`` [W] is the time from the alert to the first piece, s.
+    """
+    if high(late) <= 1e-12:
+        return True
+    if low(late) < -1e-12:
+        return False
+    N = cell.speed.shape[0]
+    slowest, way = np.empty(N), np.empty_like(cell.speed)
+    for i in range(N):
+        pull, certain = early_pull(cell, i, late)
+        begin = cell.speed[i].copy()
+        way[i] = product(begin, late)
+        if cell.forces.build[i]:
+            add(way[i], 1.0, cell.forces.gain[i, 0])
+            add(cell.speed[i], 1.0, cell.forces.rise[i, 0])
+        else:
+            add(way[i], 0.5, product(pull, square(late)))
+            add(cell.speed[i], 1.0, product(pull, late))
+        slowest[i], fastest = min(low(begin), low(cell.speed[i])), max(high(begin), high(cell.speed[i]))
+        limited = high(pull) > 0.0 and fastest >= cell.limit[i]
+        if not certain or limited or slowest[i] < 0.0:
+            return False
+        if i > 0 and low(cell.gap[i - 1]) <= max(fastest - slowest[i - 1], 0.0) * high(late) + 1e-9:
+            return False
+    for p in range(N - 1):
+        add(cell.gap[p], 1.0, way[p])
+        add(cell.gap[p], -1.0, way[p + 1])
+    return True
+
+
+@compiled(apart=True)
+def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
+    """Return the acceleration of vehicle ``i`` from the alert until ``late``, and whether it is certain.
+
+    The acceleration is an affine form [W] (centre, slopes, remainder) in m/s2; it is 0 for the shielded vehicle. It is
+    not certain if the vehicle's command may take effect within that time. ``cell`` is the box of worlds; ``late`` [W]
+    is the time from the alert to the first piece (time interval of constant command), s.
+    """
+    pull = np.zeros_like(late)
+    if i == cell.vehicle:
+        return pull, True
+    acts = cell.onset[i].copy()  # becomes the time from the alert
+    add(acts, 1.0, late)
+    acts[0] -= cell.times[0]
+    if high(acts) > 1e-12:
+        return pull, low(acts) >= high(late)
+    if math.isnan(cell.constant[i]):
+        return negative(cell.brake[i]), True
+    pull[0] = cell.constant[i]
+    return pull, True
+
+
+@compiled(apart=True)
+def pieces(known: Known, onset: Floats, earliest: float, plan: Floats) -> tuple[Floats, Floats]:
+    """Return the J pieces (time intervals of constant command): their limits [J + 1], and the action in each, [J].
+
+    The limits are in s after the first decision.
+
+    Args:
+        known: the certain quantities.
+        onset: [N, W] time after the first decision at which each vehicle's command takes effect, s.
+        earliest: earliest possible time of the first decision, s.
+        plan: [L] action of the shielded vehicle at each decision.
+
+    """
+    N = onset.shape[0]
+    before = earliest - known.begin_s
+    first = math.ceil(before / LONGEST_PIECE_S) if before > 0.0 else 0
+    last = math.ceil((known.horizon_s - earliest) / known.time_step_s - 1e-9)
+    points = np.empty(first + last + 1 + 2 * N)
+    count = 0
+    for k in range(first):
+        points[count] = -before + before * k / first
+        count += 1
+    for k in range(last + 1):
+        points[count] = k * known.time_step_s
+        count += 1
+    for i in range(N):
+        if i != known.vehicle:
+            for at in (low(onset[i]), high(onset[i])):
+                if -before < at < last * known.time_step_s:
+                    points[count] = at
+                    count += 1
+    times = np.unique(points[:count])
+    action = np.zeros(times.shape[0] - 1)
+    for j in range(action.shape[0]):
+        middle = 0.5 * (times[j] + times[j + 1])
+        if middle > 0.0:
+            action[j] = plan[min(int(middle / known.time_step_s), plan.shape[0] - 1)]
+    return times, action
+
+
+@compiled(apart=True)
+def bound_of(
+    low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, stack: Stack, motion: Motion, out: Floats,
+    most: float,
+) -> float:  # fmt: skip
+    """Return an upper bound on the harm of a plan over one box, m2/s2.
+
+    A result above ``most`` is no bound; it only says that the harm may exceed ``most``.
+
+    Args:
+        low_: [Q] least values of the box.
+        high_: [Q] largest values of the box.
+        free: [K] indices of the uncertain numbers.
+        known: the certain quantities.
+        plan: [L] action of the shielded vehicle at each decision.
+        stack: memory for the sets of worlds that are followed separately.
+        motion: memory for the motion of each vehicle.
+        out: [K + 2] receives the affine form of the harm that reaches the bound.
+        most: harm above which the search stops, m2/s2.
+
+    """
+    cell, late = cell_of(low_, high_, free, known, plan)
+    # rough bound for all worlds, whose first piece begins ``late`` after the alert
+    N, P, width = cell.speed.shape[0], cell.gap.shape[0], cell.speed.shape[1]
+    path = Path(np.zeros((N + P + 1, width)), np.zeros((P, TOUCH_WIDTH)), np.zeros(2 * P + 1, np.int64))
+    for i in range(N):
+        path.forms[i] = cell.speed[i]
+        if i != cell.vehicle and cell.constant[i] > 0.0:
+            path.forms[i, -1] += cell.constant[i] * high(late)
+    rough = rough_harm(cell, path, -1)
+    if wait(cell, late):
+        harm = most_harm(cell, stack, motion, out, most)
+        if harm <= rough:
+            return harm
+    out[:] = 0.0
+    out[0] = rough
+    return rough
+
+
+@compiled(apart=True)
+def bound_box(
+    low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, enough: float, cells: int, only_enough: bool
+) -> tuple[float, int]:
+    """Return an upper bound on the harm of a plan over a box (m2/s2), and the number of parts of the box that were
+    examined.
+
+    The part with the largest bound is halved until the bound is at most ``enough`` or ``cells`` parts were examined.
+
+    Args:
+        low_: [Q] least values of the box.
+        high_: [Q] largest values of the box.
+        free: [K] indices of the uncertain numbers.
+        known: the certain quantities.
+        plan: [L] action of the shielded vehicle at each decision.
+        enough: bound that needs no refinement, m2/s2.
+        cells: largest number of parts to examine.
+        only_enough: True: stop in a part once its harm is above ``enough``; a result above ``enough`` is then no bound.
+
+    """
+    N, K, Q = known.limit.shape[0], free.shape[0], low_.shape[0]
+    stack, motion = new_stack(N, K + 2), new_motion(N, K + 2)
+    lows, highs = np.empty((cells + 1, Q)), np.empty((cells + 1, Q))
+    bounds, slopes = np.full(cells + 1, -math.inf), np.zeros((cells + 1, K + 2))
+    lows[0], highs[0] = low_, high_
+    most, size, looked = enough if only_enough else math.inf, 1, 1
+    bounds[0] = bound_of(low_, high_, free, known, plan, stack, motion, slopes[0], most)
+    while looked + 2 <= cells and K > 0:
+        at = int(np.argmax(bounds[:size]))
+        if bounds[at] <= enough:
+            break
+        share = (highs[at] - lows[at])[free] / (high_ - low_)[free]
+        weight = np.abs(slopes[at, 1:-1])
+        which = free[int(np.argmax(weight if weight.max() > 0.0 else share))]
+        middle = 0.5 * (lows[at, which] + highs[at, which])
+        lows[size], highs[size] = lows[at], highs[at]
+        highs[at, which], lows[size, which] = middle, middle
+        bounds[at] = bound_of(lows[at], highs[at], free, known, plan, stack, motion, slopes[at], most)
+        bounds[size] = bound_of(lows[size], highs[size], free, known, plan, stack, motion, slopes[size], most)
+        size += 1
+        looked += 2
+    return bounds[:size].max(), looked
+
+
+MOST_VEHICLES = 3
+
+CELLS_AT_ALERT, CELLS = 200, 40  # most cells to examine: for the bound at the alert, and for one later certificate
+
+NEAR = 1.02  # a bound below this multiple of the largest harm in a corner is not refined further
+
+NEARLY_NOTHING = 0.1  # m2/s2; added to that limit
+
+CORNERS, INTERIOR = "corners", "interior"  # worlds that mode robust certifies: the corners of a box, or the whole box
+
+CERTAINTIES = (CORNERS, INTERIOR)
+
+SCRIPTS = ("full_brake", "coast", "constant")
+
+
+class Boxes(NamedTuple):
+    """The boxes of ``n`` worlds: each number of a world lies between ``low`` and ``high``. ``Q = 8 N - 1`` numbers."""
+
+    # [n, Q] least values: braking and driving capacity, latency, mass, brake rate, release rate and speed of each
+    # vehicle, then the gaps
+    low: Floats
+    high: Floats  # [n, Q] largest values, in the same order
+    limit: Floats  # [n, N] speed limits, m/s
+    restitution: Floats  # [n] coefficient of restitution, 0 to 1
+    begin_s: Floats  # [n] time at which the worlds begin, s
+    constant: Floats  # [n, N] command of each other vehicle, m/s2; NaN: full braking
+    vehicle: int  # index of the shielded vehicle
+    time_step_s: float  # time between two decisions, s
+    horizon_s: float  # time at which the episode ends, s
+
+    @staticmethod
+    def check_possible(robust: str, scenario: Scenario, harm_count: HarmCount, others: Mapping[int, Script]) -> None:
+        """Raise ``InvalidInput`` for a setting that ``robust="interior"`` cannot certify in any world.
+
+        Such settings are: total harm; more than three vehicles; an obstacle ahead; another vehicle whose script is not
+        to brake fully, to coast, or to hold one deceleration.
+
+        Args:
+            robust: ``corners`` (never raises) or ``interior``.
+            scenario: the scenario of the worlds.
+            harm_count: ``first`` or ``total``.
+            others: script of each other vehicle, by its index.
+
+        """
+        if robust != INTERIOR:
+            return
+        for what, there in (
+            ("total harm", harm_count == "total"),
+            (f"{scenario.vehicles} vehicles", scenario.vehicles > MOST_VEHICLES),
+            ("an obstacle ahead", scenario.has_obstacle),
+        ):
+            if there:
+                raise _refusal(what)
+        for i, script in sorted(others.items()):
+            name = getattr(script, "name", type(script).__name__)
+            if name.split(":")[0] not in SCRIPTS:
+                raise InvalidInput(
+                    f"shield: robust interior: vehicle_{i + 1} is driven by {name!r}, which it cannot enclose;"
+                    " full_brake, coast and constant:A are possible; robust corners takes every script"
+                )
+
+    @classmethod
+    def of(
+        cls, possible: Worlds, problem: ProfileProblem, n: int, scenario: Scenario, others: Mapping[int, Script]
+    ) -> Boxes:
+        """Return the boxes of ``n`` worlds at the alert.
+
+        Raises ``InvalidInput`` for worlds that interior mode cannot certify: an obstacle ahead, a braking profile in
+        pieces, brakes that began to build up before the alert, or another vehicle whose command differs within the box.
+        ``check_possible`` covers what does not depend on the worlds.
+
+        Args:
+            possible: [n * M] worlds, M consecutive ones for each box: the reported world and the corners of its box.
+            problem: the same worlds as columns of numbers, with the commands of the other vehicles.
+            n: number of boxes.
+            scenario: the scenario of the worlds.
+            others: script of each other vehicle, by its index.
+
+        """
+        v, N, vehicle, members = possible.vehicles, possible.N, int(problem.vehicles[0]), possible.n // n
+        if possible.obstacle_ahead.any():
+            raise _refusal("an obstacle ahead")
+        if v.in_pieces.any():
+            raise _refusal("a vehicle that brakes in pieces (profile)")
+        if v.build_up.any() and possible.command_mps2.any():
+            raise _refusal("brakes that began to build up before the alert")
+        command, constant = problem.command.reshape(n, members, N), np.full((n, N), np.nan)
+        for i, script in others.items():
+            name = getattr(script, "name", type(script).__name__)
+            if i == vehicle or name.split(":")[0] == "full_brake":
+                continue
+            if not (command[:, :, i] == command[:, :1, i]).all():
+                raise InvalidInput(
+                    f"shield: robust interior: vehicle_{i + 1} is driven by {name!r}, whose command is another one in"
+                    " each world of the box; full_brake, coast and constant:A are possible, A being at most every"
+                    " capacity of the box"
+                )
+            constant[:, i] = command[:, 0, i]
+        numbers = np.concatenate(
+            [
+                v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s, v.mass_t, v.brake_rate_mps3,
+                v.release_rate_mps3, possible.speeds_mps, possible.gaps_m,
+            ],
+            axis=1,
+        ).reshape(n, members, 8 * N - 1)  # fmt: skip
+        return cls(
+            numbers.min(axis=1), numbers.max(axis=1), v.speed_limit_mps[::members], v.restitution[::members],
+            possible.time_s[::members], constant, vehicle, scenario.time_step_s, scenario.horizon_s,
+        )  # fmt: skip
+
+    def take(self, rows: Ints) -> Boxes:
+        """Return the boxes of the worlds with the indices ``rows`` [m]."""
+        arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._fields[:6]}
+        return self._replace(**arrays)
+
+    def placed(self, old: Boxes | None, rows: Ints) -> Boxes:
+        """Return the boxes of all running episodes after new episodes begin in ``rows``.
+
+        Args:
+            old: boxes of all episodes before; None at the first start.
+            rows: [m] indices of the new episodes; this object holds their boxes. If they cover all episodes, ``old`` is
+                unused.
+
+        """
+        if old is None or len(rows) >= len(old.low):
+            return self.take(np.argsort(rows))
+        arrays: dict[str, Any] = {name: getattr(old, name).copy() for name in self._fields[:6]}
+        for name, array in arrays.items():
+            array[rows] = getattr(self, name)
+        return self._replace(**arrays)
+
+    def at_alert(self, plans: Floats, harm: Floats) -> Floats:
+        """Return an upper bound on the harm of each world's plan at the alert, [n] m2/s2.
+
+        Args:
+            plans: [n, L] action of the shielded vehicle at each decision, for each world.
+            harm: [n] largest harm of the plan in a corner of the box, m2/s2; a bound close to it is not refined.
+
+        """
+        return self.bound(np.arange(len(plans)), plans, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)
+
+    def bound(
+        self, rows: Ints, plans: Floats, enough: Floats, cells: int = CELLS, *, only_enough: bool = False
+    ) -> Floats:
+        """Return an upper bound on the harm of each plan over all worlds of its box, [m] m2/s2.
+
+        The harm counts from the alert on.
+
+        Args:
+            rows: [m] indices of the boxes.
+            plans: [m, L] action of the shielded vehicle at each decision, for each box.
+            enough: [m] bound that needs no refinement, m2/s2.
+            cells: largest number of parts of a box to examine.
+            only_enough: True: a result above ``enough`` is no bound; it only says that no bound of at most ``enough``
+                was established.
+
+        """
+        bounds = np.empty(len(rows))
+        for j, k in enumerate(rows.tolist()):
+            low, high = self.low[k], self.high[k]
+            known = Known(
+                self.vehicle, self.constant[k], self.limit[k], float(self.restitution[k]), float(self.begin_s[k]),
+                self.time_step_s, self.horizon_s,
+            )  # fmt: skip
+            free, plan = np.flatnonzero(high > low), np.ascontiguousarray(plans[j], np.float64)
+            bounds[j], _ = bound_box(low, high, free, known, plan, float(enough[j]), cells, only_enough)
+        return bounds
+
+
+def _refusal(what: str) -> InvalidInput:
+    return InvalidInput(
+        f"shield: robust interior: {what}: it certifies first-impact harm of at most {MOST_VEHICLES} vehicles without"
+        " an obstacle; robust corners takes every scenario"
+    )
+
+
+def checked_robust(robust: object, where: str) -> str:
+    """Return ``robust`` if it is ``corners`` or ``interior``; raise ``UnknownName`` otherwise.
+
+    ``where`` names the setting at the start of the error message.
+    """
+    if robust not in CERTAINTIES:
+        raise unknown_name(f"{where}: robust", robust, CERTAINTIES)
+    return str(robust)

@@ -1,0 +1,300 @@
+"""The estimated world of one vehicle: what it received, extrapolated by the scripts, with ranges for all the rest.
+
+A vehicle is *known* if its message has arrived or it is in sight. The estimate takes three sources:
+
+* Of a known vehicle: its capacities, mass and own latency, and its newest received state. The script that the vehicle
+  follows extrapolates this state to the present: from the time of the state if a command was in force then, else from
+  the time at which the vehicle is expected to react.
+* Of a vehicle that is not known: what the scenario declares. Each quantity is the median of its distribution, or any
+  value of its range. Its script runs from the alert.
+* Of the vehicle itself: measurements of its own state, its distance since the alert, and impacts with known neighbours.
+
+Nothing else of the line is read, so information that was not received cannot change an estimated world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.driving import script_agents
+from ethbrake_marl.agents.protocol import fixed_commands
+from ethbrake_marl.engine.scripts import Script
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics.estimates import move_on
+from ethbrake_marl.physics.messages import Messages
+from ethbrake_marl.physics.motion import has_acted
+from ethbrake_marl.physics.state import Bools, Floats, Vehicles, Worlds
+from ethbrake_marl.scenario.sampling import middle_world
+from ethbrake_marl.scenario.schema import Scenario
+
+TOUCHING_M = 1e-9  # a gap below this counts as contact, because received positions are rounded
+
+OF_OTHERS = (
+    "place",
+    "speeds_mps",
+    "braking_capacity_mps2",
+    "mass_t",
+    "latency_s",
+    "news_s",
+)  # quantities that may be uncertain
+
+
+class Told(NamedTuple):
+    """Information that one vehicle has received about the others by now. Columns of unknown vehicles are meaningless.
+
+    A vehicle is *known* if its message has arrived or it is in sight.
+    """
+
+    known: Bools  # [n, N] True for known vehicles; always True for the vehicle itself
+    at_s: Floats  # [n, N] time of the received state, s
+    place_m: Floats  # [n, N] position at that time, relative to the receiving vehicle's present position, m
+    speed_mps: Floats  # [n, N] speed at that time, m/s
+    command_mps2: Floats  # [n, N] command in force at that time, m/s2
+    obstacle_m: Floats  # [n] distance of the obstacle from the vehicle's present position, m; infinite: none is known
+    obstacle_hit: Bools  # [n] True if an impact with the obstacle is known
+    hit: Bools  # [n, P] True for an own pair with a known neighbour that had an impact
+
+    @property
+    def reacts(self) -> Bools:
+        """True for vehicles that are known to have a command in force, [n, N]."""
+        reacts: Bools = self.known & (self.command_mps2 != 0.0)
+        return reacts
+
+    @classmethod
+    def to(cls, worlds: Worlds, vehicle: int) -> Told:
+        """Return the information that the vehicle with index ``vehicle`` has received in ``worlds`` by their present
+        time.
+        """
+        n, N = worlds.speeds_mps.shape
+        known = worlds.vehicles.known_from_s[:, vehicle] <= worlds.time_s[:, np.newaxis]
+        known[:, vehicle] = True
+        place = _places_of(worlds, vehicle)
+        hit = np.zeros((n, N - 1), np.bool_)
+        at_s = np.repeat(worlds.time_s[:, np.newaxis], N, axis=1)
+        told = cls(
+            known, at_s, place, worlds.speeds_mps.copy(), worlds.command_mps2.copy(),
+            worlds.obstacle_gap_m + place[:, 0], worlds.obstacle_hit.copy(), hit,
+        )  # fmt: skip
+        if (periodic := Messages.of(worlds).periodic).any():
+            told._hear_messages(worlds, vehicle, periodic)
+        for pair, other in ((vehicle - 1, vehicle - 1), (vehicle, vehicle + 1)):
+            if 0 <= pair < N - 1:
+                hit[:, pair] = worlds.pair_hit[:, pair] & known[:, other]
+        unheard = ~known[:, 0]
+        told.obstacle_m[unheard], told.obstacle_hit[unheard] = np.inf, False
+        return told
+
+    def _hear_messages(self, worlds: Worlds, vehicle: int, periodic: Bools) -> None:
+        """Replace, in place, the present state of other vehicles by their newest message, except where they are in
+        sight.
+
+        ``periodic`` [n] is True for worlds in which vehicles send messages periodically.
+        """
+        newest = Messages.of(worlds).newest_told(vehicle)
+        other = periodic[:, np.newaxis] & (np.arange(worlds.N) != vehicle)
+        stale = other & (newest.at_s < worlds.time_s[:, np.newaxis])
+        self.place_m[stale] = (newest.place_m - newest.own_place_m[:, np.newaxis])[stale]
+        self.speed_mps[stale] = newest.speed_mps[stale]
+        self.command_mps2[stale] = newest.command_mps2[stale]
+        self.at_s[stale] = newest.at_s[stale]
+        if vehicle > 0:
+            self.obstacle_m[periodic] = (newest.obstacle_place_m - newest.own_place_m)[periodic]
+            self.obstacle_hit[periodic] = newest.obstacle_hit[periodic, 0] == 1.0
+        self.known[:] &= ~other | (newest.at_s >= 0.0)
+
+
+def _places_of(worlds: Worlds, vehicle: int) -> Floats:
+    """Return the position of each vehicle ahead of ``vehicle``, [n, N] m; negative behind it.
+
+    The positions come from the gaps of ``worlds``. Direct neighbours are exactly one gap away.
+    """
+    ahead = np.concatenate([np.zeros((worlds.n, 1)), -np.cumsum(worlds.gaps_m, axis=1)], axis=1)
+    place: Floats = ahead - ahead[:, [vehicle]]
+    for j, step in ((vehicle - 1, -1), (vehicle + 1, 1)):
+        if 0 <= j < worlds.N:
+            place[:, j] = -step * worlds.gaps_m[:, min(vehicle, j)]
+    return place
+
+
+@dataclass(frozen=True, slots=True)
+class Ranges:
+    """Ranges that a scenario declares for the vehicles that ``vehicle`` does not know.
+
+    Keys of the mappings: ``place`` (position ahead of the vehicle's own position at the alert, m), ``speeds_mps``,
+    ``braking_capacity_mps2``, ``mass_t``, ``latency_s`` (a vehicle's own part of the latency) and ``news_s`` (time at
+    which a vehicle has received the alert, before which it does not react; 0 without a channel). Each value is [N].
+    """
+
+    vehicle: int  # index of the estimating vehicle
+    others: Mapping[int, Script]  # scripts of the other vehicles, by index; a vehicle without a script brakes fully
+    middle: Mapping[str, Floats]  # median of each quantity, [N] each
+    low: Mapping[str, Floats]  # least value of each quantity, [N] each
+    high: Mapping[str, Floats]  # largest value of each quantity, [N] each
+    obstacle_gap_m: float  # gap of vehicle_1 to the obstacle, m; infinite without an obstacle
+
+    @classmethod
+    def of(cls, scenario: Scenario, vehicle: int, others: Mapping[int, Script] | None = None) -> Ranges:
+        """Return the ranges that ``scenario`` declares for all vehicles, as the vehicle with index ``vehicle`` sees
+        them.
+
+        ``others`` are the scripts of the other vehicles by index; None: the scenario's scripts. Raises ``InvalidInput``
+        for a mixture of scenarios, because an unknown vehicle could belong to any of them.
+        """
+        if scenario.members:
+            names = ", ".join(member.name for member in scenario.members)
+            raise InvalidInput(
+                f"scenario {scenario.name!r}: is a mixture, and a vehicle that is not known could be of any of {names};"
+                " believed agents need one of these"
+            )
+        world = middle_world(scenario)
+        low, high = ({key: np.array(scenario.bounds(key)).T[k] for key in ("gaps_m", *OF_OTHERS[1:5])} for k in (0, 1))
+        named = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps")
+        one, N = np.ones((1, scenario.vehicles)), scenario.vehicles
+        heard = Vehicles.at_once(
+            one, one, np.zeros((1, N)), one, one, np.zeros(1)
+        )  # no latency except that of the alert message
+        if scenario.v2x.by_link:
+            heard = scenario.v2x.with_news(heard, np.full((1, scenario.v2x.width(N)), 0.5), scenario.equipped())
+        middle = {
+            "place": _places(world.gaps_m[0], world.gaps_m[0], vehicle),
+            "speeds_mps": world.speeds_mps[0],
+            **{key: getattr(world.vehicles, key)[0] for key in named},
+            "latency_s": world.vehicles.own_latency_s[0],
+            "news_s": heard.latency_s[0],
+        }
+        low["place"] = _places(low["gaps_m"], high["gaps_m"], vehicle)
+        high["place"] = _places(high["gaps_m"], low["gaps_m"], vehicle)
+        low["news_s"] = np.zeros(scenario.vehicles)
+        high["news_s"] = scenario.v2x.latest_reaction_s(low["news_s"], scenario.equipped())
+        others = script_agents(scenario, except_for=vehicle) if others is None else others
+        return cls(vehicle, others, middle, low, high, float(world.obstacle_gap_m[0]))
+
+    def at(self, share: Mapping[tuple[str, int], float] | None, key: str) -> Floats:
+        """Return a value of one quantity for every vehicle, [N]: its median, unless ``share`` selects a point of its
+        range.
+
+        Args:
+            share: maps (quantity, vehicle index) to a position in the range: 0 is the least value, 1 the largest. None:
+                all medians.
+            key: the quantity, a key of ``middle``.
+
+        """
+        value = self.middle[key].copy()
+        for (name, j), part in () if share is None else share.items():
+            if name == key:
+                value[j] = self.low[key][j] + part * (self.high[key][j] - self.low[key][j])
+        return value
+
+    @property
+    def uncertain(self) -> tuple[tuple[str, int], ...]:
+        """Pairs (quantity, vehicle index) of all numbers of other vehicles that the scenario leaves open."""
+        others = [j for j in range(len(self.middle["place"])) if j != self.vehicle]
+        return tuple((key, j) for j in others for key in OF_OTHERS if self.low[key][j] < self.high[key][j])
+
+    def believe(
+        self,
+        worlds: Worlds,
+        way_m: Floats,
+        share: Mapping[tuple[str, int], float] | None = None,
+        foretold: tuple[Worlds, Bools] | None = None,
+    ) -> Worlds:
+        """Return the estimated worlds of the vehicle at the present time, [n].
+
+        Args:
+            worlds: the true worlds; only what the vehicle received is read.
+            way_m: [n] the vehicle's own distance since the alert, m.
+            share: maps (quantity, vehicle index) to a position in its range, 0 to 1; None: the median of every
+                quantity.
+            foretold: the worlds as they were predicted for now (impacts included), and a mask [n, N] of the vehicles
+                for which this prediction is better than their last message. None: no prediction.
+
+        """
+        worlds.refuse_build_up(":believed")
+        vehicle, (n, N) = self.vehicle, worlds.speeds_mps.shape
+        told, own, v = Told.to(worlds, vehicle), np.arange(N) == vehicle, worlds.vehicles
+        given = {"mass_t": v.mass_t, "braking_capacity_mps2": v.braking_capacity_mps2,
+                 "driving_capacity_mps2": v.driving_capacity_mps2, "speed_limit_mps": v.speed_limit_mps}  # fmt: skip
+        of = {key: np.where(told.known, values, self.at(share, key)) for key, values in given.items()}
+        at_s = np.where(told.known, told.at_s, 0.0)
+        own_part = np.where(told.known, v.own_latency_s, self.at(share, "latency_s"))
+        latency = np.where(told.reacts, at_s, np.maximum(np.maximum(own_part, self.at(share, "news_s")), at_s))
+        past = v.latency_s[:, vehicle] <= worlds.time_s
+        latency[:, vehicle] = np.where(
+            past, v.latency_s[:, vehicle], np.maximum(v.own_latency_s[:, vehicle], worlds.time_s)
+        )
+        vehicles = Vehicles.at_once(
+            of["braking_capacity_mps2"], of["driving_capacity_mps2"], latency, of["mass_t"], of["speed_limit_mps"],
+            v.restitution,
+        )  # fmt: skip
+        place = np.where(told.known, told.place_m, self.at(share, "place") - way_m[:, np.newaxis])
+        speed = np.maximum(np.where(told.known, told.speed_mps, self.at(share, "speeds_mps")), 0.0)
+        usual_gaps = np.repeat(-np.diff(self.middle["place"])[np.newaxis], n, axis=0)
+        line = replace(
+            worlds, vehicles=vehicles, speeds_mps=np.minimum(speed, of["speed_limit_mps"]), pair_hit=told.hit,
+            command_mps2=np.zeros((n, N)), gaps_m=usual_gaps, messages=np.zeros((n, 0)), obstacle_hit=told.obstacle_hit,
+            road=np.zeros((n, 0)),
+        )  # fmt: skip
+        command = fixed_commands(self.others, line, "believed", vehicle=vehicle)
+        speed, way = move_on(
+            line.speeds_mps, command, latency - at_s, of["speed_limit_mps"], worlds.time_s[:, None] - at_s
+        )
+        speed[:, vehicle], way[:, vehicle] = line.speeds_mps[:, vehicle], 0.0
+        place, hit = place + way, told.hit
+        if foretold is not None:
+            (expected, keeps), hit = foretold, hit | foretold[0].pair_hit
+            place = np.where(keeps, _places_of(expected, vehicle), place)
+            speed = np.where(keeps, np.maximum(expected.speeds_mps, 0.0), speed)
+        place = _in_order(place, told.known, vehicle)
+        gaps = np.maximum(place[:, :-1] - place[:, 1:], 0.0)
+        usual_obstacle = self.obstacle_gap_m + self.middle["place"][0] - way_m
+        obstacle = np.where(np.isfinite(told.obstacle_m), told.obstacle_m, usual_obstacle)
+        command[:, own] = worlds.command_mps2[:, own]
+        return replace(
+            line,
+            pair_hit=hit,
+            speeds_mps=speed,
+            gaps_m=np.where(gaps < TOUCHING_M, 0.0, gaps),
+            command_mps2=np.where(has_acted(latency, worlds.time_s[:, np.newaxis]), command, 0.0),
+            obstacle_gap_m=np.maximum(obstacle - place[:, 0], 0.0),
+        )
+
+
+def _places(ahead_m: Floats, behind_m: Floats, vehicle: int) -> Floats:
+    """Return the position of each vehicle ahead of ``vehicle``, [N] m; negative behind it.
+
+    Args:
+        ahead_m: [P] gaps; used for the pairs in front of the vehicle.
+        behind_m: [P] gaps; used for the pairs behind the vehicle.
+        vehicle: index of the vehicle at position 0.
+
+    """
+    front = np.cumsum(ahead_m[:vehicle][::-1])[::-1]
+    return np.concatenate([front, [0.0], -np.cumsum(behind_m[vehicle:])])
+
+
+def _in_order(place: Floats, known: Bools, vehicle: int) -> Floats:
+    """Correct positions so that the vehicles stand in line order; return the corrected array, [n, N] m.
+
+    Args:
+        place: [n, N] position of each vehicle ahead of ``vehicle``, m; changed in place.
+        known: [n, N] True for vehicles whose position is certain; they keep it.
+        vehicle: index of the vehicle at position 0.
+
+    """
+    N = place.shape[1]
+    for way in (-1, 1):  # first the vehicles ahead, then those behind
+        side = np.arange(vehicle + way, -1 if way < 0 else N, way)
+        limit = np.full(len(place), np.inf)
+        for j in side[::-1]:  # from the far end: no farther away than the next known vehicle beyond
+            far = np.where(known[:, j], -way * place[:, j], np.minimum(-way * place[:, j], limit))
+            limit = np.where(known[:, j], np.minimum(far, limit), limit)
+            place[:, j] = -way * far
+        near = np.zeros(len(place))
+        for j in side:
+            near = np.maximum(near, -way * place[:, j])
+            place[:, j] = -way * near
+    return place

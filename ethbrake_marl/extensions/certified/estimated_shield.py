@@ -1,0 +1,325 @@
+"""Shields in the estimated world: they certify on what the vehicle received and read nothing else.
+
+*Estimated world*: see ``estimated``. Mode ``step`` certifies every action in the estimated world with the median of
+everything unknown; it promises nothing about the true world. Mode ``robust`` certifies in every corner of the ranges of
+everything unknown. If the true world is such a corner, its harm up to the horizon is at most the first bound: later
+messages only remove corners that contradict them, and the held plan is replaced only by a better plan for the
+remaining corners.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+
+from ethbrake_marl.agents.driving import script_agents
+from ethbrake_marl.engine.memory import renew_memory, take_memory
+from ethbrake_marl.engine.scripts import Script
+from ethbrake_marl.errors import InvalidInput, count_of
+from ethbrake_marl.extensions.certified.enclosure import CORNERS, INTERIOR, checked_robust
+from ethbrake_marl.extensions.certified.estimated import Ranges, Told
+from ethbrake_marl.extensions.certified.estimating_agents import Odometer
+from ethbrake_marl.extensions.certified.robust_step import RobustShield
+from ethbrake_marl.extensions.certified.uncertainty import MOST_CORNERS, Uncertainty
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.physics.columns import Packed
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.certify import Decision, plan_harm
+from ethbrake_marl.shield.comparison import seen_columns, worlds_at
+from ethbrake_marl.shield.rollouts import Proposer
+from ethbrake_marl.shield.running import put
+from ethbrake_marl.shield.step import StepShield
+
+PER_WORLD = ("predicted_harm", "interventions", "_heard", "_asked_s", "_wanted", "_impact_s")  # attributes [n, ...]
+
+SURPRISE = 1e-6  # tolerance (m, m/s) between a measurement and its prediction
+
+
+def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
+    """After a restart of the shield in ``rows``, restore the harm so far, and keep the old plan where it is no worse.
+
+    ``shield`` was just restarted and is changed; ``before`` is its copy from before the restart.
+    """
+    (running, backup), (old, held) = shield.memory[:2], before.memory[:2]
+    assert running is not None and old is not None
+    at, plan, width = running.rows_of(rows), backup.plan[rows].copy(), held.plan.shape[1]
+    N, states = running.problem.mass.shape[1], running.states.copy()
+    states[at, 3 * N - 2 : 5 * N - 4] = old.states[at, 3 * N - 2 : 5 * N - 4]  # harm
+    running = running._replace(states=states)
+    column = np.arange(width) + old.steps[rows, np.newaxis]
+    rest = np.take_along_axis(held.plan[rows], np.minimum(column, width - 1), axis=1)
+    rest = np.where(column < width, rest, -1.0)  # full braking after the plan
+    part = running.take(rows)
+    harm, still = plan_harm(part, plan), plan_harm(part, rest)
+    plan[still <= harm] = rest[still <= harm]
+    backup = backup._replace(plan=put(backup.plan, rows, plan), harm=put(backup.harm, rows, np.minimum(still, harm)))
+    shield.memory = shield.memory._replace(running=running, backup=backup)
+
+
+class BelievedShield:
+    """``StepShield`` that certifies the proposed actions of one vehicle in its estimated world.
+
+    It starts at the first decision, and again whenever another vehicle becomes known, is known to react, or moves
+    otherwise than predicted. The rest of the previous plan is then a candidate for the new plan. After the first
+    decision ``predicted_harm`` [n] is the first bound; it is infinite where the vehicle had an impact before, because
+    its harm is unknown.
+
+    Args:
+        scenario: the scenario of the worlds; a mixture raises ``InvalidInput``.
+        vehicle: index of the shielded vehicle.
+        harm_count: ``first`` or ``total`` impacts.
+        robust: worlds to certify. None: the median of everything unknown. ``corners``: also all corners of the ranges;
+            more than ``MOST_CORNERS`` raise ``InvalidInput``. ``interior``: all worlds of the box around the corners,
+            once, at the first decision.
+        others: scripts of the other vehicles by index; None: the scenario's scripts.
+
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        vehicle: int,
+        *,
+        harm_count: HarmCount = "first",
+        robust: str | None = None,
+        others: Mapping[int, Script] | None = None,
+    ) -> None:
+        self.scenario, self.vehicle = scenario, vehicle
+        self.robust = None if robust is None else checked_robust(robust, "believed")
+        self.predicted_harm: Floats = np.zeros(0)
+        self.interventions: Ints = np.zeros(0, np.int64)  # [n] so far in the running episodes
+        self.decision: Decision | None = None  # last decision
+        self._harm_count: HarmCount = harm_count
+        self._others = script_agents(scenario, except_for=vehicle) if others is None else others
+        self._odometer: tuple[Floats, ...] = ()  # an ``Odometer``
+        self._heard: Floats = np.zeros((0, 0))  # [n, 2 N] news on which the shield began; NaN where it has not begun
+        self._asked_s: Floats = np.zeros(0)  # [n] time of the last decision
+        self._wanted: Floats = np.zeros(0)  # [n] last certified actions
+        self._totals: Floats = np.zeros((0, 0, 0))  # [n, M, pairs] predicted total harm at the last decision (m2/s2)
+        self._impact_s: Floats = np.zeros((0, 0))  # [n, N] time of the last predicted impact of each vehicle
+        self._ranges = Ranges.of(scenario, vehicle, self._others)
+        numbers = len(self._ranges.uncertain)
+        if self.robust is not None and 2**numbers > MOST_CORNERS:
+            raise InvalidInput(
+                f"robust:believed: scenario {scenario.name!r} leaves {numbers} numbers of the other vehicles open,"
+                f" which make {2**numbers} corners; at most {MOST_CORNERS} can be certified"
+            )
+        self.shield = self._make()
+
+    def _make(self) -> RobustShield:
+        certain = self.robust or CORNERS
+        return RobustShield(
+            self.scenario, self.vehicle, harm_count=self._harm_count, others=self._others, robust=certain
+        )
+
+    @property
+    def members(self) -> int:
+        """Number of worlds that are certified for each true world: 1 for the median, plus 1 for each corner."""
+        return 1 + len(self._corners())
+
+    def __copy__(self) -> BelievedShield:
+        """Return an independent copy: its decisions do not change this shield."""
+        apart = object.__new__(BelievedShield)
+        apart.__dict__.update(self.__dict__)
+        apart.shield = copy.copy(self.shield)
+        for name in PER_WORLD:
+            setattr(apart, name, getattr(self, name).copy())
+        return apart
+
+    def take(self, rows: Ints) -> BelievedShield:
+        """Return an independent shield for the episodes with the indices ``rows``."""
+        apart = copy.copy(self)
+        if self.shield.memory.running is not None:
+            apart.shield = self.shield.take(rows)
+        apart._odometer = take_memory(self._odometer, rows)
+        for name in (*PER_WORLD, *(("_totals",) if len(self._totals) else ())):
+            setattr(apart, name, getattr(self, name)[rows])
+        return apart
+
+    def begin(self, worlds: Worlds, rows: Ints) -> None:
+        """Start episodes in the batch at indices ``rows``; ``worlds`` [m] are their worlds at the alert.
+
+        The certification itself starts at the first decision, with the information received by then.
+        """
+        if len(rows) >= len(self._wanted):
+            self.shield, self._wanted, self._totals = self._make(), np.zeros(0), np.zeros((0, 0, 0))
+        n, N, fresh = len(rows), worlds.N, self._wanted.size == 0
+        begun = {
+            "_odometer": Odometer.begun(worlds, self.vehicle), "predicted_harm": np.full(n, np.nan),
+            "_heard": np.full((n, 2 * N), np.nan), "_impact_s": np.full((n, N), -1.0), "_asked_s": np.full(n, np.nan),
+            "_wanted": np.zeros(n), "interventions": np.zeros(n, np.int64),
+        }  # fmt: skip
+        for name, part in begun.items():
+            setattr(self, name, part if fresh else renew_memory(getattr(self, name), rows, part))
+
+    def decide(
+        self, worlds: Worlds, proposed: Floats, proposer: Proposer | None = None, *, only: Bools | None = None
+    ) -> Floats:
+        """Return the certified actions, [n], from -1 (full braking) to 1; 0 before the vehicle's latency has elapsed.
+
+        A repeated call at the same time returns the same actions. Raises ``InvalidInput`` for an episode without
+        ``begin``.
+
+        Args:
+            worlds: the true worlds; only what the vehicle received is read.
+            proposed: [n] proposed actions.
+            proposer: the policy and its memory. Where nothing else certifies a proposal, its rollout in the estimated
+                worlds is tried. None: no rollout.
+            only: [n] True for worlds that decide now; None: all.
+
+        """
+        shield, vehicle = self.shield, self.vehicle
+        if worlds.n > len(self._heard):
+            raise InvalidInput(
+                f"shield: believed: act on {count_of(worlds.n, 'world')}, but begin was not called for each"
+            )
+        self._odometer = odometer = Odometer(*self._odometer).look(worlds, vehicle)
+        past = worlds.vehicles.latency_s[:, vehicle] <= worlds.time_s
+        due = past & (worlds.time_s != self._asked_s) & (worlds.time_s < self.scenario.horizon_s)
+        due &= True if only is None else only
+        if due.any():
+            believed = self._believe(worlds, odometer.way_m, None)
+            self._begin_anew(worlds, believed, odometer.way_m, due)
+            proposer = None if proposer is None else proposer._replace(worlds=believed)
+            self.decision = decision = shield.decide(proposed, only=due, proposer=proposer)
+            self._wanted[due] = decision.applied[due]
+            self.interventions = self.interventions + (decision.intervened & due)
+            self._asked_s[due] = worlds.time_s[due]
+        return self._wanted.copy()
+
+    def _begin_anew(self, worlds: Worlds, believed: Worlds, way_m: Floats, due: Bools) -> None:
+        """Restart the inner shield in worlds where it has not started, or where a message contradicts the prediction.
+
+        Args:
+            worlds: the true worlds.
+            believed: the estimated worlds.
+            way_m: [n] the vehicle's distance since the alert, m.
+            due: [n] True for worlds that decide now.
+
+        """
+        shield, vehicle = self.shield, self.vehicle
+        told = Told.to(worlds, vehicle)
+        heard = np.concatenate([told.known, told.reacts], axis=1).astype(np.float64)
+        fresh, begun = np.isnan(self._heard[:, 0]), shield.memory.running is not None
+        keeps, anew = np.zeros_like(told.known), fresh
+        if self.robust != INTERIOR:  # in interior mode, plans are certified once, at the first decision
+            if begun:
+                self._note_impacts(worlds)
+            keeps = self._keeps(told, worlds.time_s)
+            surprised = self._is_surprised(believed, told.known & ~keeps) if begun else fresh
+            anew = fresh | surprised | (heard != self._heard).any(axis=1)
+        rows = np.flatnonzero(due & anew)
+        rows = rows if begun else np.arange(worlds.n)
+        if not rows.size:
+            return
+        before = copy.copy(shield) if begun and self.robust != INTERIOR else None
+        keeps = keeps & ~fresh[:, np.newaxis]
+        self._begin_shield(worlds.take(rows), believed.take(rows), way_m[rows], rows, keeps[rows], before)
+        if before is not None and (held_before := rows[~fresh[rows]]).size:
+            _hold_better(shield, held_before, before)
+        rows = rows[due[rows]]  # the other worlds begin again at their own first decision
+        first, self._heard[rows] = rows[fresh[rows]], heard[rows]
+        felt = worlds.pair_hit[first, max(vehicle - 1, 0) : vehicle + 1].any(axis=1)
+        felt |= worlds.obstacle_hit[first] & (vehicle == 0)
+        self.predicted_harm[first] = np.where(felt, np.inf, shield.memory.backup.harm[first])
+
+    def _begin_shield(
+        self, worlds: Worlds, believed: Worlds, way_m: Floats, rows: Ints, keeps: Bools, before: StepShield | None
+    ) -> None:
+        """Start the inner shield in ``rows``, with the median of everything unknown and, if robust, the corners of its
+        ranges.
+
+        Args:
+            worlds: the true worlds of these rows.
+            believed: their estimated worlds.
+            way_m: the vehicle's distance since the alert in each of them, m.
+            rows: indices of the episodes in the batch.
+            keeps: mask of vehicles, [rows, N], whose predicted state is better than their received state.
+            before: the inner shield before the restart; None at the first start.
+
+        """
+        parts = []
+        for m, share in enumerate([None, *self._corners()]):
+            foretold = None
+            if before is not None:
+                running = before.memory.running
+                assert running is not None
+                expected = worlds_at(believed, running.states[rows * running.members + m])
+                known = keeps.any(axis=1, keepdims=True)
+                foretold = (replace(expected, pair_hit=expected.pair_hit & known), keeps)
+            parts.append(self._believe(worlds, way_m, share, foretold))
+        self.shield.begin(parts[0], rows, possible=Uncertainty.interleaved(parts))
+
+    def _keeps(self, told: Told, time_s: Floats) -> Bools:
+        """Return a mask [n, N] of the vehicles whose predicted state is better than their received state.
+
+        These are unknown vehicles, and known vehicles without a message since their last predicted impact or contact.
+        ``told`` is the received information, ``time_s`` [n] the present time.
+        """
+        running = self.shield.memory.running
+        if running is None:
+            return np.zeros(told.known.shape, np.bool_)
+        n, N = told.known.shape
+        whole = running.problem.mass.shape[1]  # number of vehicles in the columns, counting an obstacle ahead
+        gaps = running.states.reshape(n, running.members, -1)[:, :, whole : 2 * whole - 1]
+        touching: Bools = np.any(gaps == 0.0, axis=1)
+        pressed = np.zeros((n, whole), np.bool_)
+        pressed[:, :-1], pressed[:, 1:] = touching, pressed[:, 1:] | touching
+        since = (told.at_s < self._impact_s) | (pressed[:, whole - N :] & (told.at_s < time_s[:, np.newaxis]))
+        keeps: Bools = ~told.known | ((self._heard[:, :N] == 1.0) & since)
+        keeps[:, self.vehicle] = False
+        return keeps
+
+    def _note_impacts(self, worlds: Worlds) -> None:
+        """Store the present time of ``worlds`` for vehicles that had an impact in any certified world since the last
+        decision.
+        """
+        running = self.shield.memory.running
+        assert running is not None
+        pairs = running.problem.mass.shape[1] - 1
+        totals = running.states[:, 4 * pairs + 1 : 5 * pairs + 1].reshape(worlds.n, running.members, pairs)
+        if self._totals.shape == totals.shape:
+            met: Bools = np.any(totals > self._totals, axis=1)
+            for p in range(pairs):
+                for j in {p - pairs + worlds.N - 1, p - pairs + worlds.N} & set(range(worlds.N)):
+                    self._impact_s[met[:, p], j] = worlds.time_s[met[:, p]]
+        self._totals = totals.copy()
+
+    def _is_surprised(self, believed: Worlds, heard: Bools) -> Bools:
+        """Return a mask [n] of the worlds in which a vehicle is outside the range of its predicted states.
+
+        Args:
+            believed: the estimated worlds now, [n].
+            heard: [n, N] True for vehicles whose received state is compared.
+
+        """
+        running = self.shield.memory.running
+        assert running is not None
+        seen, wrong = seen_columns(Packed.of(believed)), np.zeros(believed.n, np.bool_)
+        first = (seen.shape[1] + 4) // 5 - believed.N  # 1: an obstacle ahead is vehicle 0 of the columns
+        foretold = running.states[:, : seen.shape[1]].reshape(believed.n, running.members, -1)
+        outside: Bools = (seen < foretold.min(axis=1) - SURPRISE) | (seen > foretold.max(axis=1) + SURPRISE)
+        for i in range(believed.N):
+            wrong |= heard[:, i] & outside[:, first + i]
+        for p in range(believed.N - 1):
+            wrong |= heard[:, p] & heard[:, p + 1] & outside[:, 2 * first + believed.N + p]
+        return wrong
+
+    def _corners(self) -> list[dict[tuple[str, int], float]]:
+        uncertain = self._ranges.uncertain
+        shares = [] if self.robust is None else product((0.0, 1.0), repeat=len(uncertain))
+        return [dict(zip(uncertain, each, strict=True)) for each in shares]
+
+    def _believe(
+        self,
+        worlds: Worlds,
+        way_m: Floats,
+        share: dict[tuple[str, int], float] | None,
+        foretold: tuple[Worlds, Bools] | None = None,
+    ) -> Worlds:
+        return self._ranges.believe(worlds, way_m, share, foretold)

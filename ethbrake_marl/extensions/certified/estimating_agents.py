@@ -1,0 +1,156 @@
+"""Agents that decide in the estimated world: what their vehicle received, with the scenario's ranges for the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.protocol import Agent, AgentAround, Knowledge, Source
+from ethbrake_marl.engine.memory import Memory, ask_script, begin_script, renew_memory
+from ethbrake_marl.engine.scripts import Script
+from ethbrake_marl.extensions.certified.estimated import Ranges, Told
+from ethbrake_marl.physics.state import Floats, Vehicles, Worlds
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.paper_hybrid import HybridAgent
+
+
+class Odometer(NamedTuple):
+    """Distance of a vehicle since the alert, computed from its own speed and command at its decisions."""
+
+    way_m: Floats  # [n] distance since the alert, m
+    time_s: Floats  # [n] time of the last decision, s
+    speed_mps: Floats  # [n] speed at the last decision, m/s
+
+    @classmethod
+    def begun(cls, alert: Worlds, vehicle: int) -> Odometer:
+        """Return the odometer of vehicle ``vehicle`` (index) at the start of episodes in the worlds ``alert``, [n]."""
+        return cls(np.zeros(alert.n), alert.time_s.copy(), alert.speeds_mps[:, vehicle].copy())
+
+    def look(self, worlds: Worlds, vehicle: int) -> Odometer:
+        """Return the odometer after the time since the last decision; ``worlds`` [n] are the present ones.
+
+        The distance is exact under a constant command, also if the vehicle stops. In other cases the mean speed is
+        used.
+        """
+        speed, command, before = worlds.speeds_mps[:, vehicle], worlds.command_mps2[:, vehicle], self.speed_mps
+        way = 0.5 * (before + speed) * (worlds.time_s - self.time_s)
+        stopped = (speed == 0.0) & (before > 0.0) & (command < 0.0)
+        way[stopped] = np.minimum(way, before * before / (-2.0 * np.where(stopped, command, -1.0)))[stopped]
+        return Odometer(self.way_m + way, worlds.time_s.copy(), speed.copy())
+
+
+class Believing(AgentAround):
+    """Agent that lets another agent, ``policy``, control its vehicle in the estimated world.
+
+    The policy starts when it is first asked, on the information received by then. It starts again in worlds where
+    another vehicle becomes known, or where a message over a channel says that it reacts. In the estimate, the others
+    follow the scenario's scripts. ``predicted_harm`` [n] is the harm that the policy expected when it was first asked.
+
+    Args:
+        policy: any agent that reads the state of the line.
+        scenario: declares the ranges of everything unknown; a mixture raises ``InvalidInput``.
+        shows: True: the policy sees the estimated world at every decision. False: only where it starts.
+
+    """
+
+    def __init__(self, policy: Agent, scenario: Scenario, *, shows: bool = False) -> None:
+        super().__init__(policy, f"{policy.name}:believed")
+        self.scenario, self._shows = scenario, shows
+        self._ranges: dict[int, Ranges] = {}  # by the agent's vehicle
+        Ranges.of(scenario, 0, {})  # refuses a mixture at once
+
+    @property
+    def knows(self) -> Knowledge:
+        """Information that the agent uses: received messages, completed by the scenario's model of the line."""
+        return Knowledge((Source.BELIEFS,))
+
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        """Return the memory at the start of episodes, as a mapping. The policy has not started, because nothing was
+        received yet.
+
+        Args:
+            alert: the worlds at the alert, [n].
+            vehicle: index of the agent's vehicle.
+            scripts: scripts of the other vehicles; not used.
+
+        """
+        return {
+            "way": Odometer.begun(alert, vehicle),
+            "heard": np.full((alert.n, 2 * alert.N), np.nan),  # news on which the policy began; NaN: not begun
+            "predicted_harm": np.full(alert.n, np.nan),
+            "policy": None,
+        }
+
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        """Return the policy's command, [n] m/s2, and the new memory.
+
+        Args:
+            worlds: the true worlds; only what the vehicle received is read.
+            memory: memory from ``begin`` or the previous ``act``.
+            vehicle: index of the agent's vehicle.
+
+        """
+        way, heard = Odometer(*memory["way"]).look(worlds, vehicle), self._heard(worlds, vehicle)
+        policy, predicted = memory["policy"], memory["predicted_harm"]
+        rows = np.flatnonzero((heard != memory["heard"]).any(axis=1))
+        if rows.size:
+            believed = self._believe(worlds.take(rows), vehicle, way.way_m[rows])
+            others = self._ranges[vehicle].others
+            begun = begin_script(self.policy, self._shown_at_first(believed), vehicle, others)
+            policy = begun if policy is None else renew_memory(policy, rows, begun)  # the first call covers all rows
+            if isinstance(policy, Mapping) and "predicted_harm" in policy:
+                predicted = np.where(np.isnan(memory["heard"][:, 0]), policy["predicted_harm"], predicted)
+        shown = self._believe(worlds, vehicle, way.way_m) if self._shows else worlds
+        command, policy = ask_script(self.policy, shown, policy, vehicle)
+        return command, {"way": way, "heard": heard, "predicted_harm": predicted, "policy": policy}
+
+    def _shown_at_first(self, believed: Worlds) -> Worlds:
+        return believed
+
+    def _heard(self, worlds: Worlds, vehicle: int) -> Floats:
+        """Return flags [n, 2 N], 0 or 1: whether ``vehicle`` knows each vehicle, and whether a message says that this
+        vehicle reacts already.
+
+        Where a flag changes, the policy starts again. ``worlds`` are the true worlds now.
+        """
+        told = Told.to(worlds, vehicle)
+        unforetold = told.reacts & self.scenario.v2x.by_link  # without a channel a reaction is predicted by its latency
+        return np.concatenate([told.known, unforetold], axis=1).astype(np.float64)
+
+    def _believe(self, worlds: Worlds, vehicle: int, way_m: Floats) -> Worlds:
+        if vehicle not in self._ranges:
+            self._ranges[vehicle] = Ranges.of(self.scenario, vehicle)
+        return self._ranges[vehicle].believe(worlds, way_m)
+
+
+class BelievingHybrid(Believing):
+    """The paper's Algorithm 1 in the estimated world: the first decision chooses between the policy and E-V2X-BM, the
+    best constant deceleration.
+
+    The one that predicts less harm controls the vehicle for the whole episode.
+    """
+
+    policy: HybridAgent
+
+    @property
+    def knows(self) -> Knowledge:
+        """Information that the agent uses: the policy's information, and the estimated world for the comparison."""
+        return Knowledge.of(self.policy.policy, also=Source.BELIEFS)
+
+    def _shown_at_first(self, believed: Worlds) -> Worlds:
+        """Return the estimated worlds with their clock at 0 and without past impacts, because the rollouts that compare
+        the policy with E-V2X-BM start there.
+        """
+        v, n = believed.vehicles, believed.n
+        latency = np.maximum(v.latency_s - believed.time_s[:, np.newaxis], 0.0)
+        vehicles = Vehicles.at_once(
+            v.braking_capacity_mps2, v.driving_capacity_mps2, latency, v.mass_t, v.speed_limit_mps, v.restitution,
+            v.brake_rate_mps3, v.release_rate_mps3,
+        )  # fmt: skip
+        return replace(
+            believed, vehicles=vehicles, time_s=np.zeros(n), pair_hit=np.zeros_like(believed.pair_hit),
+            obstacle_hit=np.zeros(n, np.bool_),
+        )  # fmt: skip

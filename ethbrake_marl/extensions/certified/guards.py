@@ -1,0 +1,85 @@
+"""Guards of the modes for incomplete knowledge: against an uncertainty, or in a world estimated from messages.
+
+A *guard* connects a shield with a running engine.
+"""
+
+from __future__ import annotations
+
+import copy
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.engine.engine import Engine, Ruling
+from ethbrake_marl.extensions.certified.estimated_shield import BelievedShield
+from ethbrake_marl.physics.state import Floats, Ints, Worlds
+from ethbrake_marl.shield.contract import Guarded, ShieldGuard, why
+from ethbrake_marl.shield.guard import StepGuard
+
+
+class RobustMode(IntEnum):
+    """Number that stands for mode ``robust`` in the info ``shield_mode``; ``eb.ShieldMode`` has the other modes."""
+
+    ROBUST = 2
+
+
+class RobustGuard(StepGuard):
+    """Guard of mode ``robust``: lets a ``RobustShield`` decide on the actions in each step of a running engine."""
+
+    def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
+        """Return the infos of a step as a mapping, with ``members``: the number of certified worlds for each world.
+
+        Args:
+            memory: shield and policies after the step.
+            ruling: decision of the step; None at the reset.
+
+        """
+        return super().tell(memory, ruling) | {"members": memory.shield.memory.running.members}
+
+
+class BelievedGuard(ShieldGuard):
+    """Guard of modes ``step`` and ``robust`` in the estimated world: lets a ``BelievedShield`` decide on the actions in
+    each step of a running engine.
+
+    Its bound on harm exists from the first decision on and holds in the estimated world. The motion is not compared
+    with the prediction, because an estimate may be wrong without a fault of the system.
+    """
+
+    def _started(self, shield: BelievedShield, alert: Worlds, rows: Ints) -> BelievedShield:
+        shield.begin(alert, rows)
+        return shield
+
+    def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
+        """Return the proposed actions and the actions to apply, which the shield certifies in the estimated worlds.
+
+        Args:
+            running: the engine before the step.
+            memory: shield and policies before the step.
+            proposed: [n, 1] proposed actions.
+
+        """
+        worlds = running.worlds
+        proposed, memories = self._asked(worlds, memory.policies, proposed)
+        after = copy.copy(memory.shield)
+        before, proposer = after.interventions, self._proposer(memories, worlds)
+        applied = after.decide(worlds, proposed[:, 0], proposer, only=~running.ended)[:, np.newaxis]
+        stepped_in = after.interventions > before
+        return Ruling(proposed, applied, stepped_in, ~running.ended, after.decision, Guarded(after, memories))
+
+    def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
+        """Return, as a mapping, the infos of a step that is certified in the estimated worlds.
+
+        ``trusted`` is true if the mode is ``robust``, so that the bound also says something about the true world.
+        ``memory`` holds the shield after the step, ``ruling`` its decision (None at the reset).
+        """
+        estimated: BelievedShield = memory.shield
+        robust, shield = estimated.robust is not None, estimated.shield
+        infos = self._of_step(ruling) | why(ruling)
+        infos |= {"bound_harm": np.inf, "settles": False, "believed": True, "trusted": robust}
+        if ruling is not None:
+            infos["bound_harm"] = np.where(np.isfinite(estimated.predicted_harm), shield.bound, np.inf)
+            infos["settles"] = shield.memory.settles
+        if robust:
+            infos["members"] = estimated.members
+        return infos

@@ -1,0 +1,161 @@
+"""Checked settings of mode ``robust`` and of ``believed``, and the shields and guards that they make."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ethbrake_marl.agents.protocol import Agent, Source
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine.scripts import Script
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.certified.enclosure import CORNERS, INTERIOR, checked_robust
+from ethbrake_marl.extensions.certified.estimated_shield import BelievedShield
+from ethbrake_marl.extensions.certified.guards import BelievedGuard, RobustGuard, RobustMode
+from ethbrake_marl.extensions.certified.robust_step import RobustShield
+from ethbrake_marl.extensions.certified.uncertainty import UNCERTAINTY_EXAMPLE, Uncertainty, parse_uncertainty
+from ethbrake_marl.scenario.schema import Scenario, as_scenario
+from ethbrake_marl.shield.contract import ShieldGuard, ShieldMode
+from ethbrake_marl.shield.options import ShieldOptions, check_mode, misplaced, one_learner, shielded_vehicle
+
+
+@dataclass(frozen=True)
+class RobustOptions(ShieldOptions):
+    """``eb.ShieldOptions`` with settings for incomplete knowledge.
+
+    Args:
+        mode: a mode of ``eb.ShieldOptions``, or ``robust``: ``step`` against an uncertainty. None: ``robust`` with an
+            uncertainty, else ``step``.
+        uncertainty: uncertainty for mode ``robust``, such as ``"gaps_m=0.5"``.
+        robust: worlds of the uncertainty that mode ``robust`` certifies: its ``corners`` (fast) or whole ``interior``.
+        believed: certify in the estimated world, on what the vehicle received; in mode ``robust`` against everything
+            that it did not receive. For modes ``step`` and ``robust`` with one learner, and not together with
+            ``uncertainty``, ``allowance``, ``cap``, ``logging`` and ``shares``.
+
+    Raises ``InvalidInput`` and ``UnknownName`` as ``eb.ShieldOptions`` does.
+
+    >>> import ethbrake_marl as eb
+    >>> eb.ShieldOptions(uncertainty="gaps_m=0.5").mode
+    'robust'
+
+    """
+
+    uncertainty: Uncertainty | str | None = None
+    robust: str = CORNERS
+    believed: bool = False
+
+    def __post_init__(self) -> None:
+        if self.mode is None:
+            object.__setattr__(self, "mode", "step" if self.uncertainty is None else "robust")
+        mode, where = check_mode(self.mode), self.where
+        self.check_switches("believed")
+        if self.believed:
+            if mode == "episode":
+                raise misplaced("believed", True, mode, ["step", "robust"], where)
+            without = {"uncertainty": None, "allowance": 0.0, "cap": None, "logging": False, "shares": False}
+            for name, value in without.items():
+                if getattr(self, name) != value:
+                    raise InvalidInput(
+                        f"{where}: {name} = {getattr(self, name)!r}: not together with believed = True, which"
+                        " certifies against what was not received"
+                    )
+        uncertainty = None if self.believed else mode_uncertainty(mode, self.uncertainty, where)
+        object.__setattr__(self, "uncertainty", uncertainty)
+        super().__post_init__()
+        if checked_robust(self.robust, where) == INTERIOR and mode != "robust":
+            raise misplaced("robust", self.robust, mode, ["robust"], where)
+
+    @property
+    def written(self) -> str:
+        """Text of the mode in an agent spec, after the ``+``: ``robust:interior:believed`` in
+        ``ppo+robust:interior:believed``.
+        """
+        robust = "" if self.robust == CORNERS else f":{self.robust}"
+        return f"{self.mode}{robust}{':believed' if self.believed else ''}"
+
+    @property
+    def adds(self) -> Source:
+        """Source of information that the shield uses in addition to the policy's information."""
+        return Source.BELIEFS if self.believed else super().adds
+
+    def shield(
+        self, scenario: Scenario, vehicle: int | tuple[int, ...], others: Mapping[int, Script] | None = None
+    ) -> Any:
+        """Return a new shield for ``vehicle`` (an index; several for modes that shield several), before any episode.
+
+        ``others`` are the scripts of the other vehicles by index; None: the scenario's scripts.
+        """
+        if self.believed:
+            assert isinstance(vehicle, int)
+            robust = self.robust if self.mode == "robust" else None
+            return BelievedShield(scenario, vehicle, harm_count=self.harm_count, robust=robust, others=others)
+        if self.mode == "robust":
+            return RobustShield(
+                scenario, vehicle, harm_count=self.harm_count, allowance=self.allowance, others=others, cap=self.cap,
+                uncertainty=checked_uncertainty(self.uncertainty), robust=self.robust, logging=self.logging,
+            )  # fmt: skip
+        return super().shield(scenario, vehicle, others)
+
+    def check_in(self, scenario: Scenario, *, several: bool) -> None:
+        """Raise ``InvalidInput`` if a shield with these settings refuses the scenario.
+
+        ``several`` is True for one shield of all learners together.
+        """
+        one = one_learner(scenario)
+        if self.believed:  # the scenario's scripts apply only if it has exactly one learner
+            self.shield(scenario, one or 0, {} if one is None else None)
+        else:
+            super().check_in(scenario, several=several)
+
+    def guard(self, engine: Engine, policies: Mapping[int, Agent], *, several: bool = False, **how: Any) -> ShieldGuard:
+        """Return the guard that connects a shield with these settings to an engine.
+
+        Args:
+            engine: the engine whose learners are shielded.
+            policies: agents that propose the actions, by vehicle index.
+            several: True: one shield for several learners.
+            how: further keyword arguments of ``StepGuard``.
+
+        """
+        scenario, scripts, where = as_scenario(engine.scenario), engine.scripts, self.where
+        if self.believed:
+            if len(engine.learners) > 1:
+                raise InvalidInput(
+                    f"{where}: believed = True: shields one learner, not several; pass learners=['vehicle_2'] to the"
+                    " environment"
+                )
+            mode = RobustMode.ROBUST if self.mode == "robust" else ShieldMode.STEP
+            shield = self.shield(scenario, engine.learners[0], scripts)
+            return BelievedGuard(engine, policies, shield, mode=mode, where=where)
+        if self.mode == "robust":
+            shield = self.shield(scenario, shielded_vehicle(engine, several), scripts)
+            mode = RobustMode.ROBUST
+            return RobustGuard(engine, policies, shield, mode=mode, where=where, shares=self.shares, **how)
+        return super().guard(engine, policies, several=several, **how)
+
+
+def checked_uncertainty(given: object) -> Uncertainty | None:
+    """Return ``given`` as an ``Uncertainty``: an object, its written form such as ``"gaps_m=0.5"``, or None, which
+    stays None.
+
+    Raises ``InvalidInput`` for anything else.
+    """
+    if given is None or isinstance(given, Uncertainty):
+        return given
+    if isinstance(given, str):
+        return parse_uncertainty(given)
+    raise InvalidInput(f"uncertainty = {given!r}: must be an Uncertainty or text, for instance {UNCERTAINTY_EXAMPLE!r}")
+
+
+def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None:
+    """Return the checked uncertainty for a shield mode, or None if there is none.
+
+    Raises ``InvalidInput`` if mode ``robust`` has none, or another mode has one; ``where`` begins the message.
+    ``given`` is an ``Uncertainty``, its written form, or None.
+    """
+    uncertainty = checked_uncertainty(given)
+    if (mode == "robust") != (uncertainty is not None):
+        what = "needs an uncertainty" if uncertainty is None else "takes no uncertainty; robust does"
+        raise InvalidInput(f"{where}: mode {mode} {what}, for instance {UNCERTAINTY_EXAMPLE}")
+    return uncertainty

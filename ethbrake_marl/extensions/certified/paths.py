@@ -1,0 +1,607 @@
+"""Paths of a box of worlds: in each piece, the worlds in which a pair has an impact branch off as a path of their own.
+
+A *path* is a set of worlds with the same sequence of impacts (``affine.Path``); a *cell* is a box with its commands.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.extensions.certified.affine import (
+    CLOSING,
+    FREE,
+    HARDEST,
+    MAY_STOP,
+    MOVES,
+    OPENING,
+    PARTS,
+    REACH,
+    ROUNDING,
+    SINCE,
+    SOFTEST,
+    SPREAD,
+    STANDS,
+    TOUCH_WIDTH,
+    TOUCHES,
+    WIDE,
+    Cell,
+    Motion,
+    Path,
+    add,
+    between,
+    cut,
+    difference,
+    high,
+    low,
+    move_alone,
+    negative,
+    product,
+    square,
+    square_root,
+)
+from ethbrake_marl.extensions.certified.approach import NEVER, Approach, approach, may_meet, noise, pressing
+from ethbrake_marl.extensions.certified.bounce import spring_apart, stay
+from ethbrake_marl.extensions.certified.rough import driven, rough_harm
+from ethbrake_marl.extensions.certified.touching import (
+    UNEVEN,
+    apart,
+    begin_touch,
+    common,
+    dip_of,
+    is_blurred,
+    move_together,
+    pressing_together,
+)
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.motion import BOUND
+from ethbrake_marl.physics.state import Floats, Ints
+
+STACK = 256  # largest number of waiting paths
+
+
+class Stack(NamedTuple):
+    """Stack of paths that wait to be followed. A *path* is a set of worlds with the same impacts so far."""
+
+    forms: Floats  # [STACK, N + P + 1, W] ``Path.forms`` of each path
+    touch: Floats  # [STACK, P, TOUCH_WIDTH] ``Path.touch`` of each path
+    marks: Ints  # [STACK, 2 P + 1] ``Path.marks`` of each path
+    size: Ints  # [1] number of paths on the stack
+
+
+@compiled(apart=True)
+def new_stack(N: int, width: int) -> Stack:
+    """Return an empty stack of paths for ``N`` vehicles and affine forms of length ``width``."""
+    P = N - 1
+    return Stack(
+        np.zeros((STACK, N + P + 1, width)),
+        np.zeros((STACK, P, TOUCH_WIDTH)),
+        np.zeros((STACK, 2 * P + 1), np.int64),
+        np.zeros(1, np.int64),
+    )
+
+
+@compiled(apart=True)
+def keep_worst(harm: Floats, worst: float, out: Floats) -> float:
+    """Return the larger of ``worst`` and the largest value of the affine form ``harm`` [W] (centre, slopes, remainder),
+    m2/s2.
+
+    If ``harm`` reaches a new maximum, it is copied to ``out`` [W].
+    """
+    if not high(harm) <= worst:
+        out[:] = harm
+        return high(harm)
+    return worst
+
+
+@compiled(apart=True)
+def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
+    """Record a bound on the harm of a path that is not followed any further; return the largest harm recorded so far.
+
+    The bound is ``rough_harm``, which uses only the largest speeds that are still possible.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        worst: largest harm recorded so far, m2/s2.
+        out: [W] receives the affine form of the harm if it is a new largest one.
+
+    """
+    return keep_with(np.zeros(cell.speed.shape[1]), rough_harm(cell, path, -1), worst, out)
+
+
+@compiled(apart=True)
+def branch(
+    cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, how: Approach, worst: float, out: Floats
+) -> float:
+    """Record the harm of the worlds in which pair ``p`` has an impact in the present piece, or follow them as a new
+    path.
+
+    If no other impact can follow, their harm is final and recorded. Else they are put on the stack as a path of their
+    own. Where that path cannot be followed, ``rough_harm`` is recorded instead: a bound from the largest speeds that
+    are still possible. Returns the largest harm recorded so far.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        stack: paths that wait to be followed; new paths are put on top.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        how: closing speed and time of the contact (from ``approach``).
+        worst: largest harm recorded so far, m2/s2.
+        out: [W] receives the affine form of the harm if it is a new largest one.
+
+    """
+    P = cell.gap.shape[0]
+    harm = path.forms[-1].copy()
+    if path.marks[p] == 0:
+        add(harm, 1.0, how.squared)
+    other = 1 - p
+    final = P == 1 or path.marks[other] == 1
+    touches = path.marks[p] == 0 and pressing(motion, p)[1] >= 0.0 and may_only_touch(cell, path, motion, p, how)
+    touches = touches and (P == 1 or may_turn(cell, motion, p, path.marks[2 * P]))  # its first impact is then to come
+    if final:
+        worst = keep_worst(harm, worst, out)
+        if not touches:
+            return worst
+    rough = rough_harm(cell, path, -1 if touches else p) - high(path.forms[-1])
+    if P == 2 and path.marks[P + other] != FREE:
+        return keep_with(harm, rough, worst, out)
+    speed = cut(square_root(how.squared), 0.0, math.inf)
+    length = cell.times[path.marks[2 * P] + 1] - cell.times[path.marks[2 * P]]
+    closing = np.zeros_like(speed) if final else closing_after(cell, path, motion, p, speed, how.time, length)
+    if high(closing) > 0.0:
+        if touches:
+            return keep_with(harm, rough, worst, out)
+        both = harm.copy()
+        add(both, 1.0, square(cut(closing, 0.0, math.inf)))
+        worst = keep_worst(both, worst, out)
+    if not strike(cell, path, stack, motion, p, how, speed, harm):
+        worst = keep_with(harm, rough, worst, out)
+    return worst
+
+
+@compiled(apart=True)
+def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
+    """Record the affine form ``harm`` [W] (centre, slopes, remainder), to which at most ``rest`` (m2/s2) will be added;
+    return the largest harm recorded, m2/s2.
+
+    ``worst`` is the largest harm recorded so far; ``out`` [W] receives the affine form of a new largest harm.
+    """
+    whole = harm.copy()
+    whole[0] += rest
+    return keep_worst(whole, worst, out)
+
+
+@compiled(apart=True)
+def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats, time: Floats, length: float) -> Floats:
+    """Return the closing speed of the other pair of three vehicles if it may meet in the same piece after pair ``p``.
+
+    The result is an affine form [W] (centre, slopes, remainder) in m/s; it is 0 if that pair cannot meet.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        speed: affine form [W] of the closing speed at the impact of pair ``p``, m/s.
+        time: affine form [W] of the time of that impact, s after the start of the piece.
+        length: length of the piece, s.
+
+    """
+    N, other = cell.speed.shape[0], 1 - p
+    push = product(cell.share[p, other], speed)  # change of the middle vehicle's speed, towards the other pair
+    push *= 1.0 + cell.restitution
+    softest, hardest = pressing(motion, other)
+    hold = max(pressing(motion, p)[1], 0.0) * length  # further change while pair p presses on
+    hold *= max(1.0, (1.0 + cell.restitution) * high(cell.share[p, other]))
+    begin, after = path.forms[N + other], path.forms[N + other].copy()
+    add(after, 1.0, motion.way[other])
+    add(after, -1.0, motion.way[other + 1])
+    dip = 0.125 * length * length * max(-softest, 0.0) + high(push) * (length - low(time)) + hold * length
+    if min(low(begin), low(after)) - dip > NEVER:
+        return np.zeros_like(speed)
+    closing = difference(path.forms[other + 1], path.forms[other])
+    add(closing, 1.0, push)
+    add(closing, 1.0, between(min(softest, 0.0) * length, max(hardest, 0.0) * length + hold, speed.shape[0]))
+    return closing
+
+
+@compiled(apart=True)
+def strike(
+    cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, how: Approach, speed: Floats, harm: Floats
+) -> bool:
+    """Put the worlds in which pair ``p`` has its impact in the present piece on the stack as a new path.
+
+    Returns False, and puts nothing on the stack, if the stack is full or the rear vehicle may move backwards
+    (``thrown_back``).
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        stack: paths that wait to be followed; new paths are put on top.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        how: closing speed and time of the contact (from ``approach``).
+        speed: affine form [W] (centre, slopes, remainder) of the closing speed at the impact, m/s.
+        harm: affine form [W] of the harm including this impact, m2/s2.
+
+    """
+    N, P, width = cell.speed.shape[0], cell.gap.shape[0], cell.speed.shape[1]
+    size = stack.size[0]
+    if size >= STACK or thrown_back(cell, path, motion, p, how, speed):
+        return False
+    piece = path.marks[2 * P]
+    length = cell.times[piece + 1] - cell.times[piece]
+    after = Path(stack.forms[size], stack.touch[size], stack.marks[size])
+    after.forms[:], after.touch[:], after.marks[:] = path.forms, path.touch, path.marks
+    after.forms[N + P] = harm
+    after.marks[p], after.marks[2 * P] = 1, piece + 1
+    left = negative(how.time)
+    left[0] += length
+    way = np.empty((N, width))
+    for i in range(N):
+        after.forms[i], way[i] = motion.speed[i], motion.way[i]
+    bounces = cell.restitution if high(speed) >= BOUND.PLASTIC_SPEED_MPS else 0.0
+    returns = cell.restitution if low(speed) >= BOUND.PLASTIC_SPEED_MPS else 0.0
+    _, most = pressing(motion, p)
+    # driving acceleration that a front vehicle loses if the impact pushes it beyond its speed limit; else 0
+    drive = high(motion.pull[p]) + motion.vague[p]
+    pushed = (1.0 + cell.restitution) * high(speed) + 2.0 * max(pressing(motion, p)[1], 0.0) * length
+    fastest = high(motion.onward[p])
+    if cell.moving:
+        fastest = max(fastest, high(path.forms[p]) + max(drive, 0.0) * length)
+    unlimited = drive if drive > 0.0 and fastest + pushed > cell.limit[p] else 0.0
+    if most < 0.0 or -returns * low(speed) + max(most, 0.0) * high(left) < 0.0:
+        jump = speed * (1.0 + bounces)
+        jump[-1] = abs(jump[-1]) + (bounces - returns) * BOUND.PLASTIC_SPEED_MPS
+        spring_apart(cell, path, motion, p, how, jump, left, after, way)
+    else:
+        most_apart, touch = bounces * high(speed), after.touch[p]  # largest opening speed after the impact
+        least, hardest = pressing_together(motion, p)
+        begin_touch(touch)
+        touch[CLOSING] = max(hardest, 0.0) * length
+        touch[OPENING] = max(most_apart, cell.restitution * touch[CLOSING]) - min(least, 0.0) * length
+        touch[WIDE] = touch[OPENING] * length
+        ratio = math.sqrt(hardest / least) if least > 0.0 else math.inf
+        steady = motion.vague[p] + motion.vague[p + 1] == 0.0
+        regular = cell.restitution * ratio < 1.0 and (ratio < UNEVEN or not cell.moving)
+        if least > 0.0 and (steady or (cell.moving and regular)):
+            touch[OPENING], touch[CLOSING] = most_apart, most_apart
+            touch[WIDE] = min(0.5 * most_apart * most_apart / least, most_apart * length)
+            if regular:
+                touch[OPENING], touch[CLOSING] = most_apart * ratio, most_apart * ratio
+                touch[SOFTEST], touch[HARDEST], touch[SINCE] = least, hardest, 0.0
+        touch[SPREAD], touch[REACH] = apart(touch), 0.0
+        stay(cell, path, motion, p, how, speed, left, after, way)
+        after.marks[P + p] = TOUCHES
+    for i in range(p, p + 2):
+        if unlimited > 0.0 and (i == p or after.marks[P + p] == TOUCHES):
+            add(after.forms[i], 1.0, between(-unlimited * high(left), 0.0, width))
+            add(way[i], 1.0, between(-0.5 * unlimited * high(left) * high(left), 0.0, width))
+    for q in range(P):
+        add(after.forms[N + q], 1.0, way[q])
+        add(after.forms[N + q], -1.0, way[q + 1])
+        if after.marks[P + q] == PARTS:
+            after.marks[P + q] = FREE
+    stack.size[0] = size + 1
+    if after.marks[P + p] == TOUCHES and path.marks[p] == 0 and may_only_touch(cell, path, motion, p, how):
+        return touch_only(cell, path, stack, motion, p, length)
+    return True
+
+
+@compiled(apart=True)
+def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int, how: Approach) -> bool:
+    """Return whether pair ``p`` may reach gap 0 with closing speed 0 exactly when it begins to be pressed together.
+
+    This needs a change in how the pair is pressed: a command changes, or a force builds up.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        how: closing speed and time of the contact (from ``approach``).
+
+    """
+    N, P = cell.speed.shape[0], cell.gap.shape[0]
+    softest, hardest = pressing(motion, p)
+    piece = path.marks[2 * P]
+    harder = may_turn(cell, motion, p, piece)
+    if harder and softest <= 0.0 <= hardest and low(how.squared) <= 1e-8:
+        return True
+    vague = harder if cell.moving else motion.vague[p] + motion.vague[p + 1] > 0.0
+    changed = piece == 0 or vague or (P == 2 and path.marks[1 - p] == 1)
+    for i in range(p, p + 2):
+        if i != cell.vehicle:
+            changed = changed or high(cell.onset[i]) == cell.times[piece]
+        elif piece > 0:
+            changed = changed or cell.action[piece] != cell.action[piece - 1]
+    closing = difference(path.forms[p + 1], path.forms[p])
+    return changed and low(closing) <= 1e-4 and high(closing) >= -1e-4 and low(path.forms[N + p]) <= 1e-6
+
+
+@compiled(apart=True)
+def may_turn(cell: Cell, motion: Motion, p: int, piece: int) -> bool:
+    """Return whether forces that build up may press pair ``p`` together harder within a piece.
+
+    That is so if the front vehicle's acceleration may fall or the rear vehicle's may rise.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        piece: index of the piece, 0 to J - 1.
+
+    """
+    return may_move(cell, motion, p, piece, 0) or may_move(cell, motion, p + 1, piece, 1)
+
+
+@compiled(apart=True)
+def may_move(cell: Cell, motion: Motion, i: int, piece: int, which: int) -> bool:
+    """Return whether brake build-up may lower (``which`` 0) or raise (``which`` 1) an acceleration within a piece.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        i: index of the vehicle.
+        piece: index of the piece, 0 to J - 1.
+        which: 0 or 1.
+
+    """
+    if not cell.forces.build[i] or motion.vague[i] > cell.forces.swing[i, piece + 1].max():
+        return cell.moving and motion.vague[i] > 0.0
+    return bool(cell.forces.swing[i, piece + 1, which] > 0.0)
+
+
+@compiled(apart=True)
+def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, length: float) -> bool:
+    """Push a second path: the worlds in which pair ``p`` met and stayed in contact without an impact.
+
+    With brake build-up the pair may open and have its first impact within the piece; the path below on the stack covers
+    these worlds. Returns False if the stack is full.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        stack: paths that wait to be followed; new paths are put on top.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        length: length of the piece, s.
+
+    """
+    size = stack.size[0]
+    if size >= STACK:
+        return False
+    stack.forms[size], stack.touch[size], stack.marks[size] = (
+        stack.forms[size - 1], stack.touch[size - 1], stack.marks[size - 1],
+    )  # fmt: skip
+    stack.forms[size, -1] = path.forms[-1]
+    stack.marks[size, p] = 0
+    begin_touch(stack.touch[size, p])
+    if cell.moving:
+        touch, (softest, hardest) = stack.touch[size, p], pressing(motion, p)
+        touch[OPENING], touch[CLOSING] = max(-softest, 0.0) * length, max(hardest, 0.0) * length
+        touch[WIDE] = touch[OPENING] * length
+        stack.forms[size - 1, -1, 0] += touch[CLOSING] * touch[CLOSING]
+    stack.size[0] = size + 1
+    return True
+
+
+@compiled(apart=True)
+def thrown_back(cell: Cell, path: Path, motion: Motion, p: int, how: Approach, speed: Floats) -> bool:
+    """Return whether the rear vehicle may move backwards after the impact of pair ``p``, so that it could be hit again.
+
+    False for the last vehicle of the line if it never drives: nobody is behind it, so it may as well stand.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        how: closing speed and time of the contact (from ``approach``).
+        speed: affine form [W] (centre, slopes, remainder) of the closing speed at the impact, m/s.
+
+    """
+    P, share = cell.gap.shape[0], (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0
+    slowest = 0.0
+    if not how.front_stands:
+        dip = dip_of(cell, motion.vague[p], cell.times[path.marks[2 * P] + 1] - cell.times[path.marks[2 * P]])
+        slowest = max(min(low(path.forms[p]), low(motion.speed[p])) - dip, 0.0)
+    last = p == P - 1 and driven(cell, p + 1, 0.0, cell.times[path.marks[2 * P]]) <= 0.0
+    return share * high(speed) > slowest and not last
+
+
+MOST_PATHS = 4000  # most paths to follow in one cell
+
+
+@compiled(apart=True)
+def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float) -> float:
+    """Return an upper bound on the harm of every world of the cell, m2/s2.
+
+    A result above ``most`` is no bound: the search then stopped early.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        stack: memory for paths (sets of worlds with the same impacts).
+        motion: memory for the motion of each vehicle.
+        out: [W] receives the affine form of the harm that reaches the bound.
+        most: harm above which the search stops, m2/s2.
+
+    """
+    N, P = cell.speed.shape[0], cell.gap.shape[0]
+    worst, paths = -math.inf, 0
+    first = Path(stack.forms[0], stack.touch[0], stack.marks[0])
+    first.forms[:N], first.forms[N : N + P], first.forms[N + P] = cell.speed, cell.gap, 0.0
+    first.touch[:], first.marks[:] = 0.0, 0
+    stack.size[0] = 1
+    here = Path(np.empty_like(first.forms), np.empty_like(first.touch), np.empty_like(first.marks))
+    while stack.size[0] > 0:
+        stack.size[0] -= 1
+        paths += 1
+        top = stack.size[0]
+        here.forms[:], here.touch[:], here.marks[:] = stack.forms[top], stack.touch[top], stack.marks[top]
+        worst = follow(cell, here, stack, motion, worst, out)
+        if worst > most:
+            return worst
+        if paths > MOST_PATHS:
+            for k in range(stack.size[0]):
+                worst = keep_rough(cell, Path(stack.forms[k], stack.touch[k], stack.marks[k]), worst, out)
+            return worst
+    return worst if worst >= 0.0 else math.inf  # every world takes some path, so no path at all is an error
+
+
+@compiled(apart=True)
+def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
+    """Follow a path to its end. Return the maximum of ``worst``, its harm, and the harm that branches off on the way.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; changed in place.
+        stack: paths that wait to be followed; new paths are put on top.
+        motion: memory for the motion of each vehicle.
+        worst: largest harm recorded so far, m2/s2.
+        out: [W] receives the affine form of the harm if it is a new largest one.
+
+    """
+    N, P = cell.speed.shape[0], cell.gap.shape[0]
+    quiet = 0  # first piece from which on no vehicle drives
+    for j in range(cell.action.shape[0]):
+        if cell.action[j] > 0.0:
+            quiet = j + 1
+    for i in range(cell.constant.shape[0]):
+        if i != cell.vehicle and cell.constant[i] > 0.0:
+            quiet = cell.action.shape[0]
+    while path.marks[2 * P] < cell.action.shape[0]:
+        piece = path.marks[2 * P]
+        move_alone(cell, path, piece, motion)
+        if may_meet_unseen(cell, path, motion):
+            return keep_rough(cell, path, worst, out)
+        worst = meet(cell, path, stack, motion, worst, out)
+        if not go_on(cell, path, motion):
+            return worst
+        path.marks[2 * P] += 1
+        if piece >= quiet and (motion.rest == STANDS).all() and path.touch[:, :WIDE].max() <= 0.0:
+            break
+    return keep_worst(path.forms[N + P], worst, out)
+
+
+@compiled(apart=True)
+def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
+    """Return whether a pair in contact, without an impact so far, may have its first impact in the present piece.
+
+    For this the pair must open first.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+
+    """
+    P = cell.gap.shape[0]
+    for p in range(P):
+        if path.marks[P + p] == TOUCHES and path.marks[p] == 0:
+            least, most = pressing_together(motion, p)
+            if least < 0.0 <= most and not (motion.rest[p : p + 2] == STANDS).all():
+                return True
+    return False
+
+
+@compiled(apart=True)
+def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
+    """Move the pairs in contact through the present piece, and branch off the worlds in which a pair has an impact.
+
+    Pairs in contact move as one from here on, or separate. The worlds with an impact are recorded or put on the stack
+    (``branch``). Returns the largest harm recorded so far.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; changed in place.
+        stack: paths that wait to be followed; new paths are put on top.
+        motion: motion of each vehicle in the present piece; changed in place.
+        worst: largest harm recorded so far, m2/s2.
+        out: [W] receives the affine form of the harm if it is a new largest one.
+
+    """
+    N, P = cell.speed.shape[0], cell.gap.shape[0]
+    length = cell.times[path.marks[2 * P] + 1] - cell.times[path.marks[2 * P]]
+    for p in range(P):
+        again = path.marks[P + p] == FREE and path.marks[p] == 1 and (P == 1 or path.marks[2 * P - 1 - p] == FREE)
+        if again and may_meet(cell, path, motion, p, length) and is_blurred(path, motion, N, p, length):
+            # treat a pair that may or may not be in contact as a pair in contact
+            front, rear, gap = path.forms[p].copy(), path.forms[p + 1].copy(), path.forms[N + p]
+            closing = difference(rear, front)
+            touch = path.touch[p]
+            begin_touch(touch)
+            touch[OPENING], touch[CLOSING], touch[WIDE] = max(-low(closing), 0.0), high(closing), max(high(gap), 0.0)
+            path.forms[p] = common(cell, p, front, rear)
+            path.forms[p + 1] = path.forms[p]
+            inside = cut(gap, 0.0, math.inf)
+            if p > 0:
+                add(path.forms[N + p - 1], 1.0, product(cell.share[p, 0], inside))
+            if p < P - 1:
+                add(path.forms[N + p + 1], 1.0, product(cell.share[p, 1], inside))
+            path.marks[P + p] = TOUCHES
+        if path.marks[P + p] == TOUCHES:
+            move_together(cell, path, motion, p, length)
+    for p in range(P):
+        if path.marks[P + p] == FREE and may_meet(cell, path, motion, p, length):
+            # impacts of the pair in this piece, with a moving or a standing front vehicle
+            for i in range(p, p + 2):
+                motion.way[i, -1] += (
+                    BOUND.TOUCH_SPEED_MPS * length
+                )  # a contact below the impact speed may change the speed by this
+                if (
+                    motion.rest[i] == MOVES
+                    or high(motion.speed[i]) > 0.0
+                    or high(motion.pull[i]) + motion.vague[i] >= 0.0
+                ):
+                    motion.speed[i, -1] += BOUND.TOUCH_SPEED_MPS
+            for stands in range(2):
+                if (motion.rest[p] == STANDS) == (stands == 1) or motion.rest[p] == MAY_STOP:
+                    how, there = approach(cell, path, motion, p, length, stands == 1)
+                    if there:
+                        worst = branch(cell, path, stack, motion, p, how, worst, out)
+    return worst
+
+
+@compiled(apart=True)
+def go_on(cell: Cell, path: Path, motion: Motion) -> bool:
+    """Advance the path to the end of the present piece without an impact. Return False if every world has an impact.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; changed in place.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+
+    """
+    N, P = cell.speed.shape[0], cell.gap.shape[0]
+    for p in range(P):
+        if path.marks[P + p] == TOUCHES:
+            continue
+        gap = path.forms[N + p]
+        add(gap, 1.0, motion.way[p])
+        add(gap, -1.0, motion.way[p + 1])
+        gap[-1] += ROUNDING * (1.0 + abs(gap[0]))
+        if high(gap) + noise(cell, path, p, True) < -1e-9:
+            return False
+        path.marks[P + p] = FREE
+    for i in range(N):
+        path.forms[i] = motion.speed[i]
+    return True

@@ -1,0 +1,174 @@
+"""Step shield for uncertain worlds: it certifies the corners of an uncertainty, or its whole interior.
+
+The *members* of a world are the worlds in which ``StepShield`` certifies a plan for it. Here they are the corners of an
+``Uncertainty``. With ``robust="interior"`` the harm of every plan is also bounded over the whole box around the corners
+(``enclosure.Boxes``), at the alert and at every decision.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.engine.profiles import ProfileProblem
+from ethbrake_marl.engine.scripts import Script
+from ethbrake_marl.errors import InvalidInput, renumbered
+from ethbrake_marl.extensions.certified.enclosure import CORNERS, INTERIOR, Boxes, checked_robust
+from ethbrake_marl.extensions.certified.uncertainty import Uncertainty
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.certify import Backup, Decision, certify
+from ethbrake_marl.shield.reasons import NO_CERTIFICATE
+from ethbrake_marl.shield.running import Running
+from ethbrake_marl.shield.step import StepShield
+from ethbrake_marl.shield.step_memory import StepMemory
+
+
+class RobustShield(StepShield):
+    """``StepShield`` whose bound holds in every corner of an uncertainty, or in its whole interior.
+
+    Args:
+        scenario: the scenario of all worlds.
+        vehicle: index of the shielded vehicle. An uncertainty allows only one.
+        uncertainty: intervals around the reported quantities; None: ``begin`` receives the ``possible`` worlds.
+        robust: worlds to certify: ``corners`` or ``interior``.
+        harm_count: ``first`` or ``total`` impacts.
+        others: scripts of the other vehicles by index; None: the scenario's scripts.
+        settings: further keywords of ``StepShield``.
+
+    Raises ``InvalidInput`` as ``StepShield`` does, for several vehicles or a cap with an uncertainty, and for settings
+    that ``interior`` cannot certify.
+
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        vehicle: int | Sequence[int],
+        *,
+        uncertainty: Uncertainty | None = None,
+        robust: str = CORNERS,
+        harm_count: HarmCount = "first",
+        others: Mapping[int, Script] | None = None,
+        **settings: Any,
+    ) -> None:
+        super().__init__(scenario, vehicle, harm_count=harm_count, others=others, **settings)
+        if uncertainty is not None and (len(self.vehicles) > 1 or self.cap is not None):
+            what = "several vehicles" if self.cap is None else "a cap"
+            raise InvalidInput(f"shield: uncertainty: {what} with it: not covered; mode robust shields one vehicle")
+        self.uncertainty, self.robust = uncertainty, checked_robust(robust, "shield")
+        Boxes.check_possible(self.robust, scenario, harm_count, self._others)
+
+    @property
+    def possible_are(self) -> str:  # type: ignore[override]  # a constant there
+        """Words for a world's members (possible worlds) in error messages, for instance "uncertainty: gaps_m=0.5"."""
+        return f"uncertainty: {self.uncertainty}"
+
+    def members_of(self, worlds: Worlds) -> Worlds:
+        """Return the members of worlds at the alert, [n * M]: each world followed by the corners of its uncertainty."""
+        return worlds if self.uncertainty is None else self.uncertainty.members(worlds)
+
+    @property
+    def boxes(self) -> Boxes | None:
+        """The boxes of mode ``interior`` (range of every number of each world), once episodes have begun; else None."""
+        boxes: Boxes | None = self.memory.enclosure
+        return boxes
+
+    def _bound_at_alert(
+        self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
+    ) -> tuple[Floats, Boxes | None]:
+        """Return the bound on the harm of each plan at the alert, [m] m2/s2, and the boxes of all episodes (None in
+        corners mode).
+
+        In interior mode the bound covers all worlds of each box, else only its members (the reported world and the
+        corners of its box).
+
+        Args:
+            possible: [m * M] members of the new worlds, M consecutive ones for each.
+            problem: the same worlds as columns of numbers.
+            rows: [m] indices of the new episodes.
+            plan: [m, L] action at each decision.
+            harm: [m] largest harm of the plan in a member, m2/s2.
+
+        """
+        if possible.n == len(rows) or self.robust != INTERIOR:
+            return harm, self.boxes
+        boxes = Boxes.of(possible, problem, len(rows), self.scenario, self._others)
+        return boxes.at_alert(plan, harm), boxes.placed(self.boxes, rows)
+
+    def _also_certified(
+        self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
+    ) -> Decision:
+        """Return the decision; in interior mode, plans that are not certified for all worlds of their box are replaced.
+
+        Args:
+            now: state of the members (the corners of the boxes) before the decision.
+            memory: memory of the shield.
+            budget: [n] largest harm that a new plan may have, m2/s2.
+            decision: the decision, certified in the members only.
+            asked: [n] True for episodes that decide now.
+
+        """
+        boxes = memory.enclosure
+        return decision if boxes is None else certify_inside(boxes, now, memory.backup, budget, decision, asked)
+
+    def _leaves_range(self, running: Running) -> Bools:
+        """Return a mask [n] of the worlds that may leave the range spanned by their members (the reported world and the
+        corners of its uncertainty), now in the states ``running``.
+
+        Besides the worlds of ``StepShield``: worlds whose own latency is uncertain, because a decision then falls at a
+        different time in each world of the box, and all worlds if one uncertain number moves several quantities
+        (friction).
+        """
+        leaves, boxes = super()._leaves_range(running), self.boxes
+        if boxes is not None:
+            own = 2 * boxes.limit.shape[1] + boxes.vehicle
+            leaves |= boxes.high[:, own] > boxes.low[:, own]
+        if self.uncertainty is not None and self.uncertainty.moves_together:
+            leaves[:] = True
+        return leaves
+
+
+def certify_inside(
+    boxes: Boxes, running: Running, held: Backup, budget: Floats, decision: Decision, asked: Bools
+) -> Decision:
+    """Replace each plan of a decision that is not certified for every world of its box by the held plan.
+
+    Args:
+        boxes: range of every number of each world.
+        running: state of the members (corners of the boxes) before the decision.
+        held: plans and bounds from before the decision.
+        budget: [n] largest harm that a new plan may have, m2/s2.
+        decision: the decision, certified in the corners only.
+        asked: [n] True for episodes that decide now. Such an episode counts as ended only at the horizon, because a box
+            may hold moving worlds when all its corners are at rest.
+
+    """
+    plan, other = decision.backup.plan.copy(), (decision.backup.plan != held.plan).any(axis=1)
+    bound = np.where(asked & ~other, held.harm, decision.bound)  # an unchanged plan keeps its bound
+    changed = np.flatnonzero(asked & other)
+    found = boxes.bound(changed, plan[changed], budget[changed], only_enough=True)
+    least = np.where(decision.intervened, held.harm, budget)[changed]
+    good = found <= least
+    bound[changed[good]] = found[good]
+    known = np.isfinite(found)
+    decision.margin[changed[known]] = (budget[changed] - found)[known]
+    bad = changed[~good]
+    plan[bad], bound[bad] = held.plan[bad], held.harm[bad]
+    decision = decision._replace(bound=bound, backup=decision.backup._replace(plan=plan, harm=bound))
+    refused = bad[~decision.intervened[bad]]
+    if refused.size:  # apply the action of the held plan instead
+        part, plan = running.take(refused), held.plan[refused]
+        action, harm = plan[np.arange(len(plan)), part.steps], held.harm[refused]
+        with renumbered(refused):
+            instead = certify(part, action, Backup(plan, harm, held.constants), harm)
+        every, reason = np.ones(len(refused), np.bool_), np.full(len(refused), NO_CERTIFICATE)
+        instead = instead._replace(intervened=every, reason=reason, margin=decision.margin[refused])
+        decision = decision.put(refused, instead, np.arange(len(refused)))
+    after = decision.after
+    over = np.repeat(after.steps, after.members) >= after.problem.last_step
+    each = np.repeat(asked, after.members)
+    return decision._replace(after=after._replace(ended=np.where(each, over, after.ended)))

@@ -1,0 +1,97 @@
+"""Rough bound on harm that follows no path, from the speeds that the vehicles of a line can still reach.
+
+It is used for the worlds of a path that cannot be followed, so no bound is ever infinite.
+
+A vehicle alone is at most as fast as it is now, or as it becomes by driving up to its limit. An impact with closing
+speed w changes each vehicle's speed by its share of (1 + e) w, with restitution e. Let u be the largest speed of any
+vehicle, and let no vehicle move backwards yet. An impact slows the rear vehicle, to no less than -e times its speed;
+a front vehicle at rest gains at most (1 + e) times the rear one's speed. So the middle one of three vehicles stays
+between -e u and (1 + e) u until its second pair meets. (Three vehicles in contact are one cluster: each leaves with
+P + e (P - v) for a weighted mean P of the speeds v, which lies between the same bounds.)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ethbrake_marl.extensions.certified.affine import FREE, Cell, Path, high, low
+from ethbrake_marl.extensions.certified.touching import blur
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Floats
+
+
+@compiled(apart=True)
+def driven(cell: Cell, i: int, speed: float, since: float) -> float:
+    """Return the largest speed (m/s) that vehicle ``i`` can reach by driving if it has at most ``speed`` at time
+    ``since``.
+
+    ``since`` counts from the first decision, in s. ``cell`` holds the box of worlds and the commands.
+    """
+    drive, rest = 0.0, cell.times[-1] - since
+    if i == cell.vehicle:
+        for j in range(cell.action.shape[0]):
+            if cell.times[j + 1] > since:
+                drive = max(drive, cell.action[j] * high(cell.drive))
+                if cell.forces.build[i]:  # an earlier driving force may not be released yet
+                    drive = max(drive, high(cell.forces.mean[i, j + 1]) + cell.forces.swing[i, j + 1].max())
+    elif cell.constant[i] > 0.0:
+        drive = cell.constant[i]
+    return float(max(speed, min(cell.limit[i], speed + drive * rest)) if drive > 0.0 else speed)
+
+
+@compiled(apart=True)
+def rough_harm(cell: Cell, path: Path, hit: int) -> float:
+    """Return an upper bound on the harm of all worlds of a path, from the present piece on, m2/s2.
+
+    It uses only the largest speeds that the vehicles can still reach.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        hit: index of a pair that counts as hit already; -1: only the pairs marked in the path.
+
+    """
+    N, P = cell.speed.shape[0], cell.gap.shape[0]
+    since = cell.times[path.marks[2 * P]]
+    own, backwards = np.zeros(N), 0.0
+    for i in range(N):
+        around = 0.0
+        for p in range(max(i - 1, 0), min(i + 1, P)):
+            if path.marks[P + p] != FREE:
+                around += blur(cell, path, p, i - p)
+        own[i] = driven(cell, i, max(high(path.forms[i]) + around, 0.0), since)
+        backwards = max(backwards, around - low(path.forms[i]))
+    return high(path.forms[-1]) + rough_rest(cell, own, backwards, since, path, hit)
+
+
+@compiled(apart=True)
+def rough_rest(cell: Cell, own: Floats, backwards: float, since: float, path: Path, hit: int) -> float:
+    """Return the largest sum of squared closing speeds of the first impacts that are still to come, m2/s2.
+
+    Args:
+        cell: the box of worlds.
+        own: [N] largest speed of each vehicle without an impact, m/s.
+        backwards: largest backward speed of any vehicle now, m/s.
+        since: present time, s after the first decision.
+        path: marks the pairs that had an impact.
+        hit: index of a further pair that counts as hit; -1: none.
+
+    """
+    P, e = cell.gap.shape[0], cell.restitution
+    first = path.marks[0] == 1 or hit == 0
+    if P == 1:
+        return float(0.0 if first else own[1] * own[1])
+    second = path.marks[1] == 1 or hit == 1
+    fastest = max(own[1], own[2])
+    ahead = driven(cell, 1, (1.0 + e) * fastest, since)  # closing speed of the front pair after a push from behind
+    back: float = own[2] + max(
+        e * driven(cell, 1, fastest, since), backwards
+    )  # closing speed of the rear pair after its front vehicle is thrown back
+    if first and second:
+        return 0.0
+    if first:
+        return back * back
+    if second:
+        return ahead * ahead
+    return float(max(fastest * fastest + back * back, own[2] * own[2] + ahead * ahead))

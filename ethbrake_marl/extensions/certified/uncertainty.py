@@ -1,0 +1,263 @@
+"""Uncertainty: an interval around each quantity of a world, and the members that represent the worlds in it.
+
+A quantity of one vehicle (or pair) with the reported value x lies in [x - h, x + h]. The half-width h is a number in
+the quantity's unit or a share of x. The interval is cut to possible values: no latency, speed or gap below 0, no speed
+above the vehicle's limit. The *members* of a world are the reported world and every corner of the box of all these
+intervals: 2^d corners for d uncertain numbers. Mode ``robust`` proves its bound for the members
+(``docs/shield-intervals.md``).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.physics.state import Floats, Vehicles, Worlds
+from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.shield.checks import is_amount
+
+OF_VEHICLES = (  # fields of ``Vehicles``
+    "braking_capacity_mps2", "driving_capacity_mps2", "latency_s", "mass_t", "brake_rate_mps3", "release_rate_mps3",
+)  # fmt: skip
+
+QUANTITIES = (*OF_VEHICLES, "speeds_mps", "gaps_m", "friction")
+
+POSITIVE = (
+    "braking_capacity_mps2",
+    "mass_t",
+    "friction",
+    "brake_rate_mps3",
+    "release_rate_mps3",
+)  # quantities that must stay above 0
+
+_OF_FRICTION = (0.0, 0.125, 0.25, 0.375, 0.625, 0.75, 0.875, 1.0)  # shares of the interval; the reported value is 0.5
+
+MOST_CORNERS = 1024  # most corners of one world; each costs as much as the world itself
+
+UNCERTAINTY_EXAMPLE = "braking_capacity_mps2=5%,latency_s=0.1,gaps_m.pair_1=0.5"
+
+_FORM = f"must be quantity=half-width, for instance {UNCERTAINTY_EXAMPLE}"
+
+_ENTRY = re.compile(
+    r"(?P<name>\w+)(?:\.(?P<what>vehicle|pair)_(?P<number>[1-9]\d*))?\s*=\s*(?P<width>[^=%\s]+)(?P<share>%?)", re.ASCII
+)
+
+_NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """Half-width of one quantity's interval, for one vehicle or pair, or for each of them."""
+
+    quantity: str  # one of QUANTITIES
+    half_width: float  # in the quantity's unit, or a share of its value below 1
+    relative: bool = False  # True: ``half_width`` is a share of the value
+    place: int | None = None  # index of the vehicle or pair from 0; None: all of them
+
+    def __post_init__(self) -> None:
+        if self.quantity not in QUANTITIES:
+            raise unknown_name("uncertain quantity", self.quantity, QUANTITIES)
+        most, told = (1.0, "a share from 0 to below 100 %") if self.relative else (np.inf, "a number, at least 0")
+        if not is_amount(self.half_width, most):
+            raise InvalidInput(f"uncertainty: {self.quantity}: half-width {self.half_width!r}: must be {told}")
+        if self.place is not None and not (isinstance(self.place, int | np.integer) and self.place >= 0):
+            raise InvalidInput(f"uncertainty: {self.quantity}: place {self.place!r}: must be an index from 0")
+        if self.quantity == "friction" and self.place is not None:
+            raise InvalidInput("uncertainty: friction is one number for the whole line; give it without a vehicle")
+
+    def __str__(self) -> str:
+        kind = "pair" if self.quantity == "gaps_m" else "vehicle"
+        where = "" if self.place is None else f".{kind}_{self.place + 1}"
+        width = f"{100.0 * self.half_width:g}%" if self.relative else f"{self.half_width:g}"
+        return f"{self.quantity}{where}={width}"
+
+
+_Side = tuple[str, int, Floats, Floats]  # one uncertain number: quantity, place, least and largest value, each [n]
+
+
+@dataclass(frozen=True, slots=True)
+class Uncertainty:
+    """Intervals around the reported quantities of a world. ``parse_uncertainty`` reads the written form.
+
+    Raises ``InvalidInput`` if there is no interval, or if two intervals cover the same quantity of a vehicle or pair.
+    """
+
+    intervals: tuple[Interval, ...]  # one entry for each uncertain quantity
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.intervals, tuple) or not all(isinstance(each, Interval) for each in self.intervals):
+            raise InvalidInput(
+                f"uncertainty: intervals = {self.intervals!r}: must be a tuple of Interval; parse_uncertainty reads it"
+            )
+        if not self.intervals:
+            raise InvalidInput(f"uncertainty: no interval; one is needed, for instance {UNCERTAINTY_EXAMPLE}")
+        for k, one in enumerate(self.intervals):
+            for other in self.intervals[:k]:
+                same = None in (one.place, other.place) or one.place == other.place
+                if one.quantity == other.quantity and same:
+                    raise InvalidInput(f"uncertainty: {other} and {one} speak of the same quantity; give each once")
+
+    def __str__(self) -> str:
+        return ",".join(str(interval) for interval in self.intervals)
+
+    @property
+    def moves_together(self) -> bool:
+        """True if one uncertain number (friction) changes several quantities; gaps and speeds are then not extreme in
+        corners.
+        """
+        return any(each.quantity == "friction" and each.half_width > 0.0 for each in self.intervals)
+
+    def members(self, worlds: Worlds) -> Worlds:
+        """Return the members of worlds at the alert, [n * M]: each world followed by the corners of its box.
+
+        The *box* of a world is the set of all values in its intervals. Corners come in the order of binary numbers; the
+        first interval is the lowest bit. Intervals of width 0 add no corners. Friction changes all capacities together
+        and harm is not monotone in it, so it has eight values instead of two ends. Raises ``InvalidInput`` for a
+        vehicle that does not exist, a capacity or mass that may be 0, or more than ``MOST_CORNERS`` corners.
+        """
+        sides = self._sides(worlds)
+        ends = [_OF_FRICTION if name == "friction" else (0.0, 1.0) for name, *_ in reversed(sides)]
+        corners = math.prod(map(len, ends)) if sides else 0
+        if corners > MOST_CORNERS:
+            raise InvalidInput(
+                f"uncertainty: {len(sides)} uncertain numbers in each world make {corners} corners; at most"
+                f" {MOST_CORNERS} can be certified: name vehicles or pairs, for instance {UNCERTAINTY_EXAMPLE}"
+            )
+        every = [shares[::-1] for shares in product(*ends)] if sides else []
+        parts = [worlds] + [_placed(worlds, sides, shares.__getitem__) for shares in every]
+        return self.interleaved(parts)
+
+    @staticmethod
+    def interleaved(parts: list[Worlds]) -> Worlds:
+        """Merge M lists of n worlds each into one list [n * M]: world 0 of each list, then world 1 of each list, and so
+        on.
+        """
+        order = np.arange(parts[0].n * len(parts)).reshape(len(parts), parts[0].n).T.ravel()
+        return Worlds.concatenate(parts).take(order)
+
+    def draw(self, worlds: Worlds, rng: np.random.Generator, *, corners: bool = False) -> Worlds:
+        """Draw one world from the box of intervals around each of ``worlds``, [n].
+
+        Args:
+            worlds: the reported worlds, [n].
+            rng: source of randomness.
+            corners: True: draw one of the corners; False: draw uniformly from the inside.
+
+        """
+        sides = self._sides(worlds)
+        shares = rng.random((len(sides), worlds.n))
+        if corners:
+            shares = np.round(shares)
+        return _placed(worlds, sides, lambda k: shares[k])
+
+    def _sides(self, worlds: Worlds) -> list[_Side]:
+        """Return the uncertain numbers of ``worlds``: quantity, index of vehicle or pair, least and largest value [n]
+        of each.
+        """
+        sides: list[_Side] = []
+        for interval in self.intervals:
+            every, name = _values(worlds, interval.quantity), interval.quantity
+            if interval.half_width == 0.0:
+                continue
+            if not np.isfinite(every).all():
+                raise InvalidInput(
+                    f"uncertainty: {interval}: {name} is not known in every world; declare it in the scenario"
+                )
+            if interval.place is not None and interval.place >= every.shape[1]:
+                raise InvalidInput(f"uncertainty: {interval}: the line has only {every.shape[1]} of these")
+            for place in range(every.shape[1]) if interval.place is None else (interval.place,):
+                told = every[:, place]
+                half = interval.half_width * told if interval.relative else np.full(worlds.n, interval.half_width)
+                low, high = told - half, told + half
+                if name in POSITIVE and not (low > 0.0).all():
+                    k = int(np.argmin(low))
+                    raise InvalidInput(
+                        f"uncertainty: {interval}: {told[k]:g}{_of(name, place)} in world {k} may be as low as"
+                        f" {low[k]:g}; it must stay above 0"
+                    )
+                most = worlds.vehicles.speed_limit_mps[:, place] if name == "speeds_mps" else np.inf
+                high, rule = np.minimum(high, most), QUANTITY.declared[name]
+                if not (high <= rule.high).all():
+                    k = int(np.argmax(high))
+                    raise InvalidInput(
+                        f"uncertainty: {interval}: {told[k]:g}{_of(name, place)} in world {k} may be as high as"
+                        f" {high[k]:g}; must be {rule.interval}"
+                    )
+                sides.append((name, place, np.maximum(low, 0.0), high))
+        return sides
+
+
+def parse_uncertainty(text: str) -> Uncertainty:
+    """Parse a text of ``quantity=half-width`` entries separated by commas, for instance ``UNCERTAINTY_EXAMPLE``.
+
+    A half-width is a number in the quantity's unit, or a percentage of its value. ``.vehicle_2`` or ``.pair_1`` after
+    the quantity limits the entry to one vehicle or pair. Blanks around entries and ``=`` are ignored. Raises
+    ``InvalidInput`` for anything else.
+    """
+    entries = [entry.strip() for entry in text.split(",")]
+    if "" in entries:
+        raise InvalidInput(f"uncertainty: {text!r}: entry {entries.index('') + 1} is empty; it {_FORM}")
+    intervals = []
+    for entry in entries:
+        found = _ENTRY.fullmatch(entry)
+        if found is None or _NUMBER.fullmatch(found["width"]) is None:
+            raise InvalidInput(f"uncertainty: {entry!r}: {_FORM}")
+        name, width = found["name"], float(found["width"])
+        if name in QUANTITIES and found["what"] not in (None, "pair" if name == "gaps_m" else "vehicle"):
+            raise InvalidInput(
+                f"uncertainty: {entry!r}: gaps_m is of pairs (.pair_1), all else of vehicles (.vehicle_1)"
+            )
+        place = None if found["number"] is None else int(found["number"]) - 1
+        intervals.append(Interval(name, width / 100.0 if found["share"] else width, bool(found["share"]), place))
+    return Uncertainty(tuple(intervals))
+
+
+def _values(worlds: Worlds, quantity: str) -> Floats:
+    """Return the reported values of one of ``QUANTITIES``: [n, N], for gaps [n, P], for friction [n, 1].
+
+    Capacities are those on a dry road.
+    """
+    if quantity.endswith("_rate_mps3"):
+        return np.asarray(getattr(worlds.vehicles, quantity), np.float64)
+    return QUANTITY.declared[quantity].of(worlds)
+
+
+def _of(quantity: str, place: int) -> str:
+    owner = QUANTITY.declared[quantity].owner(place)
+    return f" of {owner}" if owner else ""
+
+
+def _placed(worlds: Worlds, sides: list[_Side], share: Callable[[int], Floats | float]) -> Worlds:
+    """Return the worlds with each uncertain number at a position in its interval.
+
+    Without a V2X channel an uncertain latency also changes what others receive and when. With a channel, only the
+    reaction is uncertain. Friction limits the capacities of all vehicles together.
+
+    Args:
+        worlds: the reported worlds, [n].
+        sides: the uncertain numbers, from ``_sides``.
+        share: maps the index of an uncertain number to its position, a number or [n]: 0 is the least value, 1 the
+            largest.
+
+    """
+    changed: dict[str, Any] = {}
+    for k, (quantity, place, low, high) in enumerate(sides):
+        values = changed.setdefault(quantity, _values(worlds, quantity).copy())
+        at = np.broadcast_to(np.asarray(share(k), np.float64), low.shape)
+        values[:, place] = np.where(at == 0.0, low, np.where(at == 1.0, high, low + at * (high - low)))
+    if "latency_s" in changed and worlds.vehicles.is_known_at_once:
+        latency = changed["latency_s"]
+        changed |= {"own_latency_s": latency, "known_from_s": Vehicles.known_at_once(latency)}
+    friction = changed.pop("friction", worlds.friction[:, np.newaxis])[:, 0]
+    vehicles = replace(worlds.vehicles, **{name: v for name, v in changed.items() if hasattr(worlds.vehicles, name)})
+    placed = replace(worlds, vehicles=vehicles, **{name: v for name, v in changed.items() if hasattr(worlds, name)})
+    if not worlds.road.shape[1]:
+        return placed
+    return placed.on_road(friction, {name: v for name, v in changed.items() if name.endswith("capacity_mps2")})

@@ -1,0 +1,1 @@
+"""Compare levels of cooperation: ``ethbrake study ablate``."""

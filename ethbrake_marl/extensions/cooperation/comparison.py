@@ -1,0 +1,156 @@
+"""Compare levels of cooperation: harm per level, change from level to level, who pays, distance to the joint optimum.
+
+A *level* is a scenario; the *ladder* is the sequence of levels, each compared with the one before. The *joint optimum*
+is the least known harm that all learners of a level can achieve together.
+
+Confidence intervals cover other training seeds and other worlds: both are resampled (``evaluation.seeds``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from ethbrake_marl.evaluation.seeds import interquartile_mean, mean_over_seeds, share_over_seeds
+from ethbrake_marl.extensions.cooperation.joint_optimum import Goal, Harms, Measured
+from ethbrake_marl.extensions.cooperation.levels import TOLERANCE, Json
+from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.shield.episodes import Shielded
+
+
+def compare(measured: Sequence[Measured], searched: int) -> Json:
+    """Return the comparison of all levels as plain data for JSON; docs/ablate-cooperation.md describes it.
+
+    Keys: ``levels`` (results of each level), ``steps`` (each level against the one before), ``channels`` (each level
+    with a worse V2X channel against the level that it varies), and ``undertrained`` (a sentence for each level whose
+    trained policies do worse than full braking). Steps are compared for one algorithm at a time; a level without
+    learners counts in the comparison of every algorithm.
+
+    Args:
+        measured: results of ``measure``.
+        searched: number of worlds, from the first on, in which the joint optimum was searched. Figures compared with it
+            cover the same worlds.
+
+    """
+    algorithms = [m.algorithm for m in measured if m.algorithm is not None]
+    steps, channels = [], []
+    for algorithm in dict.fromkeys(algorithms):
+        own = [m for m in measured if m.algorithm in (None, algorithm)]
+        ladder = [m for m in own if m.level.clear is None]
+        steps += [_change(before, after, algorithm) for before, after in pairwise(ladder)]
+        by_name = {m.level.name: m for m in own}
+        channels += [_change(by_name[m.level.clear], m, algorithm) for m in own if m.level.clear is not None]
+    return {
+        "kind": "ablate",
+        "levels": [_level(one, searched) for one in measured],
+        "steps": steps,
+        "channels": channels,
+        "undertrained": [_undertrained(one, one.goal) for one in measured if one.goal is not None and one.goal.missed],
+    }
+
+
+def _undertrained(one: Measured, goal: Goal) -> str:
+    return (
+        f"{one.level.name} ({one.algorithm}) is not trained enough to say anything: its {goal.name} is"
+        f" {goal.reached:.2f}, and {goal.full_brake:.2f} if everybody brakes fully."
+    )
+
+
+def _level(one: Measured, searched: int) -> Json:
+    """Return the results of one level with one algorithm: harm (m2/s2) in all worlds, and in the first ``searched``.
+
+    The ``searched`` part also has the joint optimum and the share of the possible reduction.
+    """
+    scenario = one.level.scenario
+    found: Json = {
+        **one.identity,
+        "policy_sha256": [dict(seed) for seed in one.reached.policies],
+        "level": one.level.name,
+        "title": scenario.title,
+        "algorithm": one.algorithm,
+        "clear": one.level.clear,
+        "learners": [scenario.vehicle_names[i] for i in scenario.learners],
+        "seeds": len(one.reached.collided),
+        "worlds": one.reached.collided.shape[1],
+        "collision_rate": mean_over_seeds(one.reached.collided).to_json(),
+        "goal": None if one.goal is None else {**one.goal._asdict(), "missed": one.goal.missed},
+    }
+    for harm_count in HARM_COUNTS:
+        reached, braking = one.reached.world[harm_count], one.full_brake.world[harm_count]
+        best = None if one.best is None else one.best[harm_count]
+        share = None if best is None else share_over_seeds(reached[:, :searched], braking[:, :searched], best)
+        found[harm_count] = {
+            "full_brake": mean_over_seeds(braking).to_json(),
+            "harm": mean_over_seeds(reached).to_json(),
+            "each_seed": reached.mean(axis=1).tolist(),
+            "interquartile_mean": interquartile_mean([reached.mean(axis=1)], resamples=2000).to_json(),
+            "vehicles": [mean_over_seeds(column).to_json() for column in _columns(one.reached, harm_count)],
+            "searched": {
+                "worlds": min(searched, reached.shape[1]),
+                "full_brake": mean_over_seeds(braking[:, :searched]).to_json(),
+                "harm": mean_over_seeds(reached[:, :searched]).to_json(),
+                "each_seed": reached[:, :searched].mean(axis=1).tolist(),
+                "best_known": None if best is None else mean_over_seeds(best).to_json(),
+                "share_of_possible_reduction": None if share is None else share.to_json(),
+            },
+            "shielded": None if one.shielded is None else _behind(one, one.shielded[harm_count], harm_count, searched),
+        }
+    return found
+
+
+def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: int) -> Json:
+    """Return the results of a level's teams behind a shield as plain data, compared with those without a shield.
+
+    Args:
+        one: results of the level without a shield.
+        shielded: results of the same teams in the same worlds, behind a shield that bounds the harm ``harm_count``.
+        harm_count: impacts that harm counts: each pair's first one (``first``) or all (``total``).
+        searched: number of worlds, from the first on, over which the part ``searched`` of the result averages.
+
+    """
+    before, after = one.reached.vehicle[harm_count], shielded.vehicle_harm
+    actions = shielded.decisions * shielded.replaced.shape[2]
+    return {
+        "harm": mean_over_seeds(shielded.harm).to_json(),
+        "each_seed": shielded.harm.mean(axis=1).tolist(),
+        "difference": mean_over_seeds(shielded.harm - one.reached.world[harm_count]).to_json(),
+        "bound": mean_over_seeds(shielded.bound).to_json(),
+        "above_bound": int((shielded.harm > shielded.bound).sum()),
+        "replaced": float(shielded.replaced.sum() / actions.sum()),
+        "replaced_vehicles": (shielded.replaced.sum(axis=(0, 1)) / shielded.decisions.sum()).tolist(),
+        "stepped_in": mean_over_seeds((shielded.replaced > 0).any(axis=2)).to_json(),
+        "vehicles": [mean_over_seeds(column).to_json() for column in np.moveaxis(after - before, 2, 0)],
+        "worse_off": mean_over_seeds((after > before + TOLERANCE).any(axis=2)).to_json(),
+        "above_baseline": mean_over_seeds((after > shielded.baseline + TOLERANCE).any(axis=2)).to_json(),
+        "moving": int(shielded.moving.sum()),
+        "searched": {"harm": mean_over_seeds(shielded.harm[:, :searched]).to_json()},
+    }
+
+
+def _change(before: Measured, after: Measured, algorithm: str) -> Json:
+    """Return the change of harm from level ``before`` to level ``after`` on the same worlds; positive: more harm.
+
+    The result has the form ``{"from": name, "to": name, "algorithm": name, "first": changes, "total": changes}``, with
+    the changes of the whole line and of each vehicle under each count of harm. ``algorithm`` is only recorded in it.
+    """
+    found: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
+    for harm_count in HARM_COUNTS:
+        pairs = zip(_columns(after.reached, harm_count), _columns(before.reached, harm_count), strict=True)
+        # compares seed k with seed k, or with the only seed
+        old, new = before.reached.vehicle[harm_count], after.reached.vehicle[harm_count]
+        worse = new > old + TOLERANCE
+        found[harm_count] = {
+            "difference": mean_over_seeds(after.reached.world[harm_count], before.reached.world[harm_count]).to_json(),
+            "vehicles": [mean_over_seeds(new, old).to_json() for new, old in pairs],
+            "worse_off": mean_over_seeds(worse.any(axis=2)).to_json(),
+            "worse_off_vehicles": [float(share) for share in worse.mean(axis=(0, 1))],
+        }
+    return found
+
+
+def _columns(harms: Harms, harm_count: HarmCount) -> list[Floats]:
+    """Return the harm of each vehicle, front to rear, as arrays [seeds, worlds]."""
+    return [harms.vehicle[harm_count][:, :, i] for i in range(harms.vehicle[harm_count].shape[2])]

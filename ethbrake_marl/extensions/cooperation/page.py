@@ -1,0 +1,313 @@
+"""Files of an ablation: tables, HTML page, CSV and JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ethbrake_marl.agents.protocol import Team
+from ethbrake_marl.errors import count_of
+from ethbrake_marl.extensions.cooperation.comparison import compare
+from ethbrake_marl.extensions.cooperation.figures import ablation_figures
+from ethbrake_marl.extensions.cooperation.joint_optimum import Measured
+from ethbrake_marl.extensions.cooperation.levels import FIGURES, HARM, Json, Plan, algorithm
+from ethbrake_marl.extensions.report.page import Page, Part, Section
+from ethbrake_marl.extensions.report.player import Played
+from ethbrake_marl.extensions.report.style import write_picture
+from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
+from ethbrake_marl.files.store import write_output
+from ethbrake_marl.game.harm import HARM_COUNTS
+from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.team import load_team
+
+_MOST, _USUAL, _LEAST = 3, 2, 2  # number of example worlds with the largest, a median and the least saving
+
+
+def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
+    """Choose example worlds to watch, by the total harm that the last level of ``measured`` saves against the first.
+
+    These are the worlds with the largest, a median and the least saving by the policies of the first seed. Levels with
+    a worse V2X channel do not count.
+    """
+    ladder = [one for one in measured if one.level.clear is None]
+    first, last = ladder[0], ladder[-1]
+    before, after = (one.reached.world["total"][0] for one in (first, last))
+    order = np.argsort(after - before, kind="stable")
+    middle = max((len(order) - _USUAL) // 2, 0)
+    kinds = (
+        (f"Where {last.level.name} saves most against {first.level.name}", order[:_MOST]),
+        ("As usual", order[middle : middle + _USUAL]),
+        ("Where it saves least, or harms", order[::-1][:_LEAST]),
+    )
+    found: dict[int, Played] = {}
+    for kind, rows in kinds:
+        for row in map(int, rows):
+            found.setdefault(row, Played(row, kind, f"total harm {before[row]:.2f} to {after[row]:.2f}"))
+    return list(found.values())
+
+
+def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
+    """Return a section of the page with episodes to watch, level beside level, in the worlds of ``choose_worlds``.
+
+    Each trained level drives with its first seed.
+    """
+    played = choose_worlds(measured)
+    rows = np.array([each.number for each in played], np.int64)
+    driven: dict[str, tuple[int, ...]] = {}
+    for level in plan.levels:
+        worlds = level.scenario.sample(plan.episodes, plan.list_seed).worlds.take(rows)
+        drivers = {level.name: Team({}, level.name)}  # a team without vehicles: scripts drive
+        if level.scenario.learners:
+            drivers = {}
+            for recipe in plan.recipes:
+                folder = plan.training(level, recipe, 0).folder
+                name = level.name if len(plan.recipes) == 1 else f"{level.name}, {algorithm(recipe)}"
+                drivers[name] = load_team(folder, level.scenario, name)
+        for name, team in drivers.items():
+            Played.drive(played, worlds, name, team, level.scenario)
+            driven[name] = level.scenario.learners
+    told = (
+        f"{count_of(len(played), 'world')}, the same line at every level; of several seeds the first drives."
+        f" The conditions are those of {plan.levels[0].name}: delays of messages and an obstacle ahead are each"
+        " level's own."
+    )
+    return Section("Episodes", [told, Part.player(played, driven)])
+
+
+def levels_csv(measured: Sequence[Measured], searched: int) -> str:
+    """Return CSV text with one row per level, algorithm and seed: means over the worlds (m2/s2).
+
+    Columns ``searched_*`` are means over the first ``searched`` worlds, in which the joint optimum was searched.
+    Without a shield its columns are empty.
+    """
+    return csv_text(_seed_row(one, seed, searched) for one in measured for seed in range(len(one.reached.collided)))
+
+
+def _seed_row(one: Measured, seed: int, searched: int) -> Json:
+    collided = one.reached.collided[seed]
+    about: Json = {
+        "level": one.level.name,
+        "algorithm": one.algorithm,
+        "seed": seed if one.algorithm else None,
+        "worlds": len(collided),
+        "collision_rate": float(collided.mean()),
+    }
+    vehicles: Json = {}
+    shield: Json = {}
+    for harm_count in HARM_COUNTS:
+        name = RunDirectory.HARM[harm_count]
+        reached, braking = one.reached.world[harm_count][seed], one.full_brake.world[harm_count]
+        about |= {
+            name: float(reached.mean()),
+            f"full_brake_{name}": float(braking.mean()),
+            f"searched_{name}": float(reached[:searched].mean()),
+            f"searched_full_brake_{name}": float(braking[:, :searched].mean()),
+            f"searched_best_known_{name}": None if one.best is None else float(one.best[harm_count].mean()),
+        }
+        each = one.reached.vehicle[harm_count][seed].mean(axis=0)
+        vehicles |= {f"{name}_{i + 1}": float(harm) for i, harm in enumerate(each)}
+        behind = None if one.shielded is None else one.shielded[harm_count]
+        actions = 1 if behind is None else behind.decisions[seed].sum() * behind.replaced.shape[2]
+        shield |= {
+            f"shielded_{name}": None if behind is None else float(behind.harm[seed].mean()),
+            f"bound_{name}": None if behind is None else float(behind.bound[seed].mean()),
+            f"actions_replaced_{name}": None if behind is None else float(behind.replaced[seed].sum() / actions),
+        }
+    return {**about, **vehicles, **shield}
+
+
+_ALGORITHM = "Algorithm"
+
+
+def markdown(found: Json, conditions: str) -> str:
+    """Return all tables of an ablation as Markdown.
+
+    ``found`` is the content of ``ablation.json``; ``conditions`` is the text below the tables.
+    """
+    blocks = [f"**{line}**" for line in found["undertrained"]]
+    blocks += [text for title, sheets in _blocks(found) for text in (f"## {title}", *(s.markdown() for s in sheets))]
+    return "\n\n".join([*blocks, conditions]) + "\n"
+
+
+def ablation_page(found: Json, conditions: str, figures: Mapping[str, Figure], episodes: Sequence[Section] = ()) -> str:
+    """Return the HTML page of an ablation.
+
+    Args:
+        found: content of ``ablation.json``.
+        conditions: text about worlds, seeds and machine.
+        figures: file name -> figure.
+        episodes: sections with episodes to watch.
+
+    """
+    drawn = [
+        Part.drawing(figure, *FIGURES[name], alone=name == "ablation-who-pays.png", known=conditions)
+        for name, figure in figures.items()
+    ]
+    sections = [Section("Conditions", [conditions]), *([Section("Figures", drawn)] if drawn else []), *episodes]
+    for title, sheets in _blocks(found):
+        parts = []
+        for sheet in sheets:
+            rows = [
+                [cell.in_words.replace("`", "") for cell in row] for row in sheet.shown() if not isinstance(row, str)
+            ]
+            parts.append(Part.table(Sheet("", [Column(heading) for heading in sheet.headings], rows)))
+        sections.append(Section(title, parts))
+    settings = {name: value for name, value in found["settings"].items() if name != "recipes"}
+    sections.append(Section("Settings", [Part.facts(settings)]))
+    lead = "Who learns, who knows, whose harm counts: step by step."
+    alarms = [Part.paragraph(line, "alarm") for line in found["undertrained"]]
+    return Page("What cooperation is worth", sections, lead, opening=alarms).html
+
+
+def _blocks(found: Json) -> list[tuple[str, list[Sheet]]]:
+    """Return the tables of an ablation in groups, each as (title, tables); ``found`` is from ``ablation.json``."""
+    levels = [{**level, "level": f"`{level['level']}`"} for level in found["levels"]]
+    steps, channels = (
+        [{**change, "from": f"`{change['from']}`", "to": f"`{change['to']}`"} for change in found[key]]
+        for key in ("steps", "channels")
+    )
+    both = [{**change, "change": f"{change['from']} to {change['to']}"} for change in steps + channels]
+    vehicles = range(len(both[0]["first"]["vehicles"]) if both else 0)
+    worlds = levels[0]["first"]["searched"]["worlds"]
+    braking = Column("All brake fully")
+    about: _Columns = [("Level", "level"), (_ALGORITHM, "algorithm")]
+    changed: _Columns = [("From", "from"), ("To", "to"), (_ALGORITHM, "algorithm")]
+    for count in HARM_COUNTS:
+        changed += [
+            (Column(f"Change of {HARM[count]}", sign="+"), f"{count} difference"),
+            (_share(f"Somebody worse off, {HARM[count]}"), f"{count} worse_off"),
+        ]
+    blocks = {
+        "Levels": [
+            _sheet(levels, [
+                *about,
+                (_share("Collisions"), "collision_rate"),
+                (braking, f"{count} full_brake value"),
+                (Column(f"Reached, {HARM[count]}"), f"{count} harm"),
+            ])
+            for count in HARM_COUNTS
+        ],
+        f"How near the joint optimum, in the first {count_of(worlds, 'world')}": [
+            _sheet([level for level in levels if level[count]["searched"]["best_known"] is not None], [
+                *about,
+                (braking, f"{count} searched full_brake value"),
+                (Column(f"Reached, {HARM[count]}"), f"{count} searched harm"),
+                (Column("Joint optimum"), f"{count} searched best_known value"),
+                (_share("Share of its reduction"), f"{count} searched share_of_possible_reduction"),
+            ])
+            for count in HARM_COUNTS
+        ],
+        "Behind the step shield that guards the count of the table": [
+            _sheet([level for level in levels if level[count]["shielded"]], [
+                *about,
+                (Column(f"Without, {HARM[count]}"), f"{count} harm value"),
+                (Column("With"), f"{count} shielded harm value"),
+                (Column("Change", sign="+"), f"{count} shielded difference"),
+                (Column("Bound"), f"{count} shielded bound value"),
+                (_share("Replaced"), f"{count} shielded replaced"),
+                (_share("Stepped in"), f"{count} shielded stepped_in"),
+                (_share("Somebody worse off"), f"{count} shielded worse_off"),
+                (_share("Above the baseline plan"), f"{count} shielded above_baseline"),
+                (Column("Above the bound"), f"{count} shielded above_bound"),
+            ])
+            for count in HARM_COUNTS
+        ],
+        "What each step is worth": [_sheet(steps, changed)],
+        "Price of lost messages": [_sheet(channels, changed)],
+        "Who pays": [
+            _sheet(both, [
+                (f"Change of {HARM[count]}", "change"),
+                (_ALGORITHM, "algorithm"),
+                *((Column(f"Vehicle {i + 1}", sign="+"), f"{count} vehicles {i}") for i in vehicles),
+                *((_share(f"Vehicle {i + 1} worse off"), f"{count} worse_off_vehicles {i}") for i in vehicles),
+            ])
+            for count in HARM_COUNTS
+        ],
+    }  # fmt: skip
+    always = [*blocks][:2]
+    return [(title, sheets) for title, sheets in blocks.items() if title in always or any(s.rows for s in sheets)]
+
+
+_Columns = list[tuple[Column | str, str]]
+
+
+def _sheet(rows: Sequence[Json], columns: _Columns) -> Sheet:
+    """Return a table with one line for each of ``rows`` (nested objects from ``ablation.json``).
+
+    A column is a pair of its heading, and the path to its value in a row: ``first harm`` leads to
+    ``row["first"]["harm"]``. The algorithm's column is left out if there is only one algorithm.
+    """
+    if len({row["algorithm"] for row in rows} - {None}) == 1:
+        columns = [(column, path) for column, path in columns if column != _ALGORITHM]
+    cells: list[list[Any]] = []
+    for row in rows:
+        cells.append([])
+        for _, path in columns:
+            found: Any = row
+            for key in path.split():
+                found = found[int(key) if isinstance(found, list) else key]
+            cells[-1].append(Estimate(**found) if isinstance(found, dict) else found)
+    return Sheet("", [column for column, _ in columns], cells)
+
+
+def interval_words(seeds: int) -> str:
+    """Return a phrase for captions about what 95 % intervals over this number of seeds cover."""
+    if seeds == 1:
+        return "95 % intervals for other worlds only: one seed says nothing about others"
+    rough = f" (rough: {seeds} seeds)" if seeds < 3 else ""
+    return f"95 % intervals for other seeds and other worlds{rough}"
+
+
+def _share(heading: str) -> Column:
+    return Column(heading, digits=1, scale=100.0, unit=" %")
+
+
+def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> tuple[Json, list[Path]]:
+    """Write page, Markdown, CSV, JSON and figures of an ablation, replacing existing files.
+
+    Args:
+        plan: settings of the ablation.
+        measured: results of ``measure``.
+        machine: description of this machine, for the caption.
+
+    Returns the content of ``ablation.json``, and the paths of page, Markdown and figures.
+
+    """
+    settings = {
+        **plan.settings(),
+        "levels": [level.name for level in plan.levels],
+        "recipes": {name: r.model_dump(mode="json") for name, r in zip(plan.algorithms, plan.recipes, strict=True)},
+        "machine": machine,
+        "date": datetime.now(UTC).date().isoformat(),
+    }
+    found = {"settings": settings, **compare(measured, plan.search_episodes)}
+    recipes = ", ".join(
+        f"{name} (rewarded for {'first-impact' if recipe.reward.harm_count == 'first' else 'total'} harm)"
+        for name, recipe in zip(plan.algorithms, plan.recipes, strict=True)
+    )
+    conditions = (
+        f"{recipes}; {plan.seeds} {'seeds' if plan.seeds > 1 else 'seed'}, {plan.steps_per_learner:,} decisions of each"
+        f" learner. Harms are means per world in m²/s² on the same {count_of(plan.episodes, 'world')} of seed"
+        f" {plan.list_seed} at every level; {interval_words(plan.seeds)}. Joint optimum: the least harm known that"
+        f" the level's learners can do, and everything beside it, in the first {plan.search_episodes:,} of these"
+        f" worlds, {plan.budget:,} candidates per world and count. {machine}."
+    )
+    drawn = found["steps"] or found["channels"]
+    figures = dict(zip(FIGURES, ablation_figures(found, conditions), strict=True)) if drawn else {}
+    for name, figure in figures.items():
+        write_picture(plan.folder / name, figure, force=True)
+    texts = {
+        "ablation.html": ablation_page(found, conditions, figures, [episodes_section(plan, measured)]),
+        "ablation.md": markdown(found, conditions),
+        "ablation.csv": levels_csv(measured, plan.search_episodes),
+        "ablation.json": json.dumps(found, indent=2, allow_nan=False) + "\n",
+    }
+    for name, text in texts.items():
+        write_output(plan.folder / name, text.encode(), force=True)
+    return found, [plan.folder / name for name in ("ablation.html", "ablation.md", *figures)]

@@ -1,0 +1,332 @@
+"""Write the episodes of one learner as a Minari dataset.
+
+``dataset.recover_environment()`` makes the environment, and the recorded actions replay in it bit for bit. To restore
+the world of an episode: ``env.reset(seed=seed, options=options)`` with the episode's ``seed`` and ``options``.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from numpy.typing import NDArray
+
+from ethbrake_marl.agents.protocol import Driver, Team
+from ethbrake_marl.envs.making import action_box, feature_box
+from ethbrake_marl.errors import (
+    AlreadyExists,
+    InvalidInput,
+    PhysicsError,
+    check_one_learner,
+    check_whole_number,
+    naming_extras,
+    need,
+    unknown_name,
+)
+from ethbrake_marl.evaluation.identity import LIST_SEED, policies_of, result_versions, scenario_sha256
+from ethbrake_marl.evaluation.lineup import make_lineup
+from ethbrake_marl.evaluation.outcome import LeftOut
+from ethbrake_marl.extensions.datasets.parquet import KEY, OF_STEPS, parquet_dataset
+from ethbrake_marl.extensions.datasets.recording import Recording, Task, record_episodes
+from ethbrake_marl.files.store import check_target, check_writable, new_folder
+from ethbrake_marl.game.harm import HARM_COUNTS
+from ethbrake_marl.game.observations import Observation, choose_observation
+from ethbrake_marl.game.observed import observation_for
+from ethbrake_marl.game.rewards import Reward, reward_params
+from ethbrake_marl.physics.left_out import leaving_out_failed
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.schema import Scenario
+
+DATA = "data"  # name of Minari's data folder inside the folder of a dataset
+
+_DATASET_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]*-v\d+")
+
+
+def check_folder(path: Path, *, force: bool = False) -> None:
+    """Check, before any work, that a Minari dataset can be written to the folder ``path``.
+
+    ``force``: a dataset that exists there may be replaced. Raises ``AlreadyExists`` if ``path`` exists and ``force`` is
+    off. Raises ``InvalidInput`` if the name is not ``NAME-vNUMBER``, if the parent is missing or cannot be written, or
+    if ``force`` would replace something other than a Minari dataset.
+    """
+    if _DATASET_NAME.fullmatch(path.name) is None:
+        raise InvalidInput(f"{path}: a dataset of Minari is a folder called NAME-vNUMBER, for instance brakes-v0")
+    if path.is_symlink() or path.exists():
+        if not force:
+            raise AlreadyExists(f"{path}: is there already; give another name or use force (--force)")
+        if path.is_symlink() or not (path / DATA / "metadata.json").is_file():
+            raise InvalidInput(f"{path}: is no dataset of Minari, and is not replaced; give another name")
+    if not path.parent.is_dir():
+        raise InvalidInput(f"{path}: there is no folder {path.parent}; make it first")
+    try:
+        check_writable(path.parent)
+    except OSError as error:
+        raise InvalidInput(f"{path}: cannot be written ({error.strerror})") from None
+
+
+@contextmanager
+def minari_folder(
+    path: Path, task: Task, told: Mapping[str, Any], *, force: bool
+) -> Iterator[Callable[[Recording], None]]:
+    """Context manager: open a new Minari dataset, and yield the function that adds a recording to it.
+
+    The folder appears at ``path`` only when the block ends without an exception.
+
+    Args:
+        path: the folder, called ``NAME-vNUMBER``.
+        task: scenario, seed, reward and observation of the recordings.
+        told: metadata (``tell``), stored as JSON under the key ``ethbrake_marl``. It is read when the block ends, so
+            entries may be added until then.
+        force: replace an existing dataset.
+
+    Raises ``MissingExtra`` without minari or h5py.
+
+    """
+    with naming_extras():
+        import h5py  # noqa: F401  # imported here so that a missing h5py raises our message, not Minari's
+        from minari.data_collector.episode_buffer import EpisodeBuffer
+        from minari.dataset.minari_storage import MinariStorage
+
+    with new_folder(path, replace=force) as partial:
+        storage = MinariStorage.new(
+            partial.resolve() / DATA,  # absolute: with a relative path Minari 0.5.4 looks in the wrong folder
+            observation_space=feature_box(task.observation.features),
+            action_space=action_box(),
+            env_spec=env_spec(task),
+        )
+        storage.update_metadata({"dataset_id": path.name, "minari_version": version("minari")})
+
+        def add(recording: Recording) -> None:
+            first = storage.total_episodes
+            episodes = list(_episodes(recording))
+            storage.update_episodes(EpisodeBuffer(**episode) for episode in episodes)
+            harms = zip(*(recording.ledger.world_harm(count).tolist() for count in HARM_COUNTS), strict=True)
+            beside = [{"agent": recording.agent, "first_impact_harm": one, "total_harm": whole} for one, whole in harms]
+            storage.update_episode_metadata(beside, range(first, first + len(episodes)))
+
+        yield add
+        storage.update_metadata(
+            {
+                "algorithm_name": ", ".join(told["agents"]),
+                "description": f"{task.scenario.name}: {task.scenario.title or 'emergency braking'}",
+                "requirements": [f"ethbrake-marl>={version('ethbrake-marl')}"],
+                KEY: json.dumps(told),
+            }
+        )
+
+
+def env_spec(task: Task) -> EnvSpec:
+    """Return the Gymnasium spec from which ``gymnasium.make`` makes the environment of a recording's task.
+
+    The spec holds plain data only, so it survives JSON. Raises ``InvalidInput`` unless exactly one vehicle learns.
+    """
+    names = [task.scenario.vehicle_names[i] for i in task.scenario.learners]
+    check_one_learner(
+        task.scenario.name, names, "a dataset of Minari is one learner's; give the others a script, or write Parquet"
+    )
+    spec = copy.deepcopy(gymnasium.spec("EthBrake-v0"))
+    spec.kwargs = {"scenario": task.scenario.declared(), "reward": task.reward.model_dump(mode="json")}
+    if task.observation != observation_for(task.scenario):
+        spec.kwargs["observation"] = [feature.name for feature in task.observation.features]
+    return spec
+
+
+def _episodes(recording: Recording) -> Iterator[dict[str, Any]]:
+    """Yield the keyword arguments of Minari's ``EpisodeBuffer`` for each recorded episode."""
+    vehicle, seed = recording.learners[0], recording.task.seed
+    infos = _infos(recording, vehicle)
+    reward, terminated, truncated = (np.stack([getattr(step, name) for step in recording.steps]) for name in OF_STEPS)
+    for k, (world, end) in enumerate(zip(recording.index.tolist(), recording.decisions.tolist(), strict=True)):
+        yield {
+            "seed": seed,
+            "options": {"listed_world": {"seed": seed, "number": world}},
+            "observations": recording.observations[: end + 1, k, 0],
+            "actions": recording.actions[:end, k],
+            "rewards": reward[:end, k, vehicle],
+            "terminations": terminated[:end, k],
+            "truncations": truncated[:end, k],
+            "infos": {name: values[: end + 1, k] for name, values in infos.items()},
+        }
+
+
+def _infos(recording: Recording, vehicle: int) -> dict[str, NDArray[Any]]:
+    """Return the infos that the environment gives to ``vehicle`` (0 = front), by name, each [T + 1, n, ...]."""
+    told = {name: recording.told(name)[:, :, vehicle] for name in recording.reports[0].columns()}
+    cost = np.stack([each.cost for each in recording.reports])
+    news = [each.known_from_s[:, vehicle] for each in recording.reports if each.known_from_s is not None]
+    return {
+        **told,
+        "collided": told["collided"] == 1.0,
+        "chosen_action": told["chosen_action"].astype(np.float32)[:, :, np.newaxis],
+        "cost": cost,
+        "world_seed": np.full(cost.shape, recording.task.seed),
+        "world": np.stack([each.world for each in recording.reports]),
+        **{f"reward_{name}": term[:, :, 0] for name, term in recording.terms().items()},
+        **({"known_from_s": np.stack(news)} if news else {}),
+    }
+
+
+BATCH = 500  # number of worlds recorded together; it limits memory and has no effect on the episodes
+
+DatasetFormat = Literal["parquet", "minari"]
+
+_NEEDED_PACKAGES: dict[DatasetFormat, tuple[str, ...]] = {"parquet": ("pyarrow",), "minari": ("minari", "h5py")}
+
+
+@dataclass(frozen=True, slots=True)
+class DatasetSummary:
+    """What ``write_dataset`` wrote: the file, its format, and numbers of episodes and decisions."""
+
+    path: Path  # the file or folder
+    format: DatasetFormat  # ``parquet`` or ``minari``
+    episodes: Mapping[str, int]  # agent's name -> number of recorded episodes
+    decisions: int  # number of decisions in all episodes of all agents
+    # Agent's name -> largest difference (m2/s2) in a world between the harm of the recorded episode, whose actions are
+    # rounded to float32, and the harm with the agent's exact commands.
+    off_by: Mapping[str, float]
+    left_out: tuple[LeftOut, ...]  # worlds that were not recorded, because the physics could not advance them
+
+
+def write_dataset(
+    path: str | Path,
+    agents: str | Sequence[str] | Mapping[str, Driver],
+    *,
+    scenario: str | Path | Scenario,
+    episodes: int,
+    seed: int = LIST_SEED,
+    format: DatasetFormat | None = None,
+    reward: Reward = "harm",
+    observation: Observation | None = None,
+    force: bool = False,
+    on_progress: Callable[[str, int], None] | None = None,
+) -> DatasetSummary:
+    """Record agents in the same worlds of an evaluation list, as a Parquet file or a Minari dataset.
+
+    An environment that takes the recorded actions repeats the episodes bit for bit. docs/datasets.md describes the
+    content.
+
+    Args:
+        path: the file (``.parquet``) or the folder (``NAME-v0``) to write.
+        agents: agent specs as on the command line, or a mapping from name to agent or team. They control the scenario's
+            learners. They are not changed.
+        scenario: the scenario, its name or its path.
+        episodes: number of worlds, from the first one of the list.
+        seed: seed of the list of worlds.
+        format: ``parquet`` or ``minari``; None: chosen by the ending of ``path``.
+        reward: the reward to record.
+        observation: the observation to record; None: ``observation_for(scenario)``.
+        force: replace an existing dataset.
+        on_progress: called with the name of an agent and the number of its worlds done so far.
+
+    Raises ``InvalidInput``, ``AlreadyExists`` and ``MissingExtra`` before the work begins, and ``PhysicsError`` if no
+    world could be recorded.
+
+    """
+    check_whole_number("write_dataset: episodes", episodes, 1)
+    check_whole_number("write_dataset: seed", seed, 0)
+    scenario = load_scenario(scenario)
+    if isinstance(agents, Sequence):
+        agents = make_lineup(agents, scenario)
+    if not agents:
+        raise InvalidInput("write_dataset: no agents given; at least one is needed, for instance full_brake")
+    chosen = check_dataset(path, scenario, format, force=force)
+    spec = observation_for(scenario) if observation is None else choose_observation(observation)
+    task = Task(scenario, int(seed), reward_params(reward), spec)
+    told = tell(task, agents, episodes)
+    sink = (
+        parquet_dataset(Path(path), told) if chosen == "parquet" else minari_folder(Path(path), task, told, force=force)
+    )
+    recorded, off_by, left_out, decisions = dict.fromkeys(agents, 0), dict.fromkeys(agents, 0.0), [], 0
+    with sink as add:
+        for name, first in product(agents, range(0, int(episodes), BATCH)):
+            count = min(BATCH, int(episodes) - first)
+            sample = scenario.sample(count, task.seed, first=first)
+
+            def of(rows: Any, sample: Sample = sample, name: str = name) -> Recording:
+                return record_episodes(
+                    Sample(sample.worlds.take(rows), sample.index[rows], 0), agents[name], name, task
+                )
+
+            recording, _, failed = leaving_out_failed(of, np.arange(count))
+            left_out += [LeftOut(first + row, task.seed, name, why) for row, why in failed.items()]
+            if recording is not None:
+                add(recording)
+                recorded[name] += len(recording.index)
+                decisions += int(recording.decisions.sum())
+                off_by[name] = max(off_by[name], recording.off_by)
+            if on_progress is not None:
+                on_progress(name, first + count)
+        if not decisions:
+            raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in left_out})
+        told["left_out"] = [left._asdict() for left in left_out]
+        told["off_by"] = off_by
+    return DatasetSummary(Path(path), chosen, recorded, decisions, off_by, tuple(left_out))
+
+
+def check_dataset(
+    path: str | Path, scenario: Scenario, format: str | None = None, *, force: bool = False
+) -> DatasetFormat:
+    """Check that a dataset of this scenario can be written to ``path``, and return its format.
+
+    ``format`` None: chosen by the ending of ``path``. ``force``: an existing dataset may be replaced. Raises the
+    exceptions that ``write_dataset`` raises before its work begins.
+    """
+    target = Path(path)
+    is_file = target.suffix.lower() == ".parquet"
+    chosen: Any = format if format is not None else "parquet" if is_file else "minari"
+    if chosen not in get_args(DatasetFormat):
+        raise unknown_name("format", chosen, get_args(DatasetFormat))
+    if is_file != (chosen == "parquet"):
+        right = "a file ending in .parquet" if chosen == "parquet" else "a folder called NAME-vNUMBER"
+        raise InvalidInput(f"{target}: the format {chosen} is written to {right}")
+    for package in _NEEDED_PACKAGES[chosen]:
+        need(package)
+    if not scenario.learners:
+        raise InvalidInput(
+            f"scenario {scenario.name!r} has no learner to record: scenario.with_learners(['vehicle_2'])"
+        )
+    if chosen == "parquet":
+        check_target(target, force=force)
+    else:
+        env_spec(Task(scenario, LIST_SEED, reward_params("harm"), observation_for(scenario)))
+        check_folder(target, force=force)
+    return chosen  # type: ignore[no-any-return]  # a DatasetFormat: checked above
+
+
+def tell(task: Task, agents: Mapping[str, Driver], episodes: int) -> dict[str, Any]:
+    """Return the metadata of a dataset as plain data: scenario, seed, agents, observation, reward and versions.
+
+    Args:
+        task: scenario, seed, reward and observation of the recordings.
+        agents: recorded agents by name.
+        episodes: number of worlds that each agent drives.
+
+    """
+    scenario = task.scenario
+    teams = {name: Team.of(driver, scenario.learners).drivers for name, driver in agents.items()}
+    return {
+        "scenario": scenario.declared(),
+        "scenario_sha256": scenario_sha256(scenario),
+        "seed": task.seed,
+        "episodes": int(episodes),
+        "learners": [scenario.vehicle_names[i] for i in scenario.learners],
+        "agents": {
+            name: dict.fromkeys(scenario.vehicle_names[i] for i in drivers) | policies_of(drivers)
+            for name, drivers in teams.items()
+        },
+        "observation": [feature.name for feature in task.observation.features],
+        "reward": task.reward.model_dump(mode="json"),
+        "versions": result_versions(),
+    }

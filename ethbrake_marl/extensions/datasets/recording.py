@@ -1,0 +1,210 @@
+"""Record episodes as a learner of the environment would experience them, with an agent's actions.
+
+In an evaluation an agent's commands (float64, m/s2) are applied unchanged. A learner's action is a float32 in [-1, 1],
+and most commands have no exact float32 action. Recording therefore takes two episodes: the agent controls the first,
+its commands are rounded to actions, and the second plays these actions from the alert. The second episode is recorded,
+so its actions replay bit for bit. At the edge of an impact the last bit decides whether the impact happens. So if the
+nearest action changes a world's harm, rounding down and rounding up are tried too, and each world keeps the rounding
+whose harm is nearest to that of the commands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.agents.driving import episode_engine, script_agents
+from ethbrake_marl.agents.protocol import Driver, Team
+from ethbrake_marl.engine.compiled_step import Step
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.envs.infos import Report
+from ethbrake_marl.errors import PhysicsError, renumbered
+from ethbrake_marl.evaluation.aftermath import ShovedFront
+from ethbrake_marl.evaluation.record import line_positions
+from ethbrake_marl.game.actions import command_to_action
+from ethbrake_marl.game.harm import HARM_COUNTS, Ledger
+from ethbrake_marl.game.observations import ObservationSpec
+from ethbrake_marl.game.rewards import RewardParams
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.schema import Scenario
+
+Float32s = NDArray[np.float32]
+
+SLACK = 1e-6  # m2/s2; no other rounding is tried for a smaller difference of harm
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What is recorded: scenario, seed of the worlds, reward and observation."""
+
+    scenario: Scenario  # scenario of the worlds, whose learners are recorded
+    seed: int  # seed from which the worlds are drawn
+    reward: RewardParams  # reward that the learners receive
+    observation: ObservationSpec  # features that each learner observes
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Recorded episodes of ``n`` worlds.
+
+    ``T`` is the number of decisions in the longest episode, ``L`` the number of learners, ``F`` the number of observed
+    features. Values after the end of an episode are meaningless.
+    """
+
+    agent: str  # name of the agent
+    task: Task  # scenario, seed, reward and observation
+    index: Ints  # [n] number of each world in the list of the seed
+    decisions: Ints  # [n] number of decisions of each episode
+    observations: Float32s  # [T + 1, n, L, F] observations at each decision, then at the end of the episode
+    actions: Float32s  # [T, n, L] actions in [-1, 1]
+    steps: tuple[Step, ...]  # T results of ``Engine.step``, with rewards and ends of episodes
+    reports: tuple[Report, ...]  # T + 1 sets of infos; ``reports[t + 1]`` is after step t, ``reports[0]`` at the alert
+    positions_m: Floats  # [T + 1, n, N] positions of the front bumpers; Vehicle 1 is at 0 at the alert
+    speeds_mps: Floats  # [T + 1, n, N] speeds
+    ledger: Ledger  # harm of all impacts of each episode
+    off_by: float  # largest change of a world's harm because commands were rounded to float32 actions (m2/s2)
+
+    @property
+    def learners(self) -> tuple[int, ...]:
+        """Indices (0 = front) of the L recorded learners."""
+        return self.task.scenario.learners
+
+    @cached_property
+    def running(self) -> Bools:
+        """Whether each decision was made before the end of its episode, [n, T] bool."""
+        mask: Bools = np.arange(len(self.steps)) < self.decisions[:, np.newaxis]
+        return mask
+
+    def told(self, column: str) -> Floats:
+        """Return the column of the environment's infos with this name, such as ``time_s``, [T + 1, n, N]."""
+        return np.stack([each.columns()[column] for each in self.reports])
+
+    def terms(self) -> dict[str, Floats]:
+        """Return each term of the reward, without its weight, by name: [T + 1, n, L].
+
+        Entry t + 1 belongs to step t; entry 0 is 0.
+        """
+        shape = (len(self.index), self.task.scenario.vehicles)
+        found = {}
+        for name in self.reports[0].terms:
+            each = [told.terms[name] for told in self.reports]
+            whole = [np.broadcast_to(t[:, np.newaxis] if t.ndim == 1 else t, shape) for t in each]
+            found[name] = np.stack([term[:, list(self.learners)] for term in whole])
+        return found
+
+
+def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Recording:
+    """Let an agent control the scenario's learners in these worlds, and record the episodes.
+
+    The agent's commands are rounded to float32 actions; the recorded episodes are those with the rounded actions.
+
+    Args:
+        sample: the worlds at the alert.
+        driver: agent or team.
+        name: name of the agent in the recording.
+        task: scenario, seed, reward and observation to record.
+
+    Raises ``PhysicsError`` with the worlds that could not be advanced, and whatever ``episode_engine`` raises.
+
+    """
+    scenario, learners = task.scenario, task.scenario.learners
+    engine = episode_engine(sample.worlds, Team.of(driver, learners), scenario)
+    asked = []
+    while not engine.ended.all():
+        engine.step({})
+        columns = [command_to_action(engine.wanted_mps2[:, i], sample.worlds.vehicles, i) for i in learners]
+        asked.append(np.stack(columns, axis=1))
+    _refuse_failed(engine)
+    actions, off_by = _rounded(np.stack(asked), sample.worlds, engine.ledger, task)
+    engine = _learners_engine(sample.worlds, task)
+    steps: list[Step] = []
+    front, before = ShovedFront(sample.worlds, np.zeros(sample.worlds.n)), sample.worlds  # Worlds has no positions
+    observations, reports, positions, speeds = [], [], [], []
+    decisions = np.zeros(engine.n, np.int64)
+    while True:
+        for part in engine.segments(before, engine.wanted_mps2):
+            front.see(*part)
+        before = engine.worlds
+        observations.append(engine.observe_all(np.array(engine.learners, np.int64)))
+        reports.append(Report.of(engine, steps[-1] if steps else None))
+        positions.append(line_positions(front.metres, before.gaps_m))
+        speeds.append(before.speeds_mps)
+        if engine.ended.all():
+            break
+        decisions += ~engine.ended
+        steps.append(engine.step(actions[min(len(steps), len(actions) - 1)]))
+    _refuse_failed(engine)
+    played = np.stack([actions[min(t, len(actions) - 1)] for t in range(len(steps))])
+    return Recording(
+        name, task, sample.index, decisions, np.stack(observations), played, tuple(steps), tuple(reports),
+        np.stack(positions), np.stack(speeds), engine.ledger, float(off_by.max()),
+    )  # fmt: skip
+
+
+def _rounded(commanded: Floats, worlds: Worlds, evaluated: Ledger, task: Task) -> tuple[Float32s, Floats]:
+    """Round commands to float32 actions so that harm changes least.
+
+    Args:
+        commanded: [T, n, L] commands as exact actions in [-1, 1] (float64).
+        worlds: the worlds at the alert.
+        evaluated: harm of the episodes with the exact commands.
+        task: scenario, seed, reward and observation.
+
+    Returns the rounded actions [T, n, L], and how much they change the harm of each world, [n] m2/s2.
+
+    """
+    nearest = commanded.astype(np.float32)
+    best, off_by = nearest.copy(), _off_by(nearest, worlds, evaluated, task)
+    rows = np.flatnonzero(off_by > SLACK)
+    for end in (-1.0, 1.0) if len(rows) else ():
+        beyond = np.where((nearest - commanded) * end >= 0.0, nearest, np.nextafter(nearest, np.float32(end)))[:, rows]
+        part = evaluated.take(rows)
+        with renumbered(rows):
+            off = _off_by(beyond, worlds.take(rows), part, task)
+        better = off < off_by[rows]
+        best[:, rows[better]], off_by[rows[better]] = beyond[:, better], off[better]
+    return best, off_by
+
+
+def _off_by(actions: Float32s, worlds: Worlds, evaluated: Ledger, task: Task) -> Floats:
+    """Return how much these actions [T, n, L] change the ``evaluated`` harm of each world, [n] m2/s2.
+
+    It is the larger change of first-impact and total harm.
+    """
+    engine = _learners_engine(worlds, task)
+    step = 0
+    while not engine.ended.all():
+        engine.step(actions[min(step, len(actions) - 1)])
+        step += 1
+    _refuse_failed(engine)
+    ledger = engine.ledger
+    off: Floats = np.max([np.abs(ledger.world_harm(c) - evaluated.world_harm(c)) for c in HARM_COUNTS], axis=0)
+    return off
+
+
+def _learners_engine(worlds: Worlds, task: Task) -> Engine:
+    """Return an engine at the alert of ``worlds`` in which the learners take actions, as in an environment.
+
+    Scenario, reward, observation and seed are those of ``task``.
+    """
+    engine = Engine(
+        task.scenario,
+        worlds.n,
+        learners=task.scenario.learners,
+        scripts=script_agents(task.scenario),
+        reward=task.reward,
+        observation=task.observation,
+        seed=task.seed,
+        worlds=worlds,
+    )
+    engine.roster.warns = False
+    return engine
+
+
+def _refuse_failed(engine: Engine) -> None:
+    if engine.roster.failed:
+        raise PhysicsError(engine.roster.failed)

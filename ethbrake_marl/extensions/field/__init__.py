@@ -1,0 +1,1 @@
+"""Controllers from the literature to compare with: IDM, ACC, RSS, UN R157, AEB."""

@@ -1,0 +1,338 @@
+"""Controllers from the literature: car-following models, the driver models of UN R157, emergency braking.
+
+``LAWS`` lists them. A *law* is a formula that depends only on the vehicle itself and on the vehicle ahead, with its
+parameters and its source.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.protocol import Source
+from ethbrake_marl.agents.settings import AgentSettings
+from ethbrake_marl.engine.scripts import Script
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.extensions.certified.estimated import Told
+from ethbrake_marl.files.yaml import parse_numeral
+from ethbrake_marl.physics.state import Bools, Floats, Worlds
+from ethbrake_marl.registry import Part
+
+_TOUCHING_M = 1e-6  # smallest gap that a law sees, because laws divide by the gap
+
+_SAME_S = 1e-9  # tolerance for rounding in an elapsed time
+
+
+class Parameters:
+    """Parameters of one law (a controller's formula) as attributes, in SI units; ``LAWS`` lists their names."""
+
+    def __init__(self, **values: float) -> None:
+        self.__dict__.update(values)
+
+    def __getattr__(self, name: str) -> float:
+        raise AttributeError(name)
+
+
+class Seen(NamedTuple):
+    """What one vehicle knows about the vehicle ahead in ``n`` worlds, by sensors or messages; each field is [n].
+
+    Old information is extrapolated with the acceleration that it reported. Ahead of Vehicle 1 is the obstacle, if there
+    is one. Without an obstacle, and for a vehicle that has received nothing, the road ahead is free.
+    """
+
+    gap_m: Floats  # [n] gap to the vehicle or obstacle ahead; infinite if nothing is ahead
+    speed_mps: Floats  # [n] own speed
+    front_mps: Floats  # [n] speed of the vehicle or obstacle ahead
+    front_mps2: Floats  # [n] present commanded acceleration of the vehicle ahead
+    own_mps2: Floats  # [n] own present commanded acceleration
+    step_s: float  # time until the next decision (s)
+
+    @classmethod
+    def of(cls, worlds: Worlds, vehicle: int, step_s: float) -> Seen:
+        """Return what ``vehicle`` (0 = front) knows in these worlds; ``step_s`` is the time between decisions (s)."""
+        told, own, none = Told.to(worlds, vehicle), worlds.command_mps2[:, vehicle], np.zeros(worlds.n)
+        gap, front, force = told.obstacle_m, none, none
+        if vehicle:
+            k = vehicle - 1
+            age, then, force = worlds.time_s - told.at_s[:, k], told.speed_mps[:, k], told.command_mps2[:, k]
+            brakes = force < 0.0
+            age = np.minimum(age, np.where(brakes, np.maximum(then, 0.0) / np.where(brakes, -force, 1.0), np.inf))
+            front = np.where(age > 0.0, np.maximum(then + force * age, 0.0), then)
+            gap = np.where(told.known[:, k], told.place_m[:, k] + 0.5 * (then + front) * age, np.inf)
+        return cls(np.maximum(gap, _TOUCHING_M), worlds.speeds_mps[:, vehicle], front, force, own, step_s)
+
+    @property
+    def closing_mps(self) -> Floats:
+        """Speed at which the gap closes, [n]; negative if it opens."""
+        return self.speed_mps - self.front_mps
+
+    @property
+    def until_contact_s(self) -> Floats:
+        """Time to contact at the present speeds, [n]; infinite where the gap does not close."""
+        closing = self.closing_mps
+        return np.where(closing > 0.0, self.gap_m / np.where(closing > 0.0, closing, 1.0), np.inf)
+
+    @property
+    def headway_s(self) -> Floats:
+        """Gap divided by the own speed, [n]; infinite where the vehicle does not move forward."""
+        return np.where(self.speed_mps > 0.0, self.gap_m / np.where(self.speed_mps > 0.0, self.speed_mps, 1.0), np.inf)
+
+    def built_up(self, wanted_mps2: Floats, rate_mps3: float) -> Floats:
+        """Return the command [n] (m/s2) for the next time step, if braking can only build up gradually.
+
+        It is ``wanted_mps2`` [n], but the deceleration exceeds the vehicle's present one by at most ``rate_mps3`` times
+        the time step.
+        """
+        return np.maximum(wanted_mps2, np.minimum(self.own_mps2, 0.0) - rate_mps3 * self.step_s)
+
+
+def _idm(seen: Seen, p: Parameters) -> Floats:
+    wanted = p.s0 + np.maximum(
+        0.0, seen.speed_mps * p.T + seen.speed_mps * seen.closing_mps / (2 * math.sqrt(p.a * p.b))
+    )
+    return p.a * (1.0 - np.square(np.square(seen.speed_mps / p.v0)) - np.square(wanted / seen.gap_m))
+
+
+def _is_free(seen: Seen, p: Parameters) -> Bools:
+    return seen.gap_m > p.free * np.maximum(seen.speed_mps, 1.0) + p.s0
+
+
+def _acc(seen: Seen, p: Parameters) -> Floats:
+    gap = p.gap * (seen.gap_m - p.s0 - p.T * seen.speed_mps) - p.rate * seen.closing_mps
+    return np.where(_is_free(seen, p), p.speed * (p.v0 - seen.speed_mps), gap)
+
+
+def _cacc(seen: Seen, p: Parameters) -> Floats:
+    wide = seen.gap_m - p.s0 - p.T * seen.speed_mps
+    rate = -seen.closing_mps - p.T * seen.own_mps2
+    keeps, closes = p.gap * wide + p.rate * rate, 0.005 * wide + 0.05 * rate
+    change = np.where(wide < 0.0, p.gap * wide + 0.05 * rate, np.where(wide < 0.2, keeps, closes))
+    return np.where(_is_free(seen, p), p.speed * (p.v0 - seen.speed_mps), change / seen.step_s)
+
+
+def _safe_distance(seen: Seen, p: Parameters) -> Floats:
+    speed = np.maximum(seen.speed_mps, 0.0)
+    ahead = np.square(np.maximum(seen.front_mps, 0.0)) / (2.0 * p.b_max)
+    way = speed * p.rho + 0.5 * p.a * p.rho * p.rho + np.square(speed + p.rho * p.a) / (2.0 * p.b_min)
+    return np.maximum(way - ahead, 0.0)
+
+
+def _rss(seen: Seen, p: Parameters) -> Floats:
+    return np.where(seen.gap_m < _safe_distance(seen, p), -p.b_min, 0.0)
+
+
+def _human(seen: Seen, p: Parameters) -> Floats:
+    return seen.built_up(np.full_like(seen.gap_m, -p.most), p.jerk)
+
+
+def _human_notices(seen: Seen, p: Parameters) -> Bools:
+    brakes = (seen.front_mps2 < -p.front) & (seen.headway_s < p.headway)
+    return brakes | (seen.until_contact_s < p.ttc)
+
+
+def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
+    """Return a fuzzy degree of danger [n]: 0 beyond the safe distance, 1 within the unsafe one, linear between."""
+    between = (safe - distance) / np.where(safe > unsafe, safe - unsafe, 1.0)
+    return np.where(distance > safe, 0.0, np.where(distance < unsafe, 1.0, between))
+
+
+def fuzzy(seen: Seen, p: Parameters) -> tuple[Floats, Floats]:
+    """Return the proactive and the critical criterion of the fuzzy safety model of UN R157, each [n] from 0 to 1.
+
+    0 means no danger, 1 full danger. ``seen`` is what the vehicle knows about the one ahead, and ``p`` the parameters
+    of the law ``r157_fsm``.
+    """
+    speed, front = np.maximum(seen.speed_mps, 0.0), np.maximum(seen.front_mps, 0.0)
+    ahead, reacting = np.square(front) / (2.0 * p.b_front), speed * p.reaction
+    proactive = _share(
+        seen.gap_m - p.margin,
+        reacting + np.square(speed) / (2.0 * p.b_min) - ahead + p.margin_safe,
+        reacting + np.square(speed) / (2.0 * p.b_max) - ahead,
+    )
+    own = np.maximum(seen.own_mps2, -p.b_min)
+    after = speed + p.reaction * own - front
+    way = (speed + 0.5 * own * p.reaction - front) * p.reaction
+    critical = _share(seen.gap_m, way + np.square(after) / (2.0 * p.b_min), way + np.square(after) / (2.0 * p.b_max))
+    slows = (after < 0.0) & (own < 0.0)  # slower than the vehicle ahead after the reaction time
+    until = np.square(speed - front) / (2.0 * np.where(slows, -seen.own_mps2, 1.0))
+    critical = np.where(slows, np.where(seen.gap_m < until, 1.0, 0.0), critical)
+    return proactive, np.where(speed > front, critical, 0.0)
+
+
+def _fsm_notices(seen: Seen, p: Parameters) -> Bools:
+    proactive, critical = fuzzy(seen, p)
+    return (seen.closing_mps > 0.0) & (proactive + critical > 0.0)
+
+
+def _fsm(seen: Seen, p: Parameters) -> Floats:
+    proactive, critical = fuzzy(seen, p)
+    wanted = np.where(critical > 0.0, critical * (p.b_max - p.b_min) + p.b_min, proactive * p.b_min)
+    return seen.built_up(-np.minimum(wanted, p.most), p.jerk)
+
+
+def _aeb(seen: Seen, p: Parameters) -> Floats:
+    required = np.square(np.maximum(seen.closing_mps, 0.0)) / (2.0 * seen.gap_m)
+    return np.where((seen.until_contact_s < p.ttc) | (required > p.required), -np.inf, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Law:
+    """One controller from the literature: a formula for the acceleration, its parameters and its source."""
+
+    about: str  # name of the controller, for lists
+    source: str  # publication
+    parameters: Mapping[str, float]  # default value of each parameter, in SI units
+    command: Callable[[Seen, Parameters], Floats]  # formula that returns the acceleration, [n] m/s2
+    # Formula that returns for each world whether the law sees a danger, [n] bool; None: it acts from the start.
+    notices: Callable[[Seen, Parameters], Bools] | None = None
+    stays: bool = False  # whether the reaction continues after the danger is over
+    # Names of parameters that may be 0; all others must be above 0.
+    may_be_zero: frozenset[str] = field(default=frozenset({"T", "s0", "rho", "reaction", "perception", "release"}))
+
+
+_MOST = 0.774 * 9.81  # m/s2
+
+_FREE = {"free": 2.0, "speed": 0.4, "v0": 33.3}  # speed control to v0 beyond the headway `free` (s)
+
+LAWS: dict[str, Law] = {
+    "idm": Law(
+        "intelligent driver model", "Treiber, Hennecke and Helbing 2000, doi:10.1103/PhysRevE.62.1805",
+        {"T": 1.5, "s0": 2.0, "a": 1.4, "b": 2.0, "v0": 33.3}, _idm,
+    ),
+    "acc": Law(
+        "adaptive cruise control of PATH", "Milanes and Shladover 2014, doi:10.1016/j.trc.2014.09.001",
+        {"T": 1.1, "s0": 0.0, "gap": 0.23, "rate": 0.07, **_FREE}, _acc,
+    ),
+    "cacc": Law(
+        "cooperative adaptive cruise control of PATH", "the same, with the defaults of SUMO's CACC",
+        {"T": 1.0, "s0": 2.5, "gap": 0.45, "rate": 0.0125, **_FREE}, _cacc,
+    ),
+    "rss": Law(
+        "responsibility-sensitive safety", "Shalev-Shwartz, Shammah and Shashua 2017, arXiv 1708.06374",
+        {"rho": 1.0, "a": 3.5, "b_min": 4.0, "b_max": 8.0}, _rss,
+    ),
+    "r157_human": Law(
+        "competent and careful human driver of UN R157", "UN R157, annex 3, and its performance model of the JRC",
+        {"perception": 0.4, "reaction": 0.75, "release": 0.4, "jerk": 12.65, "most": _MOST, "front": 5.0,
+         "headway": 2.0, "ttc": 2.0}, _human, _human_notices, stays=True,
+    ),
+    "r157_fsm": Law(
+        "fuzzy safety model of UN R157", "Mattas et al. 2022, doi:10.1016/j.aap.2022.106743",
+        {"reaction": 0.75, "b_min": 4.0, "b_max": 6.0, "b_front": 7.0, "margin": 2.0, "margin_safe": 2.0,
+         "jerk": 12.65, "most": _MOST}, _fsm, _fsm_notices,
+    ),
+    "aeb": Law(
+        "automatic emergency braking: full braking where time to collision or required deceleration pass a limit",
+        "our own short version", {"ttc": 1.5, "required": 5.0}, _aeb,
+    ),
+}  # fmt: skip
+
+
+class Controller:
+    """Agent that follows a ``Law``, a controller's formula from the literature.
+
+    Its memory is the time at which it noticed the danger, [n] s; infinite: no danger yet; NaN: before its first
+    decision.
+
+    The reaction time runs from the decision at which the controller notices the danger. A danger that exists at the
+    first decision counts as noticed at the alert, so reaction time and latency overlap. If
+    ``law.stays``, a reaction that has begun goes on after the danger is over (law ``r157_human``); else the controller
+    waits for the next danger (law ``r157_fsm``).
+
+    Args:
+        name: spec of the agent.
+        law: the formula.
+        parameters: value of each of the law's parameters.
+        step_s: time between two decisions (s).
+
+    """
+
+    knows = Source.MESSAGES  # it decides from the messages that have reached it
+
+    def __init__(self, name: str, law: Law, parameters: Mapping[str, float], step_s: float) -> None:
+        self.name, self.law, self.parameters, self.time_step_s = name, law, Parameters(**parameters), step_s
+
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Floats:
+        """Return the initial memory [n]: NaN, because no decision was made yet. The arguments only give n."""
+        return np.full(alert.n, np.nan)
+
+    def act(self, worlds: Worlds, memory: Floats, vehicle: int) -> tuple[Floats, Floats]:
+        """Return the command of the law within the vehicle's capacities, [n] m/s2, and the new memory [n].
+
+        ``memory`` is the new memory of the last call, or that of ``begin``; ``vehicle`` is this vehicle's index (0 =
+        front).
+        """
+        seen, p, vehicles = Seen.of(worlds, vehicle, self.time_step_s), self.parameters, worlds.vehicles
+        command = self.law.command(seen, p)
+        if self.law.notices is not None:
+            now = np.where(np.isnan(memory), 0.0, worlds.time_s)
+            before = np.where(np.isnan(memory), np.inf, memory)
+            gone = before if self.law.stays else np.inf
+            memory = np.where(self.law.notices(seen, p), np.minimum(before, now), gone)
+            elapsed, perceiving = worlds.time_s - memory + _SAME_S, getattr(p, "perception", 0.0)
+            waiting = np.where(elapsed < perceiving, 0.0, np.minimum(seen.own_mps2, -getattr(p, "release", 0.0)))
+            command = np.where(elapsed < perceiving + p.reaction, waiting, command)
+        least, most = -vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
+        return np.clip(command, least, most), memory
+
+
+def make_controller(argument: str | None, settings: AgentSettings) -> Controller:
+    """Return the controller of a spec such as ``idm:T=1.0``.
+
+    Args:
+        argument: the part of the spec after the name, which sets parameters: ``T=1.0`` or ``T=1.0:a=2``; None: all
+            parameters have their default values.
+        settings: the whole spec, and the scenario's time step.
+
+    Raises ``UnknownName`` for a parameter that the law does not have, and ``InvalidInput`` for a value that is not a
+    number in range.
+
+    """
+    name = settings.spec.partition(":")[0]
+    law, where = LAWS[name], f"agent {settings.spec!r}"
+    parameters: dict[str, float] = {}
+    for part in [] if argument is None else argument.split(":"):
+        key, _, text = part.partition("=")
+        if key not in law.parameters:
+            raise unknown_name(f"{where}: parameter", key, law.parameters)
+        value = parse_numeral(text)
+        if value is None or not (0.0 < value < math.inf or (value == 0.0 and key in law.may_be_zero)):
+            least = "0 or more" if key in law.may_be_zero else "above 0"
+            raise InvalidInput(f"{where}: {key} must be a number {least}, for instance {key}={law.parameters[key]:g}")
+        if key in parameters:
+            raise InvalidInput(f"{where}: {key} is given twice")
+        parameters[key] = value
+    parameters = {**law.parameters, **parameters}
+    if parameters.get("b_min", 0.0) > parameters.get("b_max", math.inf):
+        raise InvalidInput(f"{where}: b_min {parameters['b_min']:g} must not be above b_max {parameters['b_max']:g}")
+    return Controller(settings.spec, law, parameters, settings.time_step_s)
+
+
+IDM = Part(make_controller, form="idm[:T=1.5]", about="the intelligent driver model", knows=Source.MESSAGES)
+
+ACC = Part(make_controller, form="acc[:T=1.1]", about="adaptive cruise control of PATH", knows=Source.MESSAGES)
+
+CACC = Part(
+    make_controller, form="cacc[:T=1.0]", about="its cooperative one, at a shorter distance", knows=Source.MESSAGES
+)
+
+RSS = Part(make_controller, form="rss[:rho=1.0]", about="brakes within the safe distance of RSS", knows=Source.MESSAGES)
+
+R157_HUMAN = Part(
+    make_controller,
+    form="r157_human[:reaction=0.75]",
+    about="the careful and competent driver of UN R157",
+    knows=Source.MESSAGES,
+)
+
+R157_FSM = Part(
+    make_controller, form="r157_fsm[:reaction=0.75]", about="the fuzzy safety model of UN R157", knows=Source.MESSAGES
+)
+
+AEB = Part(make_controller, form="aeb[:ttc=1.5]", about="automatic emergency braking", knows=Source.MESSAGES)
+
+FIELD = ("idm", "acc", "cacc", "rss", "r157_human", "r157_fsm", "aeb")  # the agents of ``--agents field``

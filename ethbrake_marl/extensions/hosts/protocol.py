@@ -1,0 +1,646 @@
+"""Let agents drive vehicles that a *host* moves: another simulator or a test bench.
+
+The host only moves vehicles. This package makes the decisions on their time grid, applies latencies, holds vehicles at
+rest, resolves impacts and keeps the ledger of harm. Every step has three parts:
+
+1. *Decide.* Agents whose decision is due act on the state that the host reported, behind the shield if there is one.
+2. *Move.* The host receives one command and moves for one step.
+3. *Meet.* Pairs that overlap and still close exchange velocity, unless the host resolves impacts itself and reports
+   them.
+
+Latencies are rounded up to whole steps of the host, and agents know the rounded value, so no decision falls between two
+steps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ethbrake_marl.agents.driving import Episodes, episode_engine
+from ethbrake_marl.agents.protocol import Driver, Team, check_agent
+from ethbrake_marl.engine.memory import (
+    ask_script,
+    begin_script,
+    is_state_free,
+    renew_memory,
+    take_memory,
+    within_capacity,
+)
+from ethbrake_marl.engine.own_grid import ROUNDING
+from ethbrake_marl.engine.stream import check_alert
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
+from ethbrake_marl.evaluation.outcome import Outcome
+from ethbrake_marl.evaluation.rollout import outcome_of
+from ethbrake_marl.game.actions import action_to_command
+from ethbrake_marl.game.harm import Ledger, empty_ledger
+from ethbrake_marl.physics.episode import Decisions
+from ethbrake_marl.physics.left_out import Impacts
+from ethbrake_marl.physics.motion import BOUND, has_acted
+from ethbrake_marl.physics.paper_map import held_speeds
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Vehicles, Worlds
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.step import StepShield
+
+STANDS_MPS = 1e-3  # below this speed a vehicle of a host with a fixed step counts as standing
+
+STARTS_WITHIN = 0.01  # m, m/s: tolerance between the host's first state and the worlds it was set up with
+
+READ_WITHIN = 0.2  # m, m/s: tolerance for a change between two states
+
+# tolerances for following a command: delay, constant error, and error as a share of the command
+LAG_S, OFF_MPS2, OFF_SHARE = 0.5, 0.5, 0.2
+
+SNAP = 1e-6  # times closer than this share of a step count as equal
+
+
+class HostState(NamedTuple):
+    """State that a host (another simulator or a test bench) reports of its ``n`` lines of ``N`` vehicles.
+
+    >>> import ethbrake_marl as eb
+
+    >>> from ethbrake_marl.extensions.hosts import HostState
+    >>> HostState(0.0, [[5.0, 6.0]], [[20.0, 18.0, 20.0]]).impacts is None
+    True
+
+    """
+
+    time_s: ArrayLike  # a number or [n]: time on the host's own clock, which may start anywhere
+    gaps_m: ArrayLike  # [n, N - 1] bumper to bumper; below 0 where bodies overlap
+    speeds_mps: ArrayLike  # [n, N] speed of each vehicle, front to rear
+    impacts: Impacts | None = None  # impacts since the last state, if the host resolves impacts itself
+
+
+class HostCommand(NamedTuple):
+    """Command to a host (the simulator that moves the vehicles) for one step.
+
+    >>> import ethbrake_marl as eb
+
+    >>> from ethbrake_marl.extensions.hosts import HostCommand
+    >>> HostCommand._fields
+    ('acceleration_mps2', 'speeds_mps', 'wanted_mps2', 'until_s')
+
+    """
+
+    acceleration_mps2: Floats  # [n, N] acceleration over the step, with latency, rest and speed limit applied
+    speeds_mps: Floats  # [n, N] speeds at the start of the step: the reported ones, or others after an impact
+    wanted_mps2: Floats  # [n, N] acceleration that agents decided, for a host that handles rest and latencies itself
+    until_s: Floats  # [n] time since the alert at which the step ends
+
+
+class Host(Protocol):
+    """Interface of a host, a simulator that moves ``n`` lines of vehicles, one line per world, from the alert on.
+
+    A host needs the attribute ``dt`` and the methods ``state`` and ``apply``; it need not inherit from this class.
+
+    ``dt`` is the length of every step (s). With ``math.inf`` each world moves to its own ``command.until_s``, the time
+    of its next decision; a world that is already there does not move.
+
+    >>> import ethbrake_marl as eb
+
+    >>> from ethbrake_marl.extensions.hosts import HostState, drive_host
+    >>> class Bench:
+    ...     dt = 0.1
+    ...     def __init__(self, worlds):
+    ...         self.told = HostState(0.0, worlds.gaps_m, worlds.speeds_mps)
+    ...     def state(self):
+    ...         return self.told
+    ...     def apply(self, command):
+    ...         after = command.speeds_mps + self.dt * command.acceleration_mps2
+    ...         way = self.dt * (command.speeds_mps + after) / 2
+    ...         gaps = self.told.gaps_m + way[:, :-1] - way[:, 1:]
+    ...         self.told = HostState(self.told.time_s + self.dt, gaps, after)
+    >>> worlds = eb.load_scenario("paper-random").sample(5, seed=7).worlds
+    >>> drive_host(Bench(worlds), eb.make_agent("full_brake"), "paper-random", worlds).outcome.at_rest.all()
+    np.True_
+
+    """
+
+    dt: float
+
+    def state(self) -> HostState:
+        """Return the present time, gaps and speeds, and impacts since the last call if the host reports impacts."""
+
+    def apply(self, command: HostCommand) -> None:
+        """Move all vehicles by one step, as ``command`` says."""
+
+
+class HostFailed(EthBrakeError):
+    """Raised if a host raises an exception or reports an impossible state.
+
+    Its attributes ``ledger`` and ``worlds`` hold the harm and the last valid state; ``reason`` is the message.
+
+    >>> import ethbrake_marl as eb
+
+    >>> from ethbrake_marl.extensions.hosts import HostFailed
+    >>> issubclass(HostFailed, eb.EthBrakeError)
+    True
+
+    """
+
+    def __init__(self, reason: str, ledger: Ledger, worlds: Worlds) -> None:
+        super().__init__(reason)
+        self.ledger, self.worlds = ledger, worlds
+
+
+class Hosted(NamedTuple):
+    """Result of an agent that drove vehicles in a host (another simulator)."""
+
+    outcome: Outcome  # harm and final state of each world
+    # [n] whether the host moved otherwise than the shield predicted, so that the shield's bound does not hold. None
+    # without a shield of mode step or robust, because only these compare their prediction with the host.
+    distrusted: Bools | None
+
+    @classmethod
+    def join(cls, parts: list[Hosted]) -> Hosted:
+        """Join the results of consecutive batches of worlds, in their order, into one result."""
+        distrusted = [part.distrusted for part in parts if part.distrusted is not None]
+        outcome = Outcome.join([part.outcome for part in parts])
+        return cls(outcome, np.concatenate(distrusted) if distrusted else None)
+
+
+def drive_host(host: Host, agent: Driver, scenario: str | Path | Scenario, worlds: Worlds) -> Hosted:
+    """Let an agent or a team control the scenario's learners in a host, from the alert to the end of every episode.
+
+    Args:
+        host: the host, at the alert.
+        agent: agent or team for the learners, as returned by ``make_agent``, with or without a shield. It is not
+            changed.
+        scenario: the scenario; its scripts control the other vehicles, and agents know these scripts.
+        worlds: the worlds at the alert with which the host was set up. Only gaps and speeds are read from the host.
+
+    Returns the outcome, and the worlds in which the host moved otherwise than a shield predicted. Raises
+    ``InvalidInput`` for a scenario, agent or worlds that a host does not support, and ``HostFailed`` if the host raises
+    or reports an impossible state.
+
+    """
+    scenario = load_scenario(scenario)
+    if not isinstance(worlds, Worlds):
+        raise InvalidInput(f"host: worlds = {worlds!r}: must be worlds, as scenario.sample(n, seed).worlds")
+    check_alert(worlds, worlds.n, scenario.vehicles)
+    check_agent(agent, "host", alone=False)
+    team = Team.of(agent, scenario.learners)
+    if not team.drivers:
+        raise InvalidInput(f"host: scenario {scenario.name!r} has no learner to drive; scenario.with_learners([1])")
+    return _Run(host, worlds, team, scenario).to_the_end()
+
+
+class _Grid:
+    """Decision times of vehicles that decide together: a first time in each world, and every time step after it.
+
+    ``made`` [n] counts the decisions so far, ``all`` [n] the decisions until the horizon.
+
+    Args:
+        first_s: [n] time of the first decision.
+        vehicles: indices (0 = front) of the vehicles.
+        scenario: scenario, for time step and horizon.
+
+    """
+
+    def __init__(self, first_s: Floats, vehicles: list[int], scenario: Scenario) -> None:
+        self.decisions, self.horizon_s = Decisions(first_s, scenario.time_step_s), scenario.horizon_s
+        self.vehicles, self.made = vehicles, np.zeros(len(first_s))
+        self.all = self.decisions.before(scenario.horizon_s)
+
+    @property
+    def next_s(self) -> Floats:
+        """Time of the next decision in each world, [n] s; after the last decision, the horizon."""
+        return np.where(self.made < self.all, self.decisions.at(self.made), self.horizon_s)
+
+    def is_due(self, time_s: Floats) -> Bools:
+        """Return whether the next decision, or the horizon, is due at the times ``time_s`` [n], as [n] bool."""
+        return self.next_s <= time_s + ROUNDING * self.decisions.time_step_s
+
+
+class _Run:
+    """Running episodes in a host: decisions, latencies, impacts and harm, around the host's steps.
+
+    The arguments are those of ``drive_host``; ``team`` holds the agent of each learner.
+    """
+
+    def __init__(self, host: Host, worlds: Worlds, team: Team, scenario: Scenario) -> None:
+        self.host, self.team, self.scenario = host, team, scenario
+        self.dt = _checked_dt(host, scenario)
+        self.exact = math.isinf(self.dt)
+        _check_known(worlds, scenario, tuple(team.drivers))
+        self.ledger, self.time_s, self.ticks = empty_ledger(worlds), np.zeros(worlds.n), 0
+        self.origin_s: Floats = np.zeros(worlds.n)
+        self.told_s: Floats = np.zeros(worlds.n)
+        self.alert = self.final = worlds
+        self.gaps_m, self.speeds_mps, self.wanted_mps2 = worlds.gaps_m, worlds.speeds_mps, worlds.command_mps2
+        self.gaps_m, self.speeds_mps = self._first_state()
+        if not self.exact:
+            worlds = replace(worlds, vehicles=_on_steps(worlds, self.dt))
+        self.alert = self.final = worlds.running(0.0, self.gaps_m, self.speeds_mps)
+        self.engine = engine = episode_engine(self.alert, team, scenario)
+        first = self.alert.first_decision_s
+        asked = [i for i, script in engine.scripts.items() if not is_state_free(script)]
+        drivers = [*engine.deciders]
+        self.grids = [_Grid(first(drivers), [i for i in asked if i in drivers], scenario)]
+        self.grids += [_Grid(first([i]), [i], scenario) for i in asked if i not in drivers]
+        known = {i: script for i, script in engine.scripts.items() if i not in drivers}
+        others = [i for i in asked if i not in drivers]
+        self.memories = engine.memories | {i: begin_script(known[i], self.alert, i, known) for i in others}
+        self.wanted_mps2 = engine.wanted_mps2.copy()
+        self.wanted_mps2[:, asked] = 0.0
+        self.motion = _Motion(self.alert, self.dt)
+        self.ended: Bools = np.zeros(worlds.n, np.bool_)
+        self.at_rest: Bools = np.zeros(worlds.n, np.bool_)
+
+    def to_the_end(self) -> Hosted:
+        """Run every world to the end of its episode, and return the result."""
+        if self.exact:
+            self._move()  # to the first decision
+        while not self.ended.all():
+            self._decide()
+            self._move()
+            self._end()
+        guarded = self.engine.guarded
+        driven = {i: memory for i, memory in self.memories.items() if i in self.team.drivers}
+        outcome = outcome_of(self.team, Episodes(self.ledger, self.final, self.at_rest, guarded, driven))
+        shield = None if guarded is None else guarded.shield
+        return Hosted(outcome, shield.memory.distrusted if isinstance(shield, StepShield) else None)
+
+    # decisions
+    def _decide(self) -> None:
+        """Let every vehicle decide whose decision is due. All of them see the same state."""
+        each = [~self.ended & (grid.made < grid.all) & grid.is_due(self.time_s) for grid in self.grids]
+        if not np.any(each):
+            return
+        worlds = self._seen()
+        for number, (grid, due) in enumerate(zip(self.grids, each, strict=True)):
+            idle = np.flatnonzero(~due)
+            if len(idle) == len(due):
+                continue
+            for i in grid.vehicles:
+                script, before = self.engine.scripts[i], self.memories[i]
+                command, after = ask_script(script, worlds, before, i)
+                self.wanted_mps2[due, i] = within_capacity(command, worlds, i, script, due)[due]
+                self.memories[i] = renew_memory(after, idle, take_memory(before, idle))
+            if number == 0 and self.engine.guard is not None:
+                self._ask_guard(worlds, due, idle)
+            grid.made = grid.made + due
+
+    def _ask_guard(self, worlds: Worlds, due: Bools, idle: Ints) -> None:
+        """Let the policies behind the shield propose actions, and use the actions that the shield applies.
+
+        Args:
+            worlds: the present state.
+            due: [n] whether a decision is due in each world.
+            idle: row numbers of the other worlds, whose memories stay as they are.
+
+        """
+        engine = self.engine
+        assert engine.guard is not None
+        engine.place(worlds, self.ledger, ended=~due)
+        before: Any = engine.guarded
+        nothing = np.full((worlds.n, len(engine.learners)), np.nan)
+        ruling = engine.guard.decide(engine, before, nothing)
+        policies = renew_memory(ruling.memory.policies, idle, take_memory(before.policies, idle))
+        engine.remember(ruling.memory._replace(policies=policies))
+        for c, i in enumerate(engine.learners):
+            self.wanted_mps2[due, i] = action_to_command(ruling.applied[:, c], worlds.vehicles, i)[due]
+
+    def _seen(self) -> Worlds:
+        """Return the present state as agents see it: nearly standing vehicles stand, and gaps are at least 0."""
+        latency, speeds = self.alert.vehicles.latency_s, self.speeds_mps
+        in_force = np.where(has_acted(latency, self.time_s[:, np.newaxis]), self.wanted_mps2, 0.0)
+        if not self.exact:
+            speeds = np.where(np.abs(speeds) < STANDS_MPS, 0.0, speeds)
+        gaps = np.maximum(self.gaps_m, 0.0)
+        return self.alert.running(self.time_s, gaps, speeds, command_mps2=in_force, pair_hit=self.ledger.count > 0)
+
+    def _end(self) -> None:
+        """Mark the episodes that end with the last step. Their controlled vehicles brake fully from now on."""
+        first = self.grids[0]
+        if not (stepped := ~self.ended & first.is_due(self.time_s) & (first.made > 0)).any():
+            return
+        worlds = self._seen()
+        rests = ((worlds.speeds_mps == 0.0) & (self.wanted_mps2 <= 0.0)).all(axis=1)
+        over = stepped & (rests | (self.time_s >= self.scenario.horizon_s - SNAP * self.scenario.time_step_s))
+        self.at_rest |= over & rests
+        self.ended |= over
+        rows, drivers = np.flatnonzero(over), list(self.team.drivers)
+        self.final = self.final.assign(rows, worlds.take(rows))
+        self.wanted_mps2[np.ix_(over, drivers)] = -worlds.vehicles.braking_capacity_mps2[np.ix_(over, drivers)]
+
+    # the host's steps
+    def _move(self) -> None:
+        """Let the host make one step, check the state that it reports, and resolve impacts unless it reported them."""
+        if self.exact:
+            until = np.minimum.reduce([grid.next_s for grid in self.grids])
+            until = np.where(self.ended, self.time_s, np.maximum(until, self.time_s))
+        else:
+            self.ticks += 1
+            until = np.full(len(self.ended), self.ticks * self.dt)
+        v, begin = self.alert.vehicles, self.speeds_mps
+        acceleration = np.where(v.latency_s <= self.time_s[:, np.newaxis], self.wanted_mps2, 0.0)
+        if not self.exact:
+            acceleration = (held_speeds(begin, acceleration, v.speed_limit_mps, self.dt) - begin) / self.dt
+        command = HostCommand(acceleration.copy(), begin.copy(), self.wanted_mps2.copy(), until.copy())
+        try:
+            self.host.apply(command)
+        except Exception as error:
+            self._fail(f"apply raised {describe_error(error)}", error)
+        time_s, gaps, speeds, impacts = self._read()
+        self._check_clock(time_s, until)
+        before_m, step_s = self.gaps_m, until - self.time_s
+        step = _Step(self.wanted_mps2, begin, until, time_s - self.told_s, gaps, speeds, impacts)
+        if refusal := self.motion.refusal(step):
+            self._fail(refusal[1], world=refusal[0])
+        self.told_s, self.time_s, self.gaps_m = time_s, until, gaps
+        self.speeds_mps = speeds.copy()
+        self.ledger = self.ledger.add(self._meet(before_m, begin, step_s) if impacts is None else impacts)
+
+    def _meet(self, before_m: Floats, begin: Floats, step_s: Floats) -> Impacts:
+        """Resolve the impacts of the step by the paper's eq. (13), from the rear pair to the front pair.
+
+        A pair has an impact if its gap is at most 0 and still closes. At the end of the step let w be the closing
+        speed, g <= 0 the gap, and b the mean closing acceleration of the step. A pair that was apart before the step
+        met with the closing speed ``sqrt(w^2 + 2 b g)``; this speed counts as harm and enters eq. (13).
+
+        Args:
+            before_m: [n, P] gaps before the step.
+            begin: [n, N] speeds at the start of the step.
+            step_s: [n] length of the step.
+
+        Changes ``speeds_mps``, and returns the impacts.
+
+        """
+        v, gaps, speeds, told = self.alert.vehicles, self.gaps_m, self.speeds_mps, self.speeds_mps.copy()
+        first, total, count = np.zeros(gaps.shape), np.zeros(gaps.shape), np.zeros(gaps.shape, np.int64)
+        pressing = np.diff(told - begin, axis=1) / np.maximum(step_s, SNAP)[:, np.newaxis]
+        for p in range(gaps.shape[1] - 1, -1, -1):
+            closing = speeds[:, p + 1] - speeds[:, p]
+            meets = (gaps[:, p] <= 0.0) & (closing > 0.0)
+            then = np.sqrt(np.maximum(closing * closing + 2.0 * pressing[:, p] * gaps[:, p], 0.0))
+            closing = np.where(meets, np.where(before_m[:, p] > 0.0, then, closing), 0.0)
+            front, rear = v.mass_t[:, p], v.mass_t[:, p + 1]
+            impulse = (1.0 + v.restitution) * closing / (front + rear)
+            speeds[:, p] += rear * impulse
+            speeds[:, p + 1] -= front * impulse
+            count[:, p] = closing > BOUND.TOUCH_SPEED_MPS
+            total[:, p] = np.where(count[:, p], closing * closing, 0.0)
+            first[:, p] = np.where(self.ledger.count[:, p], 0.0, total[:, p])
+        return Impacts(first, total, count, *Impacts.no_obstacle(len(gaps)))
+
+    def _read(self) -> tuple[Floats, Floats, Floats, Impacts | None]:
+        """Read the host's state, and return checked copies.
+
+        These are the time since the alert [n], gaps [n, P], speeds [n, N], and impacts (None: not reported). Raises
+        ``HostFailed`` for an exception, a wrong shape or a number that is not finite.
+        """
+        (n, N), read = self.alert.speeds_mps.shape, list[Floats]()
+        try:
+            state = HostState(*self.host.state())
+            given = [np.array(np.ma.filled(each, np.nan), np.float64) for each in state[:3]]
+        except Exception as error:
+            self._fail(f"state raised {describe_error(error)}", error)
+        given[0] = given[0] if given[0].ndim else np.full(n, given[0])
+        for name, each, shape in zip(HostState._fields, given, ((n,), (n, N - 1), (n, N)), strict=False):
+            if each.shape != shape:
+                self._fail(f"{name} is of shape {each.shape}; {shape} is needed: worlds, then vehicles or pairs")
+            if not np.isfinite(each).all():
+                at = np.argwhere(~np.isfinite(each))[0].tolist()
+                self._fail(f"{name}{at} is {each[tuple(at)]}; every number must be finite")
+            read.append(each)
+        impacts = state.impacts
+        if impacts is not None:
+            if not isinstance(impacts, Impacts):
+                self._fail(f"impacts are {type(impacts).__name__}; what eb.advance gives is needed, or None")
+            for place, column in enumerate(fields(Impacts)[:6]):
+                values, shape = np.asarray(getattr(impacts, column.name)), (n, N - 1) if place < 3 else (n,)
+                whole = values.dtype.kind in ("iu" if column.name.endswith("count") else "fiu")
+                if not (whole and values.shape == shape and np.isfinite(values).all() and (values >= 0).all()):
+                    self._fail(f"impacts.{column.name} must be of shape {shape}, finite and not below 0; counts whole")
+        return read[0] - self.origin_s, read[1], read[2], impacts
+
+    def _first_state(self) -> tuple[Floats, Floats]:
+        """Return the host's gaps [n, P] and speeds [n, N] at the alert, and set the origin of its clock.
+
+        Raises ``HostFailed`` if they differ from the worlds with which the host was set up.
+        """
+        self.origin_s, gaps, speeds, _ = self._read()
+        for name, told, given in (("gaps_m", gaps, self.alert.gaps_m), ("speeds_mps", speeds, self.alert.speeds_mps)):
+            if not (close := np.abs(told - given) <= STARTS_WITHIN).all():
+                at = tuple(np.argwhere(~close)[0].tolist())
+                self._fail(
+                    f"{name}{list(at)} is {told[at]:g} and {given[at]:g} in the worlds that were given; set the host up"
+                    f" with these, to {STARTS_WITHIN:g}"
+                )
+        return np.maximum(gaps, 0.0), speeds
+
+    def _check_clock(self, time_s: Floats, until: Floats) -> None:
+        """Raise ``HostFailed`` unless the host's clock ``time_s`` [n] is at ``until`` [n], to half a step."""
+        within = SNAP * self.scenario.time_step_s if self.exact else self.dt / 2.0
+        if not (good := np.abs(time_s - until) <= within).all():
+            k = int(np.argmin(good))
+            went = "skips" if time_s[k] > until[k] else "goes back" if time_s[k] < self.told_s[k] else "loses a step"
+            self._fail(
+                f"world {k} {went}: its clock went from {self.told_s[k]:g} s to {time_s[k]:g} s, and {until[k]:g} s is"
+                f" right to {within:g} s; each call of apply must make one step of dt"
+            )
+
+    def _fail(self, what: str, error: Exception | None = None, world: int | None = None) -> NoReturn:
+        at = float(self.time_s.max(initial=0.0) if world is None else self.time_s[world])
+        raise HostFailed(f"host {type(self.host).__name__} at {at:.2f} s: {what}", self.ledger, self._seen()) from error
+
+
+class _Step(NamedTuple):
+    """One step of a host: its command and the state that it reported at the end."""
+
+    wanted_mps2: Floats  # [n, N] acceleration that the agents decided
+    begin_mps: Floats  # [n, N] speeds at the start of the step, as commanded to the host
+    until_s: Floats  # [n] time since the alert at which the step should end
+    clock_s: Floats  # [n] length of the step on the host's own clock (s)
+    gaps_m: Floats  # [n, N - 1] reported gaps at the end; below 0 where bodies overlap
+    speeds_mps: Floats  # [n, N] reported speeds at the end
+    impacts: Impacts | None  # impacts in the step; None: the host does not report impacts
+
+
+class _Motion:
+    """Ranges in which the gaps and speeds of a host's vehicles can be, given the commands since the alert.
+
+    ``alert`` are the worlds at the alert, ``dt`` is the length of the host's steps (s; infinite: each to a decision).
+
+    Three rules refuse an impossible state:
+
+    1. *Speed in a step.* It changes by no more than the commands so far allow.
+    2. *Gaps since the alert.* They follow from the speeds at the start and at the end of each step.
+    3. *Speed since the alert.* It follows the commands with a delay of at most ``LAG_S`` and an error of the
+       acceleration of at most ``OFF_MPS2`` plus ``OFF_SHARE`` of the command.
+
+    In a host that does not report impacts, bodies pass through one another and never push. In a host that reports
+    impacts, vehicles in contact push one another. For them rule 1 uses the commands of the whole line, and the line's
+    energy after an impact; rules 2 and 3 start again from the reported state.
+    """
+
+    def __init__(self, alert: Worlds, dt: float) -> None:
+        self.vehicles, self.jitter_s = alert.vehicles, 0.0 if math.isinf(dt) else dt
+        self.time_s, self.gaps_m, self.speeds_mps = alert.time_s, alert.gaps_m, alert.speeds_mps
+        self.least_mps2 = self.most_mps2 = np.zeros(alert.speeds_mps.shape)  # range of the commands so far
+        self.least_m = self.most_m = alert.gaps_m  # range of the gaps that follows from the speeds
+        self.led_mps = alert.speeds_mps  # speeds that follow from the commands
+        self.off_mps = np.full(alert.speeds_mps.shape, READ_WITHIN)  # tolerance of led_mps, without the delay
+
+    def refusal(self, step: _Step) -> tuple[int, str] | None:
+        """Check the state that the host reported at the end of ``step``.
+
+        Returns the row number of a world and what is impossible in it, or None if every state is possible.
+        """
+        acting_s = np.maximum(step.until_s[:, np.newaxis] - np.maximum(self._now, self.vehicles.latency_s), 0.0)
+        command = np.where(acting_s > 0.0, step.wanted_mps2, 0.0)
+        met = self._met(step)
+        low, high = self._reachable(step, met)
+        wrong = (
+            _refused(
+                step.speeds_mps, low, high,
+                lambda k, i, right: f"vehicle_{i + 1} of world {k} goes from {step.begin_mps[k, i]:g} to"
+                f" {step.speeds_mps[k, i]:g} m/s within {step.until_s[k] - self.time_s[k]:g} s; {right} m/s is possible"
+                f" under {command[k, i]:g} m/s2: begin a step with command.speeds_mps and let bodies pass through one"
+                " another, or report every impact in the state",
+            )
+            or self._wrong_gap(step, met, low, high)
+            or self._wrong_speed(step, met, command * acting_s)
+        )  # fmt: skip
+        self.time_s, self.gaps_m, self.speeds_mps = step.until_s, step.gaps_m, step.speeds_mps
+        return wrong
+
+    @property
+    def _now(self) -> Floats:
+        return self.time_s[:, np.newaxis]
+
+    def _met(self, step: _Step) -> Bools:
+        """Return which vehicles may have pushed one another during the step, [n, N] bool."""
+        met = np.zeros(step.speeds_mps.shape, np.bool_)
+        if step.impacts is not None:
+            touch = (step.impacts.count > 0) | (np.minimum(step.gaps_m, self.gaps_m) <= READ_WITHIN)
+            met[:, :-1] |= touch
+            met[:, 1:] |= touch
+        return met
+
+    def _reachable(self, step: _Step, met: Bools) -> tuple[Floats, Floats]:
+        """Return the least and the greatest possible speed at the end of the step, each [n, N] m/s.
+
+        ``met`` [n, N]: vehicles that may have pushed one another.
+        """
+        # a host that handles latencies itself does not round them up to whole steps
+        begun = step.until_s[:, np.newaxis] + self.jitter_s > self.vehicles.latency_s
+        command = np.where(begun, step.wanted_mps2, 0.0)
+        self.least_mps2, self.most_mps2 = np.minimum(self.least_mps2, command), np.maximum(self.most_mps2, command)
+        least = np.where(met, self.least_mps2.min(axis=1, keepdims=True), self.least_mps2)
+        most = np.where(met, self.most_mps2.max(axis=1, keepdims=True), self.most_mps2)
+        begin, seconds = step.begin_mps, np.maximum(step.until_s - self.time_s, step.clock_s)[:, np.newaxis]
+        low = begin + least * seconds - READ_WITHIN
+        high = np.maximum(begin, 0.0) + most * seconds + READ_WITHIN  # brakes stop a vehicle that rolls backwards
+        if step.impacts is None:
+            return low, high
+        mass, fastest = self.vehicles.mass_t, np.maximum(np.abs(low), np.abs(high))
+        by_energy = np.sqrt((mass * fastest * fastest).sum(axis=1, keepdims=True) / mass)
+        struck = met & (step.impacts.count > 0).any(axis=1, keepdims=True)
+        return np.where(struck, -by_energy, low), np.where(struck, by_energy, high)
+
+    def _wrong_gap(self, step: _Step, met: Bools, low: Floats, high: Floats) -> tuple[int, str] | None:
+        seconds = (step.until_s - self.time_s)[:, np.newaxis]
+        low = np.where(met, low, np.minimum(step.begin_mps, step.speeds_mps))
+        high = np.where(met, high, np.maximum(step.begin_mps, step.speeds_mps))
+        closing = np.abs(np.diff(step.speeds_mps, axis=1))
+        jitter = self.jitter_s / 2.0 * np.abs(np.diff(step.speeds_mps - self.speeds_mps, axis=1))
+        least = self.least_m + seconds * (low[:, :-1] - high[:, 1:]) - jitter
+        most = self.most_m + seconds * (high[:, :-1] - low[:, 1:]) + jitter
+        off, pushed = READ_WITHIN + self.jitter_s * closing, met[:, :-1] | met[:, 1:]
+        self.least_m, self.most_m = np.where(pushed, step.gaps_m, least), np.where(pushed, step.gaps_m, most)
+        return _refused(
+            step.gaps_m, least - off, most + off,
+            lambda k, p, right: f"the gap between vehicle_{p + 1} and vehicle_{p + 2} of world {k} is"
+            f" {step.gaps_m[k, p]:g} m at {step.until_s[k]:g} s; their speeds lead to {right} m",
+        )  # fmt: skip
+
+    def _wrong_speed(self, step: _Step, met: Bools, change: Floats) -> tuple[int, str] | None:
+        """Return the first reported speed that the commands since the alert rule out, and what is wrong with it.
+
+        Args:
+            step: the step.
+            met: [n, N] vehicles that may have pushed one another, which are not checked.
+            change: [n, N] m/s that the command alone adds to the speed in this step.
+
+        Returns the row number of the world and a message; None if all speeds are possible.
+
+        """
+        began = self.led_mps + step.begin_mps - self.speeds_mps
+        led = held_speeds(began, change, self.vehicles.speed_limit_mps, 1.0)
+        seconds = (step.until_s - self.time_s)[:, np.newaxis]
+        self.off_mps = self.off_mps + OFF_MPS2 * seconds + OFF_SHARE * np.abs(led - began)
+        self.led_mps = np.where(met, step.speeds_mps, led)
+        off = self.off_mps + LAG_S * (self.most_mps2 - self.least_mps2)
+        led = np.where(step.speeds_mps >= 0.0, np.maximum(led, 0.0), led)  # some hosts have no negative speeds
+        return _refused(
+            step.speeds_mps, np.where(met, -np.inf, led - off), np.where(met, np.inf, led + off),
+            lambda k, i, right: f"vehicle_{i + 1} of world {k} drives at {step.speeds_mps[k, i]:g} m/s at"
+            f" {step.until_s[k]:g} s; its commands lead to {right} m/s: follow command.acceleration_mps2",
+        )  # fmt: skip
+
+
+def _refused(
+    values: Floats, low: Floats, high: Floats, describe: Callable[[int, int, str], str]
+) -> tuple[int, str] | None:
+    """Find the first of ``values`` [n, entries] outside its range from ``low`` to ``high``.
+
+    Returns its row, and ``describe(row, entry, range in words)``; None if all values are in range.
+    """
+    good = (low <= values) & (values <= high)
+    if good.all():
+        return None
+    k, i = np.argwhere(~good)[0].tolist()
+    return k, describe(k, i, f"{low[k, i]:g} to {high[k, i]:g}")
+
+
+def _checked_dt(host: Host, scenario: Scenario) -> float:
+    """Return the length of the host's steps (s), its ``dt``.
+
+    Raises ``InvalidInput`` for an object that is not a host, and for a step that does not divide the scenario's time
+    step.
+    """
+    missing = [what for what in ("dt", "state", "apply") if not hasattr(host, what)]
+    if missing:
+        raise InvalidInput(f"host {type(host).__name__}: has no {' and no '.join(missing)}; docs/hosts.md shows one")
+    dt, step = host.dt, scenario.time_step_s
+    if isinstance(dt, bool) or not isinstance(dt, int | float | np.number) or not dt > 0.0:
+        raise InvalidInput(f"host: dt = {dt!r}: must be a number of seconds above 0, or math.inf")
+    if not math.isinf(dt) and not (dt <= step * (1.0 + SNAP) and abs(step / dt - round(step / dt)) <= SNAP):
+        raise InvalidInput(
+            f"host: dt = {dt:g} s: decisions every {step:g} s must be whole steps; for instance"
+            f" {step / math.ceil(step / dt):g} s"
+        )
+    return float(dt)
+
+
+def _check_known(worlds: Worlds, scenario: Scenario, vehicles: tuple[int, ...]) -> None:
+    """Raise ``InvalidInput`` if the worlds have brakes that build up, periodic messages or an obstacle.
+
+    A host provides gaps and speeds only, so it cannot represent these. ``vehicles``: indices of controlled vehicles.
+    """
+    scenario.play_pieces(worlds, vehicles).refuse_build_up("host")
+    if worlds.messages.shape[1] or worlds.obstacle_ahead.any():
+        what = "periodic messages (v2x)" if worlds.messages.shape[1] else "an obstacle ahead (obstacle_gap_m)"
+        raise InvalidInput(f"host: scenario {scenario.name!r}: has {what}; hosts know lines of vehicles alone")
+
+
+def _on_steps(worlds: Worlds, dt: float) -> Vehicles:
+    """Return the vehicles of these worlds with all latencies rounded up to whole steps of ``dt`` (s)."""
+
+    def up(seconds: Floats) -> Floats:
+        return np.ceil(seconds / dt - SNAP) * dt
+
+    v = worlds.vehicles
+    latency = up(v.latency_s)
+    if v.is_known_at_once:
+        return replace(v, latency_s=latency, own_latency_s=latency, known_from_s=Vehicles.known_at_once(latency))
+    return replace(v, latency_s=latency, own_latency_s=up(v.own_latency_s), known_from_s=up(v.known_from_s))

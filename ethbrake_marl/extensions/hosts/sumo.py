@@ -1,0 +1,197 @@
+"""SUMO as a host. Each world is a straight edge of one simulation, which runs in this process (libsumo)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, closing, redirect_stdout
+from importlib.metadata import version
+from io import StringIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.protocol import Driver
+from ethbrake_marl.errors import AgentFailed, InvalidInput, naming_extras, need, renumbered, unknown_name
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.extensions.hosts.protocol import Host, HostCommand, Hosted, HostState, drive_host
+from ethbrake_marl.files.yaml import parse_numeral
+from ethbrake_marl.physics.state import Bools, Floats, Worlds
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.schema import Scenario
+
+_SUMO_DT_S = 0.01  # default step length
+
+_SUMO_LENGTH_M = 5.0  # length of every vehicle; gaps are bumper to bumper, so its value has no effect
+
+_SUMO_EDGE_M = 10_000.0
+
+_EVERY_CHECK_OFF = 32  # SUMO's speed mode in which a vehicle takes the commanded speed without checks
+
+_SUMO_OPTIONS = (
+    *("--step-method.ballistic", "true", "--collision.action", "none", "--time-to-teleport", "-1"),
+    *("--no-step-log", "true", "--no-warnings", "true", "--xml-validation", "never", "--duration-log.disable", "true"),
+)
+
+
+class SumoHost:
+    """Host that runs worlds as parallel edges of one SUMO simulation. A process can hold one at a time.
+
+    Vehicles take the commanded speed. SUMO moves them by its ballistic steps and lets bodies pass through one another.
+    It has no negative speeds: a vehicle that would bounce backwards stands instead. ``close`` ends the simulation.
+
+    Args:
+        worlds: the worlds at the alert.
+        dt: step length, in whole milliseconds (s).
+
+    Raises ``MissingExtra`` without libsumo. Raises ``InvalidInput`` for another step length, or while another
+    simulation is open.
+
+    """
+
+    def __init__(self, worlds: Worlds, dt: float = _SUMO_DT_S) -> None:
+        with naming_extras(), redirect_stdout(StringIO()):  # libsumo prints a warning about another library's version
+            import libsumo
+        if not (dt >= 0.001 and abs(1000.0 * dt - round(1000.0 * dt)) < 1e-9):
+            raise InvalidInput(f"sumo: dt = {dt!r}: must be whole milliseconds, s, for instance 0.01")
+        if libsumo.isLoaded():
+            raise InvalidInput("sumo: a simulation is open in this process, which can hold one; close() it first")
+        self.dt, self._sumo = float(dt), libsumo
+        self._names = [[f"{k}.{i}" for i in range(worlds.N)] for k in range(worlds.n)]
+        with TemporaryDirectory() as folder:
+            net, routes = Path(folder, "net.xml"), Path(folder, "routes.xml")
+            net.write_text(_net(worlds.n), "utf-8")
+            routes.write_text(_routes(worlds, self._names), "utf-8")
+            files = ("--net-file", str(net), "--route-files", str(routes))
+            libsumo.start(["sumo", *files, "--step-length", repr(self.dt), *_SUMO_OPTIONS])
+        libsumo.simulationStep()  # inserts the vehicles at their positions and speeds
+        for name in (name for line in self._names for name in line):
+            libsumo.vehicle.setSpeedMode(name, _EVERY_CHECK_OFF)
+        self._speeds: Floats = np.array(self.state().speeds_mps)
+
+    def state(self) -> HostState:
+        """Return time, gaps and speeds as SUMO reports them."""
+        vehicle = self._sumo.vehicle
+        place = np.array([[vehicle.getLanePosition(name) for name in line] for line in self._names])
+        self._speeds = np.array([[vehicle.getSpeed(name) for name in line] for line in self._names])
+        gaps = place[:, :-1] - _SUMO_LENGTH_M - place[:, 1:]
+        return HostState(self._sumo.simulation.getTime(), gaps, self._speeds)
+
+    def apply(self, command: HostCommand) -> None:
+        """Set the speed of every vehicle at the end of the step from ``command``, and let SUMO make the step."""
+        vehicle, begin = self._sumo.vehicle, np.maximum(command.speeds_mps, 0.0)
+        end = np.maximum(command.speeds_mps + command.acceleration_mps2 * self.dt, 0.0)
+        for k, line in enumerate(self._names):
+            for i, name in enumerate(line):
+                if begin[k, i] != self._speeds[k, i]:
+                    vehicle.setPreviousSpeed(name, float(begin[k, i]))
+                vehicle.setSpeed(name, float(end[k, i]))
+        self._sumo.simulationStep()
+
+    def close(self) -> None:
+        """End the SUMO simulation, so that this process can start another one."""
+        self._sumo.close()
+
+
+def _net(edges: int) -> str:
+    """Return the XML of SUMO's network: ``edges`` straight roads of one lane, side by side, one for each world."""
+    lines = []
+    for k in range(edges):
+        y = 10.0 * k
+        lines.append(
+            f'<edge id="{k}" from="a{k}" to="b{k}"><lane id="{k}_0" index="0" speed="200" length="{_SUMO_EDGE_M}"'
+            f' shape="0,{y} {_SUMO_EDGE_M},{y}"/></edge>'
+        )
+    for k in range(edges):
+        for end, x, lanes in (("a", 0.0, ""), ("b", _SUMO_EDGE_M, f"{k}_0")):
+            lines.append(
+                f'<junction id="{end}{k}" type="dead_end" x="{x}" y="{10.0 * k}" incLanes="{lanes}" intLanes=""'
+                f' shape="{x},{10.0 * k}"/>'
+            )
+    return "\n".join(['<net version="1.20">', *lines, "</net>"])
+
+
+def _routes(worlds: Worlds, names: Sequence[Sequence[str]]) -> str:
+    """Return the XML of SUMO's routes file: all vehicles with their positions and speeds at the alert.
+
+    ``names`` holds the names of the vehicles of each world, front to rear. The last vehicle of each line stands at a
+    tenth of its edge.
+    """
+    lines = [
+        f'<vType id="v" length="{_SUMO_LENGTH_M}" minGap="0" tau="0.001" sigma="0" accel="1000" decel="1000"'
+        ' emergencyDecel="1000" maxSpeed="200"/>'
+    ]
+    lines += [f'<route id="{k}" edges="{k}"/>' for k in range(worlds.n)]
+    behind = np.cumsum(worlds.gaps_m[:, ::-1] + _SUMO_LENGTH_M, axis=1)[:, ::-1]
+    place = (_SUMO_EDGE_M / 10.0 + np.concatenate([behind, np.zeros((worlds.n, 1))], axis=1)).tolist()
+    speeds = worlds.speeds_mps.tolist()
+    for k, line in enumerate(names):
+        lines += [
+            f'<vehicle id="{name}" type="v" route="{k}" depart="0" departPos="{place[k][i]!r}" insertionChecks="none"'
+            f' departSpeed="{speeds[k][i]!r}"/>'
+            for i, name in enumerate(line)
+        ]
+    return "\n".join(["<routes>", *lines, "</routes>"])
+
+
+class FoundHost(NamedTuple):
+    """A kind of host (a simulator that moves the vehicles), chosen by its name on a command line."""
+
+    name: str  # name and version, for tables
+    open: Callable[[Worlds], AbstractContextManager[Host]]  # starts a host at the alert of these worlds, for ``with``
+
+    def evaluate(
+        self,
+        sample: Sample,
+        agents: Mapping[str, Driver],
+        scenario: Scenario,
+        seed: int | None,
+        *,
+        at_once: int = 100,
+        on_progress: Callable[[str, int], None] = lambda agent, done: None,
+    ) -> tuple[Evaluation, dict[str, Bools | None]]:
+        """Let agents drive the scenario's learners in hosts, in the same worlds.
+
+        Args:
+            sample: the worlds at the alert.
+            agents: agents or teams by name.
+            scenario: scenario of the worlds.
+            seed: seed of the worlds, which is recorded; None for worlds of other origin.
+            at_once: number of worlds in one host.
+            on_progress: called with an agent's name and the number of its worlds done.
+
+        Returns the evaluation, and for each agent in which worlds [n] the host moved otherwise than its shield
+        predicted (None without such a shield).
+
+        """
+        found: dict[str, Hosted] = {}
+        for spec, agent in agents.items():
+            parts = []
+            for first in range(0, sample.worlds.n, at_once):
+                rows = np.arange(first, min(first + at_once, sample.worlds.n))
+                worlds = sample.worlds.take(rows)
+                with renumbered(rows), AgentFailed.naming(spec), self.open(worlds) as host:
+                    parts.append(drive_host(host, agent, scenario, worlds))
+                on_progress(spec, int(rows[-1]) + 1)
+            found[spec] = Hosted.join(parts)
+        outcomes = {spec: each.outcome for spec, each in found.items()}
+        whole = Evaluation(
+            scenario, scenario.learners, sample.worlds, sample.index, seed, outcomes, kinds=sample.kinds, host=self.name
+        )
+        return whole, {spec: each.distrusted for spec, each in found.items()}
+
+
+def find_host(spec: str) -> FoundHost:
+    """Return the kind of host that a spec names: ``sumo``, or ``sumo:0.05`` with the step length in s.
+
+    Raises the exceptions of ``SumoHost``.
+    """
+    name, colon, text = spec.partition(":")
+    if name != "sumo":
+        raise unknown_name("host", name, ("sumo",))
+    dt = parse_numeral(text) if colon else _SUMO_DT_S
+    if dt is None:
+        raise InvalidInput(f"host {spec!r}: {text!r} is no step in s; for instance sumo:{_SUMO_DT_S:g}")
+    need("libsumo")
+    return FoundHost(f"SUMO {version('libsumo')}, steps of {dt:g} s", lambda worlds: closing(SumoHost(worlds, dt)))

@@ -1,0 +1,1 @@
+"""Learning algorithms of this project: vine, mixtures of experts, rollout classification."""

@@ -1,0 +1,179 @@
+"""Branches of running episodes: the same moment, played to the end in more than one way.
+
+In a branch, an offset is added to one learner's actions for a few steps; then the policy continues in closed loop. Two
+branches of a moment differ only by the offset. Everything else in them is the same, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine.state import State
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.game.observations import Observations
+from ethbrake_marl.physics.columns import columns
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Bools, Floats, Ints
+from ethbrake_marl.policies.network_spec import Float32s
+
+ROUNDING_MPS2 = 1e-5  # commands closer than this are equal: a network's rounding depends on its batch size
+
+Act = Callable[[Observations], Float32s]  # observations [rows, F] -> actions [rows] in [-1, 1]
+
+Decide = Callable[[Observations, Ints, int], Floats]  # (observations [m, L, F], rows [m], steps so far) -> [m, L]
+
+
+class Offsets(NamedTuple):
+    """Changed actions in n branches (copies of a running episode).
+
+    In each branch, an offset is added to the actions of one learner during its first steps. For example, with
+    ``learner = [0, 0]``, ``size = [0.1, -0.1]``, ``steps = [3, 3]``, the foremost learner brakes less for three steps
+    in the first branch, and more in the second.
+    """
+
+    learner: Ints  # [n] for each branch: index of the changed learner among the learners (0 = foremost)
+    size: Floats  # [n] for each branch: offset added to its actions; the sum is clipped to [-1, 1]
+    steps: Ints  # [n] for each branch: number of steps with the offset, from the first step on
+
+
+def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) -> tuple[Floats, Floats]:
+    """Play every branch (copy of a running episode) to its end, with an offset added to one learner's actions.
+
+    Args:
+        engine: engine whose n rows are the branches to play; it is changed.
+        act: policy of all learners, a function of observations alone.
+        offsets: for each row the learner whose actions are changed, by how much, and for how many steps.
+        gamma: discount of one time step.
+
+    Returns two arrays [n]: the changed learner's discounted return from now on (NaN for a row that could not be
+    advanced), and the sum over the steps of the changes of its actions, after clipping to [-1, 1]. If the reward is
+    harm alone, a row ends as soon as nothing can change any more.
+
+    """
+    moved, most = np.zeros(engine.n), int(offsets.steps.max(initial=0))
+
+    def decide(seen: Observations, rows: Ints, number: int) -> Floats:
+        wanted = act(seen.reshape(-1, seen.shape[2])).astype(np.float64).reshape(seen.shape[:2])
+        some = np.flatnonzero(number < offsets.steps[rows])  # rows whose offset still applies
+        lasting = rows[some]
+        before = wanted[some, offsets.learner[lasting]]
+        after = np.clip(before + offsets.size[lasting], -1.0, 1.0)
+        wanted[some, offsets.learner[lasting]] = after
+        moved[lasting] += after - before
+        return wanted
+
+    gained = play_on(engine, decide, gamma, at_least=most)
+    return gained[np.arange(engine.n), offsets.learner], moved
+
+
+def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) -> Floats:
+    """Play every row of an engine to the end of its episode, and return each learner's discounted return, [n, L].
+
+    Args:
+        engine: engine whose rows are played; it is changed.
+        decide: function of the observations [m, L, F], the row numbers [m] that still run, and the number of steps so
+            far. It returns the learners' actions [m, L].
+        gamma: discount of one time step.
+        at_least: number of steps before which no row ends early.
+
+    If the reward is harm alone, a row ends early as soon as nothing can change any more. The return is NaN for a row
+    that could not be advanced.
+
+    """
+    vehicles = np.array(engine.learners, np.int64)
+    gained, actions = np.zeros((engine.n, len(vehicles))), np.zeros((engine.n, len(vehicles)))
+    running, discount, number = np.flatnonzero(~engine.ended), 1.0, 0
+    only_harm = set(engine.reward_terms) <= {"harm"}
+    while len(running):
+        before = engine.packed.state.take(running, axis=0)
+        actions[running] = decide(engine.observe_all(vehicles, running), running, number)
+        step = engine.step(actions)
+        gained[running] += discount * step.reward[running][:, vehicles]
+        goes_on = ~engine.ended[running]
+        if only_harm and number >= at_least:
+            goes_on &= ~_stands_for_good(engine, before, running)
+        running = running[goes_on]
+        discount *= gamma
+        number += 1
+    gained[list(engine.roster.failed)] = np.nan
+    return gained
+
+
+def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
+    """Play every row of an engine to the end of its episode, and return what the policy met on the way.
+
+    ``act`` is the policy of all learners. The result covers the m decisions of all rows, in the order of time: the
+    observations [m, L, F], and the states of the worlds.
+    """
+    seen_then, moments = [], []
+
+    def decide(seen: Observations, rows: Ints, number: int) -> Floats:
+        seen_then.append(seen)
+        moments.append(engine.moment().take(rows))
+        return act(seen.reshape(-1, seen.shape[2])).astype(np.float64).reshape(seen.shape[:2])
+
+    play_on(engine, decide, 1.0)
+    return np.concatenate(seen_then), State.join(moments)
+
+
+def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
+    """Return for each of ``rows`` [m] whether all vehicles stand and will keep standing, [m] bool.
+
+    ``before`` [m, columns] is the packed state of these rows one step earlier; it must show the same standstill.
+
+    A policy with the same observation acts the same. So the answer is True only if no latency or message can change
+    the observation later.
+    """
+    if engine.packed.has_messages or engine.in_pieces:
+        return np.zeros(len(rows), np.bool_)  # messages under way may change the observation; a profile, the braking
+    (state, params), stands = engine.packed, np.empty(len(rows), np.bool_)
+    find_standing(state, before, params, rows, stands)
+    return stands
+
+
+@compiled
+def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, stands: Bools) -> None:
+    """Write into ``stands`` [m] whether nothing can change any more in each of ``rows`` [m].
+
+    Args:
+        state: packed state of all rows of an engine.
+        before: [m, columns] packed state of ``rows`` one step earlier.
+        params: packed constants of all rows.
+        rows: [m] row numbers.
+        stands: [m] result, which is overwritten.
+
+    """
+    column = columns(state)
+    by_link = params.shape[1] > column.own_latency
+    for m in range(rows.shape[0]):
+        k, same = rows[m], True
+        for c in range(column.speed, column.command):
+            same = same and before[m, c] == 0.0 and state[k, c] == 0.0
+        if same:
+            for c in range(column.gap, column.harm):
+                same = same and state[k, c] == before[m, c]
+            for c in range(column.command, column.previous):
+                same = same and abs(state[k, c] - before[m, c]) < ROUNDING_MPS2
+            for c in range(column.latency, params.shape[1]):
+                known = column.latency <= c < column.mass or (by_link and c >= column.news)
+                same = same and (not known or params[k, c] < before[m, column.time] or np.isinf(params[k, c]))
+        stands[m] = same
+
+
+def other_count(count: HarmCount) -> HarmCount:
+    """Return the other count of harm: ``total`` (all impacts) for ``first`` (first impacts), and the reverse."""
+    return "total" if count == "first" else "first"
+
+
+def moving_rows(moments: State) -> Bools:
+    """Return for each of the n states ``moments`` whether at least one vehicle moves, [n] bool.
+
+    Decisions at which all vehicles stand are left out of training, because actions make no difference there.
+    """
+    column = moments.packed.column
+    moving: Bools = (moments.motion[:, column.speed : column.command] != 0.0).any(axis=1)
+    return moving

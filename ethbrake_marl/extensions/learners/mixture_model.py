@@ -1,0 +1,195 @@
+"""Train a mixture of experts (several networks that drive, and a gating network that chooses one at each decision)."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import torch
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.utils import update_learning_rate
+from torch.nn.functional import mse_loss, softplus
+
+from ethbrake_marl.engine.state import State
+from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
+from ethbrake_marl.extensions.learners.averaged_actor import AveragedActor
+from ethbrake_marl.extensions.learners.branches import moving_rows, other_count, visit
+from ethbrake_marl.extensions.learners.mixture_policy import ModesPolicy
+from ethbrake_marl.extensions.learners.mixture_stages import Stage, stages_of
+from ethbrake_marl.extensions.learners.mixture_worlds import (
+    NoOtherMode,
+    Shown,
+    drive_from,
+    explore,
+    own_worlds,
+    show_templates,
+)
+from ethbrake_marl.extensions.learners.optimizer import adam, descend, follow
+from ethbrake_marl.extensions.learners.scout import choose_rows
+from ethbrake_marl.extensions.learners.trust_radius import Tried
+from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
+from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
+from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.policies.network_spec import Float32s
+
+
+class ModesModel(CounterfactualModel):
+    """Model that trains a mixture of experts: several networks that drive, and a gate that chooses one of them.
+
+    It trains the first expert alone, further experts in worlds of their own, the gate, then all together. The key
+    ``modes`` of the recipe configures it. The arguments are the environment of the training, and the recipe.
+    """
+
+    policy: ModesPolicy  # type: ignore[assignment]
+
+    def __init__(self, environment: EthBrakeVecEnv, recipe: CounterfactualRecipe) -> None:
+        assert recipe.modes is not None
+        self.plan = recipe.modes
+        self._stage: Stage | None = None
+        self._own: State | None = None  # starting states of the worlds of the stage's expert
+        self._rate_share = 1.0
+        super().__init__(environment, recipe)
+
+    def _update(self, told: BaseCallback, total: int) -> None:
+        each = self.n_envs * self.recipe.n_steps
+        number, policy = self.num_timesteps // each, self.policy
+        stage = next(s for s in stages_of(self.plan, -(-total // each)) if s.first <= number < s.end)
+        if stage != self._stage:
+            self._enter(stage, number)
+        member = policy.actors[stage.network]
+        if stage.does == "further":  # whole episodes in some of the expert's own worlds
+            assert self._own is not None
+            some = torch.randint(len(self._own.motion), (self.n_envs,)).numpy()
+            found, moments = visit(self.engine.branch(self._own.take(some)), member.act)
+            seen = found.reshape(1, -1, found.shape[2])
+            self.num_timesteps += each
+        else:
+            seen, moments = self._visit(told, member.act if stage.does == "alone" else policy.act)
+        told.on_rollout_end()
+        self._update_current_progress_remaining(number - stage.first, stage.end - stage.first)
+        self._rate_share = self.plan.together_rate if stage.does == "together" else 1.0
+        if stage.does in ("alone", "further"):
+            self._train(member, self._try_out(seen, moments, member))
+            return
+        if stage.does == "together":  # each expert learns from the decisions at which the gate chooses it
+            tried = self._try_out(seen, moments, policy)
+            chosen = policy.gate.choose(tried.seen)
+            for k, actor in enumerate(policy.actors):
+                rows = np.flatnonzero(chosen == k)
+                if len(rows) > 1:
+                    self._train(actor, Tried(*(array[rows] for array in tried)))
+        self._train_gate(*self._compare(seen, moments))
+
+    def _update_learning_rate(self, optimizers: list[torch.optim.Optimizer] | torch.optim.Optimizer) -> None:
+        assert isinstance(optimizers, torch.optim.Optimizer)
+        rate = self._rate_share * self.lr_schedule(self._current_progress_remaining)
+        self.logger.record("train/learning_rate", rate)
+        update_learning_rate(optimizers, rate)
+
+    def _enter(self, stage: Stage, number: int) -> None:
+        """Prepare a stage of the training that begins, or is resumed, at update ``number``.
+
+        For a further expert, find the worlds that it will be trained in, and let it imitate templates (random braking
+        profiles) that do better than the experts so far.
+
+        The result depends only on finished experts, so it is the same after a resume.
+        """
+        self._stage, self._own = stage, None
+        if stage.does != "further":
+            return
+        engine, gamma = self.engine, self.recipe.gamma
+        before = [actor.act for actor in self.policy.actors[: stage.network]]
+        found = explore(engine, self.plan, before, gamma)
+        seed = int(self.seed or 0)
+        shown = show_templates(engine, self.plan, found, gamma, seed)
+        pupil = copy.deepcopy(self.policy.actors[0])
+        self._imitate(pupil, shown, seed + stage.network)
+        self._own = own_worlds(engine, self.plan, found, pupil.act, gamma)
+        if len(shown.action) == 0 or len(self._own.motion) == 0:
+            raise NoOtherMode(
+                f"modes: network {stage.network + 1}: in none of {self.plan.worlds:,} worlds did one of"
+                f" {self.plan.templates} templates do better by {self.plan.gain:g}; leave out modes, or have"
+                " fewer networks"
+            )
+        if number == stage.first:
+            self.policy.actors[stage.network].load_state_dict(pupil.state_dict())
+
+    def _imitate(self, pupil: AveragedActor, shown: Shown, seed: int) -> None:
+        """Train the expert ``pupil`` to imitate the shown actions; ``seed`` orders the batches."""
+        pupil.optimizer = adam(self.lr_schedule(1.0), pupil.learning)
+        seen, wanted = torch.from_numpy(shown.seen), torch.from_numpy(shown.action)
+        generator = torch.Generator().manual_seed(seed)
+        for _ in range(self.plan.imitation_epochs):
+            for batch in torch.split(torch.randperm(len(wanted), generator=generator), self.recipe.batch_size):
+                means, target = pupil.learning(seen[batch])[:, 0], wanted[batch]
+                reached = (target.abs() >= 1.0) & (means * target >= 1.0)  # an output beyond a bound is clipped to it
+                loss = mse_loss(means, torch.where(reached, means.detach(), target))
+                descend(pupil.optimizer, loss)
+        follow(pupil.average, pupil.learning, 0.0)
+
+    def _compare(self, seen: Float32s, moments: State) -> tuple[Float32s, Floats, Float32s]:
+        """Let each of the K experts play to the end from B of the visited decisions, and return what it costs.
+
+        The cost is minus the return, plus ``tie_break`` times the harm under the count that the reward does not use.
+        The B decisions are drawn; those at which all experts take the same action are
+        left out, because the choice has no effect there.
+
+        Args:
+            seen: [steps, rows, F] observations at the visited decisions.
+            moments: states of the worlds at these decisions.
+
+        Returns observations [B, F], costs [B, K], and the importance (weight in the loss) of each decision [B].
+
+        """
+        engine, members = self.engine, [actor.act for actor in self.policy.actors]
+        observed = seen.reshape(-1, seen.shape[2])
+        actions = np.stack([act(observed) for act in members])
+        differ = (np.ptp(actions, axis=0) > 1e-2) & moving_rows(moments)
+        count, scout = self.plan.gate_states, self.policy.gate.scout
+        expect = None if scout is None else scout.expect
+        rows, importance = choose_rows(observed, np.flatnonzero(differ), count, self.recipe.focus, expect)
+        other = other_count(engine.reward.harm_count)
+        then = moments.take(rows)
+        costs = np.empty((len(rows), len(members)))
+        for number, act in enumerate(members):
+            gained, harm = drive_from(engine, then, act, self.recipe.gamma, other)
+            costs[:, number] = self.plan.tie_break * harm - gained
+        good = np.isfinite(costs).all(axis=1)
+        return observed[rows[good]], costs[good], importance[good]
+
+    def _train_gate(self, seen: Float32s, costs: Floats, importance: Float32s | None = None) -> None:
+        """Train the gating network to choose the cheapest expert.
+
+        A decision's weight is the extra cost of the other experts.
+
+        Args:
+            seen: [B, F] observations.
+            costs: [B, K] cost of each expert.
+            importance: [B] factor of each decision; None: 1.
+
+        """
+        importance = np.ones(len(seen), np.float32) if importance is None else importance
+        gate = self.policy.gate
+        self._update_learning_rate(gate.optimizer)
+        more = (costs - costs.min(axis=1, keepdims=True)).astype(np.float32)
+        rows = np.flatnonzero(more.max(axis=1) > 1e-9)
+        gate.remember(seen[rows], more[rows] * importance[rows, np.newaxis])
+        if gate.scout is not None:
+            arrays = [torch.from_numpy(array) for array in (seen, more.max(axis=1), importance)]
+            for batch in torch.split(torch.randperm(len(seen)), self.recipe.batch_size):
+                descend(gate.optimizer, gate.scout.loss(*(array[batch] for array in arrays)))
+        if len(rows):
+            regret = np.take_along_axis(more[rows], gate.choose(seen[rows])[:, np.newaxis], axis=1)
+            self.logger.record("gate/regret", float((regret[:, 0] * importance[rows]).mean()))
+        if int(gate.compared) == 0:
+            return
+        losses = []
+        for _ in range(self.plan.gate_steps):
+            inputs, costlier = gate.recall(self.recipe.batch_size)
+            scores = gate.learning(inputs)
+            best = scores.gather(1, costlier.argmin(dim=1, keepdim=True))
+            loss = (costlier * softplus(scores - best)).sum(dim=1).mean()
+            descend(gate.optimizer, loss)
+            follow(gate.average.parameters(), gate.learning, self.recipe.averaging)
+            losses.append(loss.item())
+        self.logger.record("gate/loss", float(np.mean(losses)))

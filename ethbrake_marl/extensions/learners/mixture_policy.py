@@ -1,0 +1,72 @@
+"""A mixture of experts as one policy: several actors and a gating network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.spaces import Space, flatdim
+from numpy.typing import NDArray
+from stable_baselines3.common.type_aliases import Schedule
+from torch import Tensor, nn
+
+from ethbrake_marl.extensions.learners.averaged_actor import AveragedActor, Deterministic
+from ethbrake_marl.extensions.learners.gating_network import AveragedGate
+from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
+from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
+from ethbrake_marl.training.networks import tensors_of_layers
+
+
+class ModesPolicy(Deterministic):
+    """Mixture of experts: at each decision a gating network chooses which of several actors (experts) acts.
+
+    Args:
+        observation_space: Gymnasium space of an observation.
+        action_space: Gymnasium space of an action.
+        rate: learning rate as a function of the remaining share of the training, from 1 to 0.
+        recipe: recipe with the key ``modes``.
+
+    """
+
+    def __init__(
+        self, observation_space: Space[Any], action_space: Any, rate: Schedule, recipe: CounterfactualRecipe
+    ) -> None:
+        super().__init__(observation_space, action_space)
+        assert recipe.modes is not None
+        networks = range(recipe.modes.networks)
+        self.actors = [AveragedActor(observation_space, action_space, rate, recipe) for _ in networks]
+        self.members = nn.ModuleList(self.actors)
+        self.gate = AveragedGate(flatdim(observation_space), rate, recipe)
+
+    def _chosen(self, observation: Float32s, ask: Callable[[AveragedActor, Float32s], NDArray[Any]]) -> Floats:
+        """Return for each observation [rows, F] one value, [rows], from the actor that the gate chooses for it.
+
+        ``ask`` is a method of the actors from observations to values, such as ``AveragedActor.means``.
+        """
+        chosen, found = self.gate.choose(observation), np.empty(len(observation))
+        for number, actor in enumerate(self.actors):
+            rows = np.flatnonzero(chosen == number)
+            found[rows] = ask(actor, observation[rows])
+        return found
+
+    def means(self, observation: Float32s) -> Float32s:
+        return self._chosen(observation, AveragedActor.means).astype(np.float32)  # lossless: the means are float32
+
+    def expect(self, observation: Float32s) -> Floats:
+        return self._chosen(observation, AveragedActor.expect)
+
+    def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
+        found = tensors_of_layers("gate", self.gate.average)
+        for name, actor in zip(network.actors, self.actors, strict=True):
+            found |= tensors_of_layers(
+                name, nn.Sequential(*actor.mlp_extractor["policy_net"].children(), actor.action_net)
+            )
+        return found
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return the actions [rows, 1] of the averaged networks for observations [rows, F]."""
+        chosen = self.gate.average(observation).argmax(dim=1, keepdim=True)
+        return torch.cat([actor(observation) for actor in self.actors], dim=1).gather(1, chosen)

@@ -1,0 +1,175 @@
+"""Actor that scores a number of actions and takes the best one, with a memory of what tried actions cost."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.spaces import Space, flatdim
+from stable_baselines3.common.torch_layers import create_mlp
+from stable_baselines3.common.type_aliases import Schedule
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+from ethbrake_marl.extensions.learners.averaged_actor import Deterministic
+from ethbrake_marl.extensions.learners.optimizer import adam
+from ethbrake_marl.extensions.learners.rollout_classification_recipe import OptionsRecipe
+from ethbrake_marl.extensions.learners.scout import draw_rows
+from ethbrake_marl.physics.state import Floats, Ints
+from ethbrake_marl.policies.actor import Actor
+from ethbrake_marl.policies.layers import Layers
+from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
+from ethbrake_marl.training.networks import ACTIVATIONS, copy_of, tensors_of_layers
+
+
+class _TorchActor(Actor):
+    """``Actor`` (a policy's network) with torch's matrix products instead of numpy's.
+
+    It is three times as fast; the last bits differ.
+    """
+
+    @torch.no_grad()
+    def _forward(self, layers: Layers, x: Float32s) -> Float32s:
+        activation = torch.relu if self.spec.activation == "relu" else torch.tanh
+        y: Tensor = torch.from_numpy(x)
+        for number, (weight, bias) in enumerate(layers, start=1):
+            y = torch.addmm(torch.from_numpy(bias)[:, None], torch.from_numpy(weight), y)
+            y = y if number == len(layers) else activation(y)
+        found: Float32s = y.numpy()
+        return found
+
+
+class ChoosingActor(Deterministic):
+    """Actor whose network scores a number of options; it takes the option with the highest score.
+
+    The first ``first`` options are policies, which then choose the action; the others are actions, evenly from -1 to 1.
+    The network ``learning`` is in training; ``average``, with the running average of its weights, drives.
+
+    The memory of M places holds the last decisions at which C options were tried, and how much more each cost than the
+    best one. F is the number of features.
+
+    Args:
+        observation_space: Gymnasium space of an observation.
+        action_space: Gymnasium space of an action.
+        rate: learning rate as a function of the remaining share of the training, from 1 to 0.
+        recipe: the recipe.
+        among: for each trained policy that the actor can choose instead of an action, its weights by name.
+        members: number of scenarios in the training's mixture; 1 without a mixture.
+
+    """
+
+    seen: Tensor  # [M, F] observations in memory
+    tried: Tensor  # [M, C] numbers of the tried options; the actor itself took the first of the C
+    more: Tensor  # [M, C] extra cost of each tried option over the best one
+    known: Tensor  # [1] number of decisions added to the memory so far; new ones replace the oldest
+    usual: Tensor  # [members] mean cost of the best tried option in each scenario of a mixture; 0: not measured yet
+
+    def __init__(
+        self,
+        observation_space: Space[Any],
+        action_space: Any,
+        rate: Schedule,
+        recipe: OptionsRecipe,
+        among: Sequence[Mapping[str, Float32s]],
+        members: int,
+    ) -> None:
+        super().__init__(observation_space, action_space)
+        inputs, shape, room = flatdim(observation_space), recipe.network, (recipe.memory, 1 + recipe.others)
+        self.first, scores = len(among), len(among) + shape.choices  # numbers below ``first`` stand for policies
+        layers = create_mlp(inputs, scores, list(shape.policy), ACTIVATIONS[shape.activation])
+        nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]  # until it learns, all scores are equal and it
+        nn.init.zeros_(layers[-1].bias)  # type: ignore[arg-type]  # takes number 0: a policy, or full braking
+        self.average = nn.Sequential(*layers)
+        self.learning = copy.deepcopy(self.average)
+        self.optimizer = adam(rate(1.0), self.learning)
+        spec = recipe.network_spec(inputs)
+        tensors = {f"among_{m}.{name}": each[name] for m, each in enumerate(among, 1) for name in each}
+        self._among = tuple(tensors)
+        for name, tensor in tensors.items():
+            self.register_buffer(name.replace(".", "_"), torch.from_numpy(tensor))
+        chooser = {row.name: np.zeros(row.shape, np.float32) for row in spec.tensors if row.name not in tensors}
+        self.take = _TorchActor(spec, {**chooser, **tensors}).take
+        self.register_buffer("usual", torch.zeros(members, dtype=torch.float64))
+        self.register_buffer("seen", torch.zeros(recipe.memory, inputs))
+        self.register_buffer("tried", torch.zeros(room, dtype=torch.int64))
+        self.register_buffer("more", torch.zeros(room))
+        self.register_buffer("known", torch.zeros(1, dtype=torch.int64))
+
+    @torch.no_grad()
+    def choose(self, observation: Float32s) -> Ints:
+        """Return the number of the option with the highest score, [rows], for each of the observations [rows, F].
+
+        Numbers below the attribute ``first`` stand for policies. The other numbers stand for actions, evenly spread:
+        ``first`` is the action -1, and the largest number is the action 1.
+        """
+        chosen: Ints = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
+        return chosen
+
+    def act(self, observation: Float32s) -> Float32s:
+        found: Float32s = self.take(self.choose(observation), observation.T)[0]
+        return found
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return the actions [rows, 1] of the averaged network for observations [rows, F]."""
+        return torch.from_numpy(self.act(observation.numpy()))[:, None]
+
+    def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
+        among = {name: copy_of(self.get_buffer(name.replace(".", "_"))) for name in self._among}
+        return {**tensors_of_layers("policy", self.average), **among}
+
+    def remember(self, seen: Float32s, tried: Ints, more: Floats) -> None:
+        """Add m decisions to the memory.
+
+        Args:
+            seen: [m, F] observations.
+            tried: [m, C] numbers of the tried options, as from ``choose``; the actor itself took the first of the C.
+            more: [m, C] extra cost of each tried option over the best one.
+
+        """
+        places = torch.arange(int(self.known), int(self.known) + len(seen)) % len(self.seen)
+        self.seen[places], self.tried[places] = torch.from_numpy(seen), torch.from_numpy(tried)
+        self.more[places] = torch.from_numpy(more.astype(np.float32))
+        self.known += len(seen)
+
+    def draw(self, batches: int, count: int, focus: float) -> Iterator[tuple[Tensor, Tensor]]:
+        """Draw decisions from the memory; yield for each gradient step their rows and importance, both [count].
+
+        The importance is a decision's weight in the loss.
+
+        Args:
+            batches: number of gradient steps.
+            count: decisions per step.
+            focus: share that is drawn in proportion to how much the choice matters; 0: all are drawn uniformly.
+
+        """
+        known = min(int(self.known), len(self.seen))
+        if focus == 0.0 or batches == 0:
+            for _ in range(batches):
+                yield torch.randint(known, (count,)), torch.ones(count)
+            return
+        rows, importance = draw_rows(self.more[:known].max(dim=1).values.numpy(), batches * count, focus)
+        for start in range(0, len(rows), count):
+            part = slice(start, start + count)
+            yield torch.from_numpy(rows[part]), torch.from_numpy(importance[part])
+
+    def loss(self, some: Tensor, importance: Tensor, guide: float) -> Tensor:
+        """Return the loss at decisions of the memory: the expected cost of actions drawn by a softmax of the scores.
+
+        Its gradient vanishes if the probabilities are nearly 0 or 1. So ``guide`` times a convex loss is added, which
+        lowers the score of every action except the best, and more for a costlier action.
+
+        Args:
+            some: row numbers of the decisions in the memory.
+            importance: factor of each of them.
+            guide: weight of the convex loss.
+
+        """
+        more = self.more[some]
+        scores = self.learning(self.seen[some]).gather(1, self.tried[some])
+        best = scores.gather(1, more.argmin(dim=1, keepdim=True))
+        expected = (scores.softmax(dim=1) * more).sum(dim=1)
+        found: Tensor = (importance * (expected + guide * (more * softplus(scores - best)).sum(dim=1))).mean()
+        return found

@@ -1,0 +1,450 @@
+"""Decide whether the controlled vehicle can avoid contact with both neighbours.
+
+The *largest trajectory* is the trajectory of the controlled vehicle that is farthest ahead at all times without contact
+with the front vehicle. Contact with the rear vehicle is avoidable exactly if the rear vehicle stays behind it.
+
+Symbols: l the front vehicle (leader), f the controlled vehicle (follower), r the rear vehicle; gap [m], speed v [m/s],
+braking capacity a > 0, driving capacity u >= 0 [m/s2]. Times count from the moment at which the controlled vehicle
+may act; by then the leader brakes. docs/avoidability.md derives every formula. Only + - * / and sqrt are used.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.extensions.proofs.plans import empty_plan, fill_braking, fill_plan, time_to_limit, walk
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.motion import BOUND, solo_motion, stopping_distances
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+
+ROUNDING_M = 1e-12  # a smaller overlap is a rounding error of gap 0, not an impact
+
+SQUEEZE_M = 1e-9  # with less room than this between both neighbours, contact counts as unavoidable
+
+TOUCHING_M = 1e-5  # the same limit where contact with the front vehicle is forced, which may change the way by as much
+
+AVOIDABLE, EARLY, FRONT, REAR = 0, 1, 2, 3
+
+REASON, MARGIN, SPARE, DRIVE, TOUCH, FOLLOW, RESULT_WIDTH = range(7)  # columns of a verdict
+
+
+@compiled
+def spare_gap(gap: float, v_l: float, a_l: float, v_f: float, a_f: float) -> float:
+    """Return the part of the gap that full braking from now does not need to stay behind the braking front vehicle, m.
+
+    A negative value means that the two meet. If the follower stops last, the stopping distances decide, else the moment
+    of equal speeds.
+
+    Args:
+        gap: gap between the two vehicles, m.
+        v_l: speed of the front vehicle (leader), m/s.
+        a_l: its braking capacity, m/s2.
+        v_f: speed of the follower, m/s.
+        a_f: its braking capacity, m/s2.
+
+    """
+    if v_f * a_l >= v_l * a_f:
+        return gap - max(0.0, v_f * v_f / (2.0 * a_f) - v_l * v_l / (2.0 * a_l))
+    if v_f > v_l:
+        return gap - (v_f - v_l) * (v_f - v_l) / (2.0 * (a_f - a_l))
+    return gap
+
+
+@compiled
+def drive_before_braking(
+    gap: float, v_l: float, a_l: float, v_f: float, a_f: float, u: float
+) -> tuple[float, float, bool]:
+    """Return how long a vehicle may drive with constant ``u >= 0`` so that full braking still keeps it behind the
+    leader.
+
+    Returns the duration of the drive (s), the time at which the gap becomes 0 (s), and whether both vehicles move at
+    that time (then ``a_f > a_l`` and the speeds are equal; else the follower stops at the standing leader). Both times
+    are infinite if the follower never moves. Assumes ``spare_gap >= 0``.
+
+    Args:
+        gap: gap to the leader (the vehicle in front, which brakes from now on), m.
+        v_l: speed of the leader, m/s.
+        a_l: braking capacity of the leader, m/s2.
+        v_f: speed of the following vehicle, m/s.
+        a_f: its braking capacity, m/s2.
+        u: its driving acceleration, m/s2.
+
+    """
+    w, closing, relief = v_f - v_l, u + a_l, a_f - a_l
+    if relief > 0.0 and v_l > 0.0:
+        both = u + a_f
+        root = math.sqrt(both * relief * (w * w + 2.0 * closing * gap))
+        if w > 0.0:
+            drive = max(2.0 * relief * gap - w * w, 0.0) / (w * both + root)
+        else:
+            drive = (root - w * both) / (closing * both)
+        touch = drive + (w + closing * drive) / relief
+        if touch * a_l <= v_l:
+            return drive, touch, True
+    ratio = 1.0 + u / a_f
+    room = max(v_l * v_l / (2.0 * a_l) + gap - v_f * v_f / (2.0 * a_f), 0.0)
+    pace = ratio * v_f + math.sqrt(ratio * ratio * v_f * v_f + 2.0 * u * ratio * room)
+    if v_f == 0.0 and u == 0.0:
+        return math.inf, math.inf, False
+    drive = 2.0 * room / pace if room > 0.0 else 0.0
+    return drive, drive + (v_f + u * drive) / a_f, False
+
+
+@compiled
+def largest_behind(
+    gap: float, v_l: float, a_l: float, v_f: float, a_f: float, u: float, limit: float
+) -> tuple[float, float, bool]:
+    """Return how long a vehicle may drive, at most up to its speed limit, so that full braking still keeps it behind
+    the leader.
+
+    The leader is the front vehicle, which brakes from now on. Also returns the time at which the gap becomes 0 (s), and
+    whether both vehicles move then.
+
+    Args:
+        gap: gap to the leader, m.
+        v_l: speed of the leader, m/s.
+        a_l: braking capacity of the leader, m/s2.
+        v_f: speed of the following vehicle, m/s.
+        a_f: its braking capacity, m/s2.
+        u: its driving acceleration, m/s2.
+        limit: its speed limit, m/s.
+
+    """
+    cap = time_to_limit(v_f, u, limit)
+    if cap > 0.0:
+        found = drive_before_braking(gap, v_l, a_l, v_f, a_f, u)
+        if found[0] <= cap:
+            return found
+        after_l, way_l, _ = solo_motion(v_l, -a_l, 0.0, math.inf, cap)
+        gap = gap + (way_l - 0.5 * (v_f + limit) * cap)
+        v_l, v_f = after_l, limit
+    drive, touch, moving = drive_before_braking(gap, v_l, a_l, v_f, a_f, 0.0)
+    return cap + drive, cap + touch, moving
+
+
+@compiled
+def lowest_while_coasting(gap: float, v_f: float, v_r: float, a_r: float, onset_r: float, until: float) -> float:
+    """Return the smallest gap between a vehicle that coasts until ``until`` and the vehicle behind it, m.
+
+    The gap is convex, so its minimum is at equal speeds or at an end.
+
+    Args:
+        gap: gap now, m.
+        v_f: speed of the coasting vehicle, m/s.
+        v_r: speed of the vehicle behind, m/s.
+        a_r: its braking capacity, m/s2.
+        onset_r: time from which on it brakes, s.
+        until: end of the coasting, s.
+
+    """
+    w = v_r - v_f
+    if w <= 0.0:
+        return gap
+    if onset_r + w / a_r < until:
+        return gap - w * onset_r - w * w / (2.0 * a_r)
+    return gap + v_f * until - solo_motion(v_r, -a_r, onset_r, math.inf, until)[1]
+
+
+@compiled
+def met(gap: float, closing: float) -> bool:
+    """Return whether a pair with this gap (m) and closing speed (m/s) has had an impact, or has one at this moment."""
+    return gap < -ROUNDING_M or (gap <= 0.0 and closing > BOUND.TOUCH_SPEED_MPS)
+
+
+@compiled
+def leader_at_onset(
+    gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, start: float
+) -> tuple[float, float]:
+    """Return gap to the leader (m) and speed of the leader (m/s) at ``start``, if the follower coasts until then.
+
+    The leader brakes by then. The gap is concave until then: if it is not negative at the end, it never was.
+
+    Args:
+        gap: gap now, m.
+        v_l: speed of the leader (front vehicle), m/s.
+        a_l: its braking capacity, m/s2.
+        onset_l: time from which on it brakes, s.
+        v_f: speed of the follower, m/s.
+        start: time at which the follower may act, s.
+
+    """
+    after, way, _ = solo_motion(v_l, -a_l, onset_l, math.inf, start)
+    return gap + (way - v_f * start), after
+
+
+@compiled
+def decide_front(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: int, out: Floats) -> bool:
+    """Decide whether vehicle ``i`` stays behind the front vehicle by full braking; return False if it certainly does
+    not.
+
+    Args:
+        gap: [P] gaps, m.
+        speed: [N] speeds, m/s.
+        onset: [N] times from which on the vehicles may brake, s.
+        braking: [N] braking capacities, m/s2.
+        i: index of the controlled vehicle, at least 1.
+        out: [RESULT_WIDTH] receives columns REASON (a code), MARGIN and SPARE (both m) of the verdict.
+
+    """
+    a_l, v_f, a_f = braking[i - 1], speed[i], braking[i]
+    ahead, v_l = leader_at_onset(gap[i - 1], speed[i - 1], a_l, onset[i - 1], v_f, onset[i])
+    out[REASON], out[MARGIN] = EARLY, ahead
+    if met(ahead, v_f - v_l):
+        return False
+    spare = spare_gap(max(ahead, 0.0), v_l, a_l, v_f, a_f)
+    out[REASON], out[MARGIN], out[SPARE], out[DRIVE] = FRONT, spare, max(spare, 0.0), 0.0
+    if spare < -ROUNDING_M:
+        return False
+    out[REASON] = AVOIDABLE
+    return True
+
+
+@compiled
+def plan_behind(
+    gap: Floats, speed: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, keep: float,
+    plan: Floats, out: Floats,
+) -> None:  # fmt: skip
+    """Write to ``plan`` the most forward trajectory of vehicle i among those that stay ``keep`` metres behind i - 1.
+
+    Vehicle i drives as hard as it can, then brakes fully, then follows the vehicle ahead at that distance.
+
+    Args:
+        gap: [P] gaps, m.
+        speed: [N] speeds, m/s.
+        onset: [N] times from which on the vehicles may act, s.
+        braking: [N] braking capacities, m/s2.
+        driving: [N] driving capacities, m/s2.
+        limit: [N] speed limits, m/s.
+        i: index of the controlled vehicle.
+        keep: distance to keep to the vehicle ahead, m.
+        plan: [2, PIECES] receives the trajectory: ends (s) and accelerations (m/s2) of its pieces.
+        out: [RESULT_WIDTH] receives columns DRIVE (s; end of the drive), TOUCH (s; end of the full braking after it)
+            and FOLLOW (m/s2; the command after that).
+
+    """
+    a_f, u = braking[i], driving[i]
+    if i > 0:
+        a_l = braking[i - 1]
+        ahead, v_l = leader_at_onset(gap[i - 1], speed[i - 1], a_l, onset[i - 1], speed[i], onset[i])
+        ahead = max(ahead - keep, 0.0)
+        out[DRIVE], out[TOUCH], moving = largest_behind(ahead, v_l, a_l, speed[i], a_f, u, limit[i])
+        out[FOLLOW] = -a_l if moving else -a_f
+    cap = min(time_to_limit(speed[i], u, limit[i]), out[DRIVE])
+    fill_plan(plan, cap, u, out[DRIVE], 0.0, out[TOUCH], -a_f, out[FOLLOW])
+
+
+@compiled
+def meets_rear_early(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: int, out: Floats) -> bool:
+    """Return whether the vehicle behind vehicle ``i`` meets it before vehicle ``i`` may act.
+
+    Args:
+        gap: [P] gaps, m.
+        speed: [N] speeds, m/s.
+        onset: [N] times from which on the vehicles may act, s.
+        braking: [N] braking capacities, m/s2.
+        i: index of the controlled vehicle.
+        out: [RESULT_WIDTH] receives columns REASON and MARGIN if they meet.
+
+    """
+    v_f, v_r, a_r, start = speed[i], speed[i + 1], braking[i + 1], onset[i]
+    lowest = lowest_while_coasting(gap[i], v_f, v_r, a_r, onset[i + 1], start)
+    after, way, _ = solo_motion(v_r, -a_r, onset[i + 1], math.inf, start)
+    if met(lowest, 0.0) or met(gap[i] + (v_f * start - way), after - v_f):
+        out[REASON], out[MARGIN] = EARLY, lowest
+        return True
+    return False
+
+
+@compiled
+def decide_world(
+    gap: Floats, speed: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, plan: Floats,
+    rear: Floats, out: Floats,
+) -> None:  # fmt: skip
+    """Decide whether vehicle ``i`` can avoid contact in one world, and write the verdict to ``out``.
+
+    Columns of the verdict: REASON (AVOIDABLE, EARLY, FRONT or REAR), MARGIN (m) as in ``Avoidability``, SPARE (m; part
+    of the gap that full braking does not need), DRIVE and TOUCH (s after vehicle ``i`` may act; end of the drive, and
+    of the full braking after it), FOLLOW (m/s2; the command after that).
+
+    Args:
+        gap: [P] gaps, m.
+        speed: [N] speeds, m/s.
+        onset: [N] times from which on the vehicles may act, s.
+        braking: [N] braking capacities, m/s2.
+        driving: [N] driving capacities, m/s2.
+        limit: [N] speed limits, m/s.
+        i: index of the controlled vehicle.
+        plan: [2, PIECES] working memory.
+        rear: [2, PIECES] working memory.
+        out: [RESULT_WIDTH] receives the verdict.
+
+    """
+    out[REASON], out[MARGIN], out[SPARE] = AVOIDABLE, math.inf, math.inf
+    out[DRIVE], out[TOUCH], out[FOLLOW] = math.inf, math.inf, -braking[i]
+    has_rear = i < gap.shape[0]
+    if i > 0 and not decide_front(gap, speed, onset, braking, i, out) and out[REASON] == EARLY:
+        return
+    if has_rear and meets_rear_early(gap, speed, onset, braking, i, out):
+        return
+    if has_rear and out[REASON] == AVOIDABLE:
+        # check that the rear vehicle stays behind the largest trajectory of vehicle i
+        v_f, a_r, start = speed[i], braking[i + 1], onset[i]
+        v_r, way, _ = solo_motion(speed[i + 1], -a_r, onset[i + 1], math.inf, start)
+        behind = max(gap[i] + (v_f * start - way), 0.0)
+        onset_r = max(onset[i + 1] - start, 0.0)
+        fill_braking(rear, onset_r, a_r)
+        plan_behind(gap, speed, onset, braking, driving, limit, i, 0.0, plan, out)
+        margin = walk(behind, v_f, plan, v_r, rear, onset_r + v_r / a_r)[0]
+        out[MARGIN] = margin
+        if margin < -ROUNDING_M:
+            out[REASON] = REAR
+        elif i > 0:
+            if behind > SQUEEZE_M and margin < (SQUEEZE_M if out[SPARE] >= SQUEEZE_M else TOUCHING_M):
+                out[REASON] = REAR
+            keep = 0.5 * min(SQUEEZE_M, out[SPARE], max(margin, 0.0))
+            plan_behind(gap, speed, onset, braking, driving, limit, i, keep, plan, out)
+
+
+@compiled
+def decide_worlds(
+    gaps: Floats, speeds: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, out: Floats
+) -> None:
+    """Decide for each of ``n`` worlds whether vehicle ``i`` can avoid contact; write the verdicts to ``out``.
+
+    Args:
+        gaps: [n, P] gaps, m.
+        speeds: [n, N] speeds, m/s.
+        onset: [n, N] times from which on the vehicles may act, s.
+        braking: [n, N] braking capacities, m/s2.
+        driving: [n, N] driving capacities, m/s2.
+        limit: [n, N] speed limits, m/s.
+        i: index of the controlled vehicle.
+        out: [n, RESULT_WIDTH] receives the verdicts, columns REASON to FOLLOW as in ``decide_world``.
+
+    """
+    plan, rear = empty_plan(), empty_plan()
+    for k in range(gaps.shape[0]):
+        decide_world(gaps[k], speeds[k], onset[k], braking[k], driving[k], limit[k], i, plan, rear, out[k])
+
+
+REASONS = ("", "early", "front", "rear")  # name of each reason code; "" if contact is avoidable
+
+
+@dataclass(frozen=True, slots=True)
+class Avoidability:
+    """Verdict on each of ``n`` worlds: can the controlled vehicle avoid all contact?
+
+    The *largest trajectory* is the one that is farthest ahead at all times without contact with the front vehicle.
+    ``margin_m`` is the smallest gap between it and the rear vehicle (for two vehicles with the rear one controlled: the
+    part of the gap that full braking does not need). If contact is unavoidable it is negative: for *front* the missing
+    gap, for *early* the overlap before the vehicle may act.
+
+    ``switch_s`` and ``command_mps2`` are a witness: a command profile without an impact in the physics. Each command
+    applies from its absolute time to the next (infinite: never). They are NaN if contact is unavoidable.
+    """
+
+    # [n] 0: avoidable. 1, early: a pair meets before the controlled vehicle may act. 2, front: even full braking meets
+    # the front vehicle. 3, rear: the rear vehicle meets the largest trajectory
+    reason: Ints
+    margin_m: Floats  # [n] smallest gap to the rear vehicle, m; negative if contact is unavoidable
+    switch_s: Floats  # [n, 3] times from which on the commands of the witness apply, s
+    command_mps2: Floats  # [n, 3] commands of the witness, m/s2
+
+    @property
+    def avoidable(self) -> Bools:
+        """True for worlds in which some command profile avoids all contact, and so every impact, [n]."""
+        return np.asarray(self.reason == 0, np.bool_)
+
+    @property
+    def reason_name(self) -> NDArray[np.str_]:
+        """Name of the reason in each world, [n]: "" if contact is avoidable, else "early", "front" or "rear"."""
+        return np.array(REASONS)[self.reason]
+
+
+def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str] | None = None) -> Avoidability:
+    """Decide in every world whether one vehicle can avoid all contact from now on.
+
+    Where it cannot, every command profile leads to contact, but not always to an impact: see
+    ``LowerBound.impact_proven``. Covers three vehicles with the middle one controlled, or two with either. The others
+    brake with their whole capacity from their latencies on. An overlap of the deciding trajectories of up to 1e-12 m
+    counts as gap 0, so as avoided.
+
+    Args:
+        worlds: the worlds now, [n].
+        vehicle: index of the controlled vehicle, from 0.
+        scripts: name of each other vehicle's script by index, as in ``Scenario.roles``; only checked to be full_brake.
+
+    Raises ``InvalidInput`` for another line, a script other than full_brake, a front vehicle that may brake only after
+    the controlled one acts, a vehicle that moves backward, or an obstacle (``obstacle_gap_m``) that vehicle_1 could
+    reach before any contact.
+
+    """
+    worlds.refuse_build_up("avoidability")
+    check_covered(worlds, vehicle, scripts)
+    v = worlds.vehicles
+    onset = np.maximum(v.latency_s - worlds.time_s[:, None], 0.0)
+    out = np.empty((worlds.n, RESULT_WIDTH))
+    decide_worlds(
+        worlds.gaps_m, worlds.speeds_mps, onset, v.braking_capacity_mps2, v.driving_capacity_mps2, v.speed_limit_mps,
+        vehicle, out,
+    )  # fmt: skip
+    reason = out[:, REASON].astype(np.int64)
+    start = worlds.time_s + onset[:, vehicle]
+    switch = np.column_stack([worlds.time_s, start + out[:, DRIVE], start + out[:, TOUCH]])
+    braking = -v.braking_capacity_mps2[:, vehicle]
+    command = np.column_stack([v.driving_capacity_mps2[:, vehicle], braking, out[:, FOLLOW]])
+    switch[reason > 0] = np.nan
+    command[reason > 0] = np.nan
+    return Avoidability(reason, out[:, MARGIN].copy(), switch, command)
+
+
+def check_covered(worlds: Worlds, vehicle: int, scripts: Mapping[int, str] | None) -> None:
+    """Raise ``InvalidInput`` for worlds that ``avoidability`` does not cover. Brake build-up is not checked.
+
+    Args:
+        worlds: the worlds, [n].
+        vehicle: index of the controlled vehicle.
+        scripts: name of each other vehicle's script by index; None: all brake fully.
+
+    """
+    # An obstacle that Vehicle 1 does not reach under full braking has no effect: only a push could bring the vehicle
+    # there, and a push is an impact already.
+    check_whole_number("avoidability: vehicle", vehicle, 0, worlds.N - 1)
+    own = np.maximum(worlds.vehicles.latency_s[:, 0] - worlds.time_s, 0.0)
+    v = worlds.vehicles
+    way = stopping_distances(worlds.speeds_mps[:, 0], own, v.braking_capacity_mps2[:, 0], v.brake_rate_mps3[:, 0])
+    _refuse(
+        ~(way < worlds.obstacle_gap_m),
+        worlds.obstacle_gap_m,
+        "obstacle_gap_m",
+        None,
+        "beyond full braking of vehicle_1",
+    )
+    if vehicle == 0 and np.isfinite(worlds.obstacle_gap_m).any():
+        raise InvalidInput("avoidability: vehicle_1 controlled, with an obstacle ahead (obstacle_gap_m): not decided")
+    if (worlds.N, vehicle) not in ((3, 1), (2, 0), (2, 1)):
+        raise InvalidInput(
+            f"avoidability: vehicle_{vehicle + 1} of {worlds.N} vehicles; it is decided for vehicle_2 of 3 and for"
+            " either vehicle of 2"
+        )
+    for index, script in (scripts or {}).items():
+        if index != vehicle and script != "full_brake":
+            raise InvalidInput(f"avoidability: vehicle_{index + 1} follows {script!r}; must be 'full_brake'")
+    if vehicle == 1:
+        latency = np.maximum(worlds.vehicles.latency_s, worlds.time_s[:, None])
+        _refuse(latency[:, 0] > latency[:, 1], worlds.vehicles.latency_s[:, 0], "latency_s", 0, "not above vehicle_2's")
+    for i in range(worlds.N):
+        _refuse(~(worlds.speeds_mps[:, i] >= 0.0), worlds.speeds_mps[:, i], "speeds_mps", i, ">= 0")
+
+
+def _refuse(bad: Bools, values: Floats, name: str, i: int | None, right: str) -> None:
+    if bad.any():
+        k = int(np.argmax(bad))
+        place = f"{k}" if i is None else f"{k}, {i}"
+        raise InvalidInput(f"avoidability: {name}[{place}] = {values[k]:g}: must be {right}")

@@ -1,0 +1,300 @@
+"""Least harm over all first meetings with one neighbour, by branch and bound.
+
+A *meeting* is a first contact of the controlled vehicle with a neighbour: a time and a closing speed. Its harm is the
+squared closing speed and what must follow (``obstacle.after``). A *cell* is a range of times and closing speeds. Cells
+are halved until their bounds are close to the best meeting seen so far. docs/avoidability.md has the proof.
+"""
+
+from __future__ import annotations
+
+import math
+
+from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, LINE, RAMPED_FRONT, follower, leader
+from ethbrake_marl.extensions.proofs.meetings import gentlest
+from ethbrake_marl.extensions.proofs.obstacle import CELL, after, after_at_obstacle
+from ethbrake_marl.extensions.proofs.ramped_meetings import gentlest_ramped_between
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Floats
+
+CELLS = 600  # size of the heap, which limits the number of divisions
+
+# Columns of a cell on the heap: bound (m2/s2); range of times (s); range of closing speeds (m/s); for meetings with the
+# rear vehicle also how much further than by full braking it has come (m).
+HARM, EARLY, LATE, SOFT, HARD, NEAR, FAR, HEAP_WIDTH = range(8)
+
+_SPLITS = 64  # largest number of first cells, which decisions divide
+
+_PART_S = 0.05  # length of a first cell with brake build-up
+
+_TRIED = 8  # number of meetings evaluated before the search, for a first best value
+
+
+@compiled(apart=True)
+def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
+    """Return the least closing speed of first contacts between the times ``early`` and ``late``, m/s.
+
+    It falls with time, except if the leader (front vehicle) brakes harder than the controlled vehicle: it may then rise
+    by the difference.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+
+    """
+    if kind >= RAMPED_FRONT:
+        return gentlest_ramped_between(kind, at, early, late)
+    least = gentlest(kind, at, late)[0]
+    if kind == FRONT_FIRST and at[LINE.A_L] > at[LINE.A_F] and early * at[LINE.A_L] < at[LINE.V_L]:
+        least -= (at[LINE.A_L] - at[LINE.A_F]) * (late - early)
+    return max(least, 0.0)
+
+
+@compiled
+def decision_around(at: Floats, early: float, late: float) -> tuple[float, float]:
+    """Return start and end (s) of the decision step that holds both ``early`` and ``late``.
+
+    Returns ``late`` twice if there are no decision steps, or if the times lie in more than one step. ``at`` is one
+    world, an array with the columns of ``line.LINE``.
+    """
+    step = at[LINE.TIME_STEP]
+    if step <= 0.0:
+        return late, late
+    begin = math.floor(0.5 * (early + late) / step) * step
+    if early < begin - 1e-9 or late > begin + step + 1e-9:
+        return late, late
+    return begin, begin + step
+
+
+@compiled(apart=True)
+def lacking(kind: int, at: Floats, early: float, late: float, softest: float, hard: float, begin: float) -> float:
+    """Return a lower bound (m/s2) on how far the command during a first contact is from the best command after it.
+
+    If the front vehicle is met first, the vehicle brakes before a gentle contact, and drives after it to soften the
+    impact from behind. If the rear vehicle is met first, it drives before and brakes after. The command is the same in
+    the whole decision step, so it cannot do both.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        softest: least closing speed of the contact, m/s.
+        hard: largest closing speed of the contact, m/s.
+        begin: start of the decision step, s.
+
+    """
+    whole = at[LINE.U_F] + at[LINE.A_F]
+    turn = gentlest(kind, at, early)[1]
+    if early <= begin:
+        return 0.0
+    if kind == FRONT_FIRST:
+        if leader(at, early)[0] + hard >= at[LINE.LIMIT_F]:
+            return 0.0
+    elif follower(at, late)[0] <= hard:
+        return 0.0
+    softer = max(hard - softest, 0.0) / (early - begin)
+    if turn >= begin:
+        share = (turn - begin) / (early - begin)
+        return float(max(whole - 2.0 * softer - whole * share * share, 0.0))
+    steep = (late - begin) / (begin - turn)
+    return float(max(whole - softer * (1.0 + steep) / (1.0 + 0.5 * steep), 0.0))
+
+
+@compiled(apart=True)
+def harm_of(
+    kind: int, at: Floats, early: float, late: float, soft: float, hard: float, floor: float, plan: Floats,
+    other: Floats,
+) -> float:  # fmt: skip
+    """Return a lower bound on the harm of the first contacts in a range of times and closing speeds, m2/s2.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        soft: least closing speed of the contact, m/s.
+        hard: largest closing speed of the contact, m/s.
+        floor: known lower bound on the harm at the other pair, m2/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    begin, end = decision_around(at, early, late)
+    lack = 0.0
+    if end > late:
+        lack = lacking(kind, at, early, late, gentlest_between(kind, at, early, late), hard, begin)
+    follows = after(kind, at, early, late, hard, max(end, late), lack, plan, other)
+    follows = max(follows, floor)
+    if kind == FRONT_FIRST:
+        follows = after_at_obstacle(at, early, late, soft, hard, follows, plan, other)
+    return soft * soft + follows
+
+
+@compiled
+def room_for(heap: Floats, count: int, harm: float) -> int:
+    """Make room on the heap for an entry with bound ``harm``; return its index. The caller fills in the other columns.
+
+    Index 0 holds the entry with the least bound.
+
+    Args:
+        heap: [CELLS, NEAR] entries ordered as a binary heap; changed in place.
+        count: number of entries so far.
+        harm: bound of the new entry, m2/s2.
+
+    """
+    at = count
+    while at > 0 and heap[(at - 1) // 2, HARM] > harm:
+        for c in range(heap.shape[1]):  # a copy of the whole row would take numba 3 s longer to compile
+            heap[at, c] = heap[(at - 1) // 2, c]
+        at = (at - 1) // 2
+    heap[at, HARM] = harm
+    return at
+
+
+@compiled(apart=True)
+def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: float, hard: float) -> int:
+    """Add a range of times and closing speeds to the heap; return the new number of entries.
+
+    Args:
+        heap: [CELLS, NEAR] entries ordered as a binary heap; changed in place.
+        count: number of entries so far.
+        harm: lower bound on the harm of first contacts in the range, m2/s2.
+        early: earliest time, s.
+        late: latest time, s.
+        soft: least closing speed, m/s.
+        hard: largest closing speed, m/s.
+
+    """
+    at = room_for(heap, count, harm)
+    heap[at, EARLY], heap[at, LATE], heap[at, SOFT], heap[at, HARD] = early, late, soft, hard
+    return count + 1
+
+
+@compiled(apart=True)
+def drop_first(heap: Floats, count: int) -> int:
+    """Remove the entry with the least bound, index 0, from the heap; return the new number of entries.
+
+    ``count`` is the number of entries on the heap before.
+    """
+    count -= 1
+    at, below = 0, 1
+    while below < count:
+        if below + 1 < count and heap[below + 1, HARM] < heap[below, HARM]:
+            below += 1
+        if heap[below, HARM] >= heap[count, HARM]:
+            break
+        for c in range(heap.shape[1]):
+            heap[at, c] = heap[below, c]
+        at, below = below, 2 * below + 1
+    for c in range(heap.shape[1]):
+        heap[at, c] = heap[count, c]
+    return count
+
+
+@compiled(apart=True)
+def divide(
+    kind: int, at: Floats, floor: float, count: int, plan: Floats, other: Floats, heap: Floats
+) -> tuple[int, float]:
+    """Replace the first entry of the heap, a range of times and closing speeds of first contacts, by its halves.
+
+    Returns the new number of entries, and a harm (m2/s2) that some contact in the range does not exceed.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        floor: known lower bound on the harm at the other pair, m2/s2.
+        count: number of entries on the heap.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: working memory of the search, [CELLS, NEAR].
+
+    """
+    harm, early, late, soft, hard = (heap[0, HARM], heap[0, EARLY], heap[0, LATE], heap[0, SOFT], heap[0, HARD])
+    count = drop_first(heap, count)
+    middle = 0.5 * (early + late)
+    if (late - early) * (at[LINE.U_F] + at[LINE.A_F] + at[LINE.A_L]) > hard - soft and early < middle < late:
+        closing = max(soft, gentlest(kind, at, middle)[0])
+        met = harm_of(kind, at, middle, middle, closing, closing, floor, plan, other)
+        later = max(soft, gentlest_between(kind, at, middle, late)) if kind >= RAMPED_FRONT else soft
+        if later < hard:
+            least = harm_of(kind, at, middle, late, later, hard, floor, plan, other)
+            count = put(heap, count, max(least, harm), middle, late, later, hard)
+        soft, late = max(soft, gentlest_between(kind, at, early, middle)), middle
+    else:
+        middle = 0.5 * (soft + hard)
+        met = harm_of(kind, at, late, late, middle, middle, floor, plan, other)
+        least = harm_of(kind, at, early, late, middle, hard, floor, plan, other)
+        count = put(heap, count, max(least, harm), early, late, middle, hard)
+        hard = middle
+    if soft < hard:
+        least = harm_of(kind, at, early, late, soft, hard, floor, plan, other)
+        count = put(heap, count, max(least, harm), early, late, soft, hard)
+    return count, met
+
+
+@compiled(apart=True)
+def least_harm(
+    kind: int, at: Floats, first: float, last: float, floor: float, best: float, enough: float, plan: Floats,
+    other: Floats, heap: Floats,
+) -> float:  # fmt: skip
+    """Return a lower bound on the harm of all first contacts between two times (m2/s2), or ``best`` if none does less.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        first: earliest time of the contact, s after the controlled vehicle may act.
+        last: latest time of the contact, s.
+        floor: known lower bound on the harm at the other pair, m2/s2.
+        best: result if no contact does less harm, m2/s2.
+        enough: if some contact does no more harm than this (m2/s2), 0 is returned, because a bound of ``enough`` is
+            proven elsewhere.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: working memory of the search, [CELLS, NEAR].
+
+    """
+    for k in range(_TRIED):
+        time = first + (last - first) * k / (_TRIED - 1)
+        closing = gentlest(kind, at, time)[0]
+        best = min(best, harm_of(kind, at, time, time, closing, closing, floor, plan, other))
+    # put the meetings between both times, with closing speeds up to ``hard``, on the heap: one cell for each step
+    hard = math.sqrt(best)
+    count, begin = 0, first
+    while begin < last:
+        until = next_split(kind, at, begin, last) if count < _SPLITS else last
+        soft = gentlest_between(kind, at, begin, until)
+        if soft < hard:
+            harm = harm_of(kind, at, begin, until, soft, hard, floor, plan, other)
+            count = put(heap, count, harm, begin, until, soft, hard)
+        begin = until
+    for _ in range(heap.shape[0] - _SPLITS - 2):
+        if best <= enough or count == 0 or heap[0, HARM] >= best - CELL * (1.0 + best):
+            break
+        count, met = divide(kind, at, floor, count, plan, other, heap)
+        best = min(best, met)
+    if best <= enough:
+        return 0.0
+    return min(best, heap[0, HARM]) if count > 0 else best
+
+
+@compiled
+def next_split(kind: int, at: Floats, time: float, last: float) -> float:
+    """Return the next time (s) at which a decision is due or the front vehicle comes to rest, at most ``last``.
+
+    With brake build-up it is at most ``_PART_S`` later than ``time``. ``kind`` is the kind of contact (``FRONT_FIRST``,
+    ...), ``at`` one world, an array with the columns of ``line.LINE``.
+    """
+    until = last if kind < RAMPED_FRONT else min(last, time + _PART_S)
+    if at[LINE.TIME_STEP] > 0.0:
+        until = min(until, (math.floor(time / at[LINE.TIME_STEP] + 1e-6) + 1.0) * at[LINE.TIME_STEP])
+    stand = at[LINE.V_L] / at[LINE.A_L]
+    if kind == FRONT_FIRST and time < stand:
+        until = min(until, stand)
+    return until

@@ -1,0 +1,350 @@
+"""Harm at the other pair that must follow a first meeting, whatever the controlled vehicle does then.
+
+A first meeting at a given time with closing speed ``closing`` leaves an exactly known state. From then on, no command
+beats the extreme one for the path of the two vehicles' centre of mass, and the controlled vehicle is faster (slower)
+than the centre only until it returns to its partner; ``flights.largest_lead`` bounds by how much. docs/avoidability.md
+has the proofs.
+
+The meetings of a cell lie between ``early`` and ``late``; the state is taken at ``early``. From ``late`` to ``end`` the
+command of the earlier decision is still in force; it falls short of the extreme command by at least ``lack`` (m/s2).
+"""
+
+from __future__ import annotations
+
+import math
+
+from ethbrake_marl.extensions.proofs.flights import largest_lead, widest_flight
+from ethbrake_marl.extensions.proofs.line import LINE, follower, leader
+from ethbrake_marl.extensions.proofs.plans import fill_braking, fill_drive_then_brake, fill_plan, fill_window, walk
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Floats
+
+STRUCK_M = 1e-6  # below this distance a leader counts as in contact with the obstacle
+
+HELD_M = 1e-6  # allowance for rounding in the gap to the leader
+
+LEADS = (0.02, 0.05, 0.1, 0.2, 0.4)  # s before the latest meeting; the time is divided there to bound both parts
+
+
+@compiled
+def least_of_line(
+    start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, since: float,
+    until: float,
+) -> float:  # fmt: skip
+    """Return the least value of a piecewise linear function of time from ``since`` to ``until``.
+
+    The function is ``start + slope t + bend (t - turn)+ + other_bend (t - other_turn)+``, where ()+ is the positive
+    part.
+    """
+    least = math.inf
+    for time in (since, until, min(max(turn, since), until), min(max(other_turn, since), until)):
+        value = start + slope * time + bend * max(time - turn, 0.0) + other_bend * max(time - other_turn, 0.0)
+        least = min(least, value)
+    return least
+
+
+@compiled(apart=True)
+def least_closing(
+    start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, share: float,
+    press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float, until: float,
+) -> float:  # fmt: skip
+    """Return the least closing speed (m/s) at which the controlled vehicle meets its second neighbour, after it met the
+    first.
+
+    The *common speed* is the speed of the centre of mass of the two vehicles that met first. The result is the closing
+    speed that the second neighbour has to this centre, less the largest lead of the controlled vehicle over it
+    (``largest_lead``). The *window* is the time in which an earlier command still acts, which costs the speed ``lost``.
+    Times count from the first contact, in s.
+
+    Args:
+        start: closing speed of the second neighbour to the centre of mass, at the first contact, m/s.
+        slope: its rate of change, m/s2.
+        turn: first time at which the rate changes, s.
+        bend: change of the rate at ``turn``, m/s2.
+        other_turn: second time at which the rate changes, s.
+        other_bend: change of the rate at ``other_turn``, m/s2.
+        share: share of the partner of the first contact in both masses, 0 to 1.
+        press: acceleration with which these two close under the best command, m/s2.
+        reach: part of ``press`` that a command can hold back, m/s2.
+        bounce: coefficient of restitution.
+        opening: speed with which the two separate after the first contact, m/s.
+        lost: speed that is lost in the window, m/s.
+        late: start of the window, s.
+        end: end of the window, s.
+        until: latest time of the second meeting, s.
+
+    """
+    best = least_of_line(start, slope, turn, bend, other_turn, other_bend, 0.0, until)
+    best -= largest_lead(share, press, reach, bounce, opening, lost, late, end, 0.0, until)
+    for k in range(len(LEADS)):
+        since = until - LEADS[k]
+        if since <= 0.0:
+            break
+        near = least_of_line(start, slope, turn, bend, other_turn, other_bend, since, until)
+        near -= largest_lead(share, press, reach, bounce, opening, lost, late, end, since, until)
+        far = least_of_line(start, slope, turn, bend, other_turn, other_bend, 0.0, since)
+        far -= largest_lead(share, press, reach, bounce, opening, 0.0, late, late, 0.0, since)
+        best = max(best, min(near, far))
+    return max(best, 0.0)
+
+
+@compiled(apart=True)
+def pushed_by_leader(
+    at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
+) -> float:
+    """Return the least closing speed (m/s) at the rear pair after a first contact with the front vehicle (leader).
+
+    The bound follows from the centre of mass of leader and controlled vehicle. Returns 0 if nothing is proven. If the
+    leader stands, a later first contact differs only in its time, so ``late``, ``end`` and ``lack`` are not used.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        end: time until which the command of the earlier decision stays in force, s.
+        lack: least amount by which that command falls short of the best one, m/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    share, rest, press = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.U_F] + at[LINE.A_L]
+    v_l, way_l = leader(at, early)
+    v_r, way_r = follower(at, early)
+    bounce = at[LINE.RESTITUTION]
+    speed, push = v_l + rest * closing, rest * at[LINE.U_F] - share * at[LINE.A_L]
+    stand = (speed + rest * bounce * closing) / at[LINE.A_L]
+    late, end, lost = late - early, end - early, lack * (end - late)
+    if v_l <= 0.0:
+        late, end, lack, lost = 0.0, 0.0, 0.0, 0.0
+    fill_window(plan, push, late, end, -rest * lack, stand, share * at[LINE.A_L])
+    onset = max(at[LINE.ONSET_R] - early, 0.0)
+    fill_braking(other, onset, at[LINE.A_R])
+    behind = max(at[LINE.GAP_L] + at[LINE.GAP_R] + way_l - way_r, 0.0)
+    until = walk(behind, speed, plan, v_r, other, onset + v_r / at[LINE.A_R])[1]
+    if until == math.inf:
+        return 0.0
+    reach = (
+        at[LINE.U_F] + at[LINE.A_F] if until * at[LINE.A_L] <= v_l else math.inf
+    )  # finite if the leader still moves until then, however soft the impact
+    if v_l <= 0.0:
+        slowest = max(v_r - at[LINE.A_R] * max(until - onset, 0.0), 0.0)
+        least = least_of_line(slowest - speed, -push, 0.0, 0.0, stand, -share * at[LINE.A_L], 0.0, until)
+        return max(least - largest_lead(share, press, reach, bounce, bounce * closing, 0.0, 0.0, 0.0, 0.0, until), 0.0)
+    return least_closing(
+        v_r - speed, -push, onset, -at[LINE.A_R], stand, -share * at[LINE.A_L],
+        share, press, reach, bounce, bounce * closing, lost, late, end, until,
+    )  # fmt: skip
+
+
+@compiled(apart=True)
+def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: Floats, other: Floats) -> float:
+    """Return the least closing speed (m/s) at the rear pair after a first contact with a leader that brakes harder.
+
+    The controlled vehicle then stays near the leader (front vehicle). Returns 0 if nothing is proven.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    share, rest, bounce = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.RESTITUTION]
+    v_l, way_l = leader(at, early)
+    v_r, way_r = follower(at, early)
+    back = max((share * bounce - rest) * closing - leader(at, late)[0], 0.0)
+    thrown = share * (1.0 + bounce) > 1.0
+    drive = max(at[LINE.U_F], at[LINE.A_F]) if thrown else at[LINE.U_F]
+    press, push, speed = drive + at[LINE.A_L], rest * drive - share * at[LINE.A_L], v_l + rest * closing
+    behind = max(at[LINE.GAP_L] + at[LINE.GAP_R] + way_l - way_r, 0.0)
+    onset = max(at[LINE.ONSET_R] - early, 0.0)
+    until, most, start = onset + v_r / at[LINE.A_R], 0.0, speed
+    fill_braking(other, onset, at[LINE.A_R])
+    for _ in range(2):
+        most = widest_flight(share, at[LINE.A_L] - at[LINE.A_F], press, drive, bounce, closing, back, until)
+        if most == math.inf:
+            return 0.0
+        start = max(speed, rest * most)
+        turn = (start - rest * most) / -push if push < 0.0 else math.inf
+        fill_plan(plan, turn, push, turn, 0.0, turn, 0.0, 0.0)
+        until = walk(behind, start, plan, v_r, other, math.inf)[1]
+        if until == math.inf:
+            return 0.0
+    final = max(start + push * until, rest * most)
+    slowest = max(v_r - at[LINE.A_R] * max(until - onset, 0.0), 0.0)
+    if v_l <= 0.0:
+        return float(max(slowest - max(start, final) - share * most, 0.0))
+    room = 0.5 * most * most / (drive if thrown else press) + HELD_M if press > 0.0 else math.inf
+    since = 0.0
+    if behind > room:
+        fill_braking(plan, 0.0, at[LINE.A_L])
+        since = min(walk(behind - room, v_l, plan, v_r, other, math.inf)[1], until)
+    fast = max(v_r - at[LINE.A_R] * max(since - onset, 0.0), 0.0) - max(start + push * since, rest * most)
+    return float(max(min(fast, slowest - final) - share * most, 0.0))
+
+
+@compiled(apart=True)
+def after_front(
+    at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
+) -> float:
+    """Return the least squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
+
+    It is the largest of several bounds. Those that rest on the centre of mass of both vehicles do not hold if an
+    obstacle may throw them back, and are then left out.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        end: time until which the command of the earlier decision stays in force, s.
+        lack: least amount by which that command falls short of the best one, m/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    share, rest = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE]
+    v_l, way_l = leader(at, early)
+    v_r, way_r = follower(at, early)
+    speed = v_l + rest * closing
+    if share * (1.0 + at[LINE.RESTITUTION]) <= 1.0:
+        speed -= share * at[LINE.RESTITUTION] * closing
+    onset = max(at[LINE.ONSET_R] - early, 0.0)
+    fill_drive_then_brake(plan, speed, at[LINE.U_F], at[LINE.LIMIT_F], math.inf, at[LINE.A_F])
+    fill_braking(other, onset, at[LINE.A_R])
+    behind = max(at[LINE.GAP_L] + at[LINE.GAP_R] + way_l - way_r, 0.0)
+    squared = walk(behind, speed, plan, v_r, other, onset + v_r / at[LINE.A_R])[2]
+    if at[LINE.OBSTACLE] < math.inf:
+        return squared
+    held = held_by_leader(at, early, late, closing, plan, other)
+    squared = max(squared, held * held)
+    if rest < at[LINE.RESTITUTION] * share:
+        return squared
+    pushed = pushed_by_leader(at, early, late, closing, end, lack, plan, other)
+    return max(squared, pushed * pushed)
+
+
+@compiled
+def obstacle_harm(at: Floats, late: float, closing: float) -> float:
+    """Return the least squared speed (m2/s2) at which the front vehicle hits the obstacle after the controlled vehicle
+    pushed it.
+
+    Only its own brakes slow it. Returns 0 if it already stands at the obstacle, because all three are then one cluster.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        late: latest time of the first contact, s.
+        closing: least closing speed of the push, m/s.
+
+    """
+    if not STRUCK_M < at[LINE.OBSTACLE] - at[LINE.V_L] * at[LINE.V_L] / (2.0 * at[LINE.A_L]) < math.inf:
+        return 0.0
+    push = (1.0 - at[LINE.FRONT_SHARE]) * (1.0 + at[LINE.RESTITUTION]) * closing
+    lacks = 2.0 * at[LINE.A_L] * at[LINE.OBSTACLE] - at[LINE.V_L] * at[LINE.V_L]
+    v = leader(at, late)[0] + push
+    squared = max((2.0 * v - push) * push - lacks, 0.0)
+    if 0.0 < at[LINE.UNTIL] <= late + (v - math.sqrt(squared)) / at[LINE.A_L]:
+        return 0.0
+    return float(squared)
+
+
+@compiled(apart=True)
+def braking_after(
+    gap: float, least_gap: float, v_l: float, a_l: float, v_f: float, a_f: float, plan: Floats, other: Floats
+) -> float:
+    """Return the least squared closing speed (m2/s2) with which a vehicle meets the front vehicle if it brakes with at
+    most ``a_f``.
+
+    Returns 0 if no contact is certain.
+
+    Args:
+        gap: largest possible gap, m.
+        least_gap: least possible gap, m; it matters if the front vehicle brakes harder.
+        v_l: speed of the front vehicle, m/s.
+        a_l: its braking capacity, m/s2.
+        v_f: speed of the braking vehicle, m/s.
+        a_f: its braking capacity, m/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    fill_braking(plan, 0.0, a_l)
+    fill_braking(other, 0.0, a_f)
+    squared = walk(gap, v_l, plan, v_f, other, v_f / a_f)[2]
+    if a_f < a_l:
+        w = max(v_f - v_l, 0.0)
+        squared = min(squared, w * w + 2.0 * (a_l - a_f) * max(least_gap, 0.0))
+    return squared
+
+
+@compiled(apart=True)
+def pushed_by_rear(
+    at: Floats, early: float, late: float, closing: float, end: float, lack: float, gap: float, plan: Floats,
+    other: Floats,
+) -> float:  # fmt: skip
+    """Return the least closing speed (m/s) at the front pair after the rear vehicle hit the controlled one.
+
+    The bound follows from the centre of mass of these two vehicles. The controlled vehicle must have brakes at least as
+    strong as the rear one.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        end: time until which the command of the earlier decision stays in force, s.
+        lack: least amount by which that command falls short of the best one, m/s2.
+        gap: gap to the front vehicle at ``early``, m.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
+    v_l = leader(at, early)[0]
+    bounce = at[LINE.RESTITUTION]
+    speed = max(follower(at, early)[0] - rest * closing, 0.0)
+    onset = max(at[LINE.ONSET_R] - early, 0.0)
+    late, end, lost = late - early, end - early, lack * (end - late)
+    fill_braking(plan, 0.0, at[LINE.A_L])
+    fill_window(other, -rest * at[LINE.A_F], late, end, rest * lack, onset, -share * at[LINE.A_R])
+    until = walk(gap, v_l, plan, speed, other, math.inf)[1]
+    if until == math.inf:
+        return 0.0
+    press, reach = at[LINE.A_F] - at[LINE.A_R], at[LINE.U_F] + at[LINE.A_F]
+    if onset > 0.0:
+        press, reach = at[LINE.A_F], math.inf
+    return least_closing(
+        speed - v_l, at[LINE.A_L] - rest * at[LINE.A_F], onset, -share * at[LINE.A_R], v_l / at[LINE.A_L],
+        -at[LINE.A_L], share, press, reach, bounce, bounce * closing, lost, late, end, until,
+    )  # fmt: skip
+
+
+@compiled(apart=True)
+def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: Floats, other: Floats) -> float:
+    """Return the least closing speed (m/s) at the front pair after the rear vehicle hit the controlled one.
+
+    The bound follows because the controlled vehicle stays ahead of the rear one. The controlled vehicle must have
+    brakes at least as strong as the rear one. Returns 0 if the closing speed may rise.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        closing: largest closing speed of the contact, m/s.
+        gap: gap to the front vehicle at ``early``, m.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    share, v_l = at[LINE.REAR_SHARE], leader(at, early)[0]
+    pooled = (1.0 - share) * at[LINE.A_F] + share * at[LINE.A_R]
+    mean = 0.5 * (at[LINE.A_F] + pooled)
+    speed = follower(at, early)[0] - (1.0 - share) * closing
+    if not (mean >= at[LINE.A_L] and speed > 0.0):
+        return 0.0
+    fill_braking(plan, 0.0, at[LINE.A_L])
+    fill_braking(other, 0.0, pooled)
+    until = walk(gap, v_l, plan, speed, other, speed / pooled)[1]
+    return max(speed - mean * until - max(v_l - at[LINE.A_L] * until, 0.0), 0.0) if until < math.inf else 0.0

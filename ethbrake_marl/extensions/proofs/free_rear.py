@@ -1,0 +1,282 @@
+"""Least harm over all first meetings with a rear vehicle that may act freely.
+
+The rear vehicle is never behind, nor slower than, its own full braking, but it may arrive earlier. So a meeting is
+described by its time, how much *further* the rear vehicle has come than by full braking, and the closing speed. Cells
+of these are halved until their bounds are close to the best meeting tried. docs/avoidability.md, "Teams", has the
+proof.
+"""
+
+from __future__ import annotations
+
+import math
+
+from ethbrake_marl.extensions.proofs.branch_and_bound import (
+    EARLY,
+    FAR,
+    HARD,
+    HARM,
+    LATE,
+    NEAR,
+    SOFT,
+    drop_first,
+    room_for,
+)
+from ethbrake_marl.extensions.proofs.followers import braking_after, pushed_by_rear
+from ethbrake_marl.extensions.proofs.line import LINE, follower, leader
+from ethbrake_marl.extensions.proofs.meetings import braked_then_driven, braking_to_rear
+from ethbrake_marl.extensions.proofs.obstacle import CELL
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.motion import solo_motion
+from ethbrake_marl.physics.state import Floats
+
+# Columns of a search: SINCE and POWER are arguments of ``gained``; FLOOR is the front pair's own bound; BEST is the
+# least harm of a meeting so far.
+SINCE, POWER, FLOOR, BEST, SEARCH = range(5)
+
+SEARCHED = 400  # largest number of divisions
+
+_SHORT_S = 1e-3  # least time to divide by
+
+
+@compiled
+def gained(near: float, time: float, since: float, power: float) -> float:
+    """Return by how much, at least, the rear vehicle is faster at ``time`` than by its own full braking, m/s.
+
+    Args:
+        near: by how much it has come further than by full braking, m.
+        time: time of the comparison, s.
+        since: time from which on it may hold back its brakes, s.
+        power: largest acceleration by which it holds them back, m/s2; infinite if other vehicles push it.
+
+    """
+    if near <= 0.0 or time <= since:
+        return 0.0
+    span = time - since
+    if power == math.inf:
+        return near / span
+    return float(power * (span - math.sqrt(max(span * span - 2.0 * near / power, 0.0))))
+
+
+@compiled
+def behind_full_braking(at: Floats, early: float, late: float) -> float:
+    """Return the least gap (m) to the rear vehicle if the controlled vehicle brakes until ``early``, the rear one until
+    ``late``.
+
+    ``at`` is one world, an array with the columns of ``line.LINE``; the times are in s.
+    """
+    return float(
+        at[LINE.GAP_R] + solo_motion(at[LINE.V_F], -at[LINE.A_F], 0.0, math.inf, early)[1] - follower(at, late)[1]
+    )
+
+
+@compiled
+def soft_behind(at: Floats, early: float, late: float, near: float, far: float, since: float, power: float) -> float:
+    """Return the least closing speed (m/s) of the first contacts with the rear vehicle in a range of times and
+    distances (``near`` to ``far``).
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        near: least distance by which the rear vehicle has come further than by full braking, m.
+        far: largest such distance, m.
+        since: time from which on the rear vehicle may hold back its brakes, s.
+        power: largest acceleration by which it holds them back, m/s2.
+
+    """
+    faster = gained(near, late, since, power)
+    # the fastest way of the controlled vehicle to that place is to brake, then to drive
+    brake = braking_to_rear(at, late, far + faster * (late - early))
+    closing = follower(at, late)[0] - braked_then_driven(at, brake, late)[1]
+    return max(closing + faster, 0.0)
+
+
+@compiled(apart=True)
+def after_behind(
+    at: Floats, early: float, late: float, near: float, far: float, hard: float, faster: float, moved: Floats,
+    plan: Floats, other: Floats,
+) -> float:  # fmt: skip
+    """Return the least squared closing speed (m2/s2) at the front pair after a first contact with the rear vehicle.
+
+    The bound starts from a state at ``early`` that is at every later time no further and no faster than after any of
+    these contacts.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        near: least distance by which the rear vehicle has come further than by full braking, m.
+        far: largest such distance, m.
+        hard: largest closing speed of the contact, m/s.
+        faster: least speed by which the rear vehicle is faster than by full braking, m/s.
+        moved: working memory for a second world, [LINE.WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    further = near - faster * (late - early)
+    v_l, way_l = leader(at, early)
+    v_r, way_r = follower(at, early)
+    gap = max(at[LINE.GAP_L] + at[LINE.GAP_R] + way_l - way_r - further, 0.0)
+    passed = max(follower(at, late)[1] - way_r - (leader(at, late)[1] - way_l), 0.0)
+    for column in range(LINE.WIDTH):
+        moved[column] = at[column]
+    moved[LINE.V_L], moved[LINE.GAP_L], moved[LINE.GAP_R] = v_l, gap, 0.0
+    moved[LINE.V_R], moved[LINE.ONSET_R] = v_r + faster, max(at[LINE.ONSET_R] - early, 0.0)
+    share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
+    speed = moved[LINE.V_R] - rest * hard
+    if share * (1.0 + at[LINE.RESTITUTION]) <= 1.0:
+        speed += share * at[LINE.RESTITUTION] * hard
+    speed = max(speed - max(at[LINE.A_R] - at[LINE.A_F], 0.0) * (late - early), 0.0)
+    least = gap - passed - (far - further)
+    squared = braking_after(gap, least, v_l, at[LINE.A_L], speed, at[LINE.A_F], plan, other)
+    if at[LINE.A_F] < at[LINE.A_R]:
+        return squared
+    pushed = pushed_by_rear(moved, 0.0, late - early, hard, late - early, 0.0, gap, plan, other)
+    return max(squared, pushed * pushed)
+
+
+@compiled(apart=True)
+def put_behind(
+    at: Floats, early: float, late: float, near: float, far: float, soft: float, hard: float, search: Floats,
+    count: int, moved: Floats, plan: Floats, other: Floats, heap: Floats,
+) -> int:  # fmt: skip
+    """Add a range of first contacts with the rear vehicle to the heap if it may do less harm than the best one known.
+
+    Returns the new number of entries on the heap.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        near: least distance by which the rear vehicle has come further than by full braking, m.
+        far: largest such distance, m.
+        soft: least closing speed, m/s.
+        hard: largest closing speed, m/s.
+        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
+            m2/s2) and ``BEST`` (least harm known so far, m2/s2).
+        count: number of entries on the heap.
+        moved: working memory for a second world, [LINE.WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: [SEARCHED + 4, HEAP_WIDTH] entries, the least bound first; changed in place.
+
+    """
+    since, power, floor = search[SINCE], search[POWER], search[FLOOR]
+    room = at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, late)[1] - follower(at, early)[1]
+    span = max(late - since, 0.0)
+    if near > room or behind_full_braking(at, early, late) > far or 2.0 * near > power * span * span:
+        return count
+    soft = max(soft, soft_behind(at, early, late, near, far, since, power))
+    if soft >= hard:
+        return count
+    follows = after_behind(at, early, late, near, far, hard, gained(near, late, since, power), moved, plan, other)
+    harm = soft * soft + max(follows, floor)
+    if harm >= search[BEST]:
+        return count
+    k = room_for(heap, count, harm)
+    heap[k, EARLY], heap[k, LATE], heap[k, SOFT], heap[k, HARD] = early, late, soft, hard
+    heap[k, NEAR], heap[k, FAR] = near, far
+    return count + 1
+
+
+@compiled(apart=True)
+def try_behind(
+    at: Floats, time: float, near: float, far: float, search: Floats, moved: Floats, plan: Floats, other: Floats
+) -> None:
+    """Lower ``search[BEST]`` to the harm of the gentlest first contact with the rear vehicle at ``time``, if that is
+    less.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        time: time of the contact, s.
+        near: distance by which the rear vehicle has come further than by full braking, m; raised if too small.
+        far: largest such distance, m.
+        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
+            m2/s2) and ``BEST`` (least harm known so far, m2/s2); only ``BEST`` changes.
+        moved: working memory for a second world, [LINE.WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    near = max(near, behind_full_braking(at, time, time))
+    if near > far or near > at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, time)[1] - follower(at, time)[1]:
+        return
+    since, power = search[SINCE], search[POWER]
+    soft = soft_behind(at, time, time, near, near, since, power)
+    follows = after_behind(at, time, time, near, near, soft, gained(near, time, since, power), moved, plan, other)
+    search[BEST] = min(search[BEST], soft * soft + max(follows, search[FLOOR]))
+
+
+@compiled(apart=True)
+def divide_behind(
+    at: Floats, search: Floats, count: int, moved: Floats, plan: Floats, other: Floats, heap: Floats
+) -> int:
+    """Replace the first entry of the heap by its halves; return the new number of entries.
+
+    An entry is a range of times, distances and closing speeds of first contacts with the rear vehicle.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
+            m2/s2) and ``BEST`` (least harm known so far, m2/s2); only ``BEST`` changes.
+        count: number of entries on the heap.
+        moved: working memory for a second world, [LINE.WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: [SEARCHED + 4, HEAP_WIDTH] entries, the least bound first; changed in place.
+
+    """
+    early, late, near, far = heap[0, EARLY], heap[0, LATE], heap[0, NEAR], heap[0, FAR]
+    soft, hard = heap[0, SOFT], min(heap[0, HARD], math.sqrt(search[BEST]))
+    count = drop_first(heap, count)
+    try_behind(at, early, near, far, search, moved, plan, other)
+    by_time = (late - early) * (at[LINE.U_F] + at[LINE.A_F] + at[LINE.A_R])
+    by_place = (far - near) / max(late - search[SINCE], _SHORT_S)
+    for half in range(2):
+        times, places, speeds = (early, late), (near, far), (soft, hard)
+        if by_time >= max(by_place, hard - soft):
+            middle = 0.5 * (early + late)
+            times = (early, middle) if half == 0 else (middle, late)
+        elif by_place >= hard - soft:
+            middle = 0.5 * (near + far)
+            places = (near, middle) if half == 0 else (middle, far)
+        else:
+            middle = 0.5 * (soft + hard)
+            speeds = (soft, middle) if half == 0 else (middle, hard)
+        count = put_behind(
+            at, times[0], times[1], places[0], places[1], speeds[0], speeds[1], search, count, moved, plan, other, heap
+        )
+    return count
+
+
+@compiled(apart=True)
+def meetings_behind(
+    at: Floats, last: float, search: Floats, moved: Floats, plan: Floats, other: Floats, heap: Floats
+) -> float:
+    """Return a lower bound on the harm of all first contacts with the rear vehicle until ``last`` (s), m2/s2.
+
+    The result is at most ``search[BEST]``, the least harm that is known before.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        last: latest time of the contact, s after the controlled vehicle may act.
+        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
+            m2/s2) and ``BEST`` (least harm known so far, m2/s2); only ``BEST`` changes.
+        moved: working memory for a second world, [LINE.WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: working memory of the search, [SEARCHED + 4, HEAP_WIDTH].
+
+    """
+    since, hard, count = min(search[SINCE], last), math.sqrt(search[BEST]), 0
+    if since > 0.0:
+        count = put_behind(at, 0.0, since, 0.0, 0.0, 0.0, hard, search, count, moved, plan, other, heap)
+    if last > since:
+        far = at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, last)[1] if search[POWER] > 0.0 else 0.0
+        count = put_behind(at, since, last, 0.0, far, 0.0, hard, search, count, moved, plan, other, heap)
+    for _ in range(SEARCHED):
+        if count == 0 or heap[0, HARM] >= search[BEST] - CELL * (1.0 + search[BEST]):
+            break
+        count = divide_behind(at, search, count, moved, plan, other, heap)
+    return float(min(search[BEST], heap[0, HARM]) if count > 0 else search[BEST])

@@ -1,0 +1,166 @@
+"""Least harm of the first three vehicles: Vehicle 1 scripted, Vehicle 2 controlled, the third one arbitrary.
+
+Meetings with the leader are bounded as for one controlled vehicle (``lower_bound.front_first``): a rear vehicle that
+arrives earlier only makes the rest worse. Meetings with the rear vehicle have their own search
+(``free_rear.meetings_behind``). docs/avoidability.md, "Teams", has the proofs.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ethbrake_marl.extensions.proofs.branch_and_bound import CELLS, HEAP_WIDTH, NEAR, gentlest_between
+from ethbrake_marl.extensions.proofs.closing import (
+    FOLLOWER_A,
+    FOLLOWER_ONSET,
+    FOLLOWER_V,
+    LEADER_A,
+    LEADER_FREE,
+    LEADER_ONSET,
+    LEADER_V,
+    PAIR_GAP,
+    PAIR_WIDTH,
+    least_closing_of_pair,
+)
+from ethbrake_marl.extensions.proofs.free_rear import BEST, FLOOR, POWER, SEARCH, SEARCHED, SINCE, meetings_behind
+from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, LARGE, LINE, TOUCH_HARM
+from ethbrake_marl.extensions.proofs.lower_bound import front_first, last_meeting, last_rest
+from ethbrake_marl.extensions.proofs.meetings import meet_front, stays_ahead
+from ethbrake_marl.extensions.proofs.plans import empty_plan
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Floats
+
+
+@compiled(apart=True)
+def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Floats, other: Floats) -> float:
+    """Return the least harm (m2/s2) of a contact of all three vehicles at the same time; infinity if there can be none.
+
+    Front and rear vehicle then close with at least some speed W, which the two pairs share. The front pair's part of W
+    is at least its least closing speed of any first contact.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        first: earliest first contact with the front vehicle, s.
+        last: latest first contact with the front vehicle, s.
+        pair: working memory for a pair, [PAIR_WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    pair[PAIR_GAP], pair[LEADER_ONSET], pair[LEADER_FREE] = at[LINE.GAP_L] + at[LINE.GAP_R], 0.0, 0.0
+    pair[LEADER_V], pair[LEADER_A] = at[LINE.V_L], at[LINE.A_L]
+    pair[FOLLOWER_V], pair[FOLLOWER_ONSET], pair[FOLLOWER_A] = at[LINE.V_R], at[LINE.ONSET_R], at[LINE.A_R]
+    both, met = least_closing_of_pair(pair, math.inf, plan, other)
+    if met == math.inf:
+        return math.inf
+    until = min(met, last)
+    least = gentlest_between(FRONT_FIRST, at, first, until) if until > first else 0.0
+    front = max(least, 0.5 * both)
+    rear = max(both - front, 0.0)
+    return float(front * front + rear * rear)
+
+
+@compiled(apart=True)
+def late_meetings(at: Floats, first: float, stand: float, plan: Floats, other: Floats) -> int:
+    """Return a code: may the rear vehicle first touch the controlled one after the time at which it would stand by
+    braking?
+
+    0: it cannot. 1: it may, and the harm is then no less than if the front vehicle is met first. 2: it may, and nothing
+    is proven.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        first: earliest first contact with the front vehicle, s; infinite: none.
+        stand: time at which the rear vehicle stands by full braking, s.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    if first == math.inf or not stays_ahead(at, first, first, plan, other):
+        return 0
+    _, end, leans = last_meeting(
+        at, first, plan, other
+    )  # latest first meeting with the leader if the rear vehicle brakes fully
+    if end <= stand and not leans:
+        return 0
+    leader_moves = at[LINE.A_F] < at[LINE.A_L] and at[LINE.V_L] > at[LINE.A_L] * stand
+    thrown_back = (
+        1.0 - at[LINE.FRONT_SHARE] < at[LINE.RESTITUTION] * at[LINE.FRONT_SHARE] or at[LINE.OBSTACLE] < math.inf
+    )
+    return 2 if leader_moves or thrown_back else 1
+
+
+@compiled(apart=True)
+def combined_bound_of_team(
+    at: Floats, until: float, front: float, rear: float, since: float, power: float, pair: Floats, moved: Floats,
+    plan: Floats, other: Floats, heap: Floats, heap_behind: Floats,
+) -> float:  # fmt: skip
+    """Return the least harm (m2/s2) of the first three vehicles in a world with unavoidable contact, whoever is met
+    first.
+
+    Returns 0 if the harm may come after ``until``.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        until: horizon, s; harm after it does not count.
+        front: bound on the harm of the front pair alone, m2/s2.
+        rear: bound on the harm of the rear pair alone, m2/s2.
+        since: time from which on the rear vehicle may hold back its brakes, s.
+        power: largest acceleration by which it holds them back, m/s2.
+        pair: working memory for a pair, [PAIR_WIDTH].
+        moved: working memory for a second world, [LINE.WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: working memory for contacts with the front vehicle, [CELLS, NEAR].
+        heap_behind: working memory for contacts with the rear vehicle, [SEARCHED + 4, HEAP_WIDTH].
+
+    """
+    rest, stand = last_rest(at)
+    if not rest < until:
+        return 0.0
+    first = meet_front(at, math.inf, plan, other)
+    late = late_meetings(at, first, stand, plan, other)
+    if late == 2:
+        return 0.0
+    step, least, any_time = at[LINE.TIME_STEP], 0.0, 0.0
+    once = all_at_once(at, first, meet_front(at, 0.0, plan, other), pair, plan, other)
+    search = np.empty(SEARCH)
+    search[SINCE], search[POWER], search[FLOOR] = since, power, front
+    for time_step in (0.0, step):  # a bound for all commands also holds for commands that change at decisions only
+        at[LINE.TIME_STEP] = time_step
+        best = min(front_first(at, rear, LARGE, front + rear, plan, other, heap), once)
+        if time_step <= 0.0:
+            any_time = best
+        elif late == 1:
+            best = min(best, any_time)
+        search[BEST] = best
+        if best > front + rear:
+            best = meetings_behind(at, stand, search, moved, plan, other, heap_behind)
+        least = max(least, best - TOUCH_HARM if best < LARGE else 0.0)
+        if step <= 0.0:
+            break
+    return least
+
+
+@compiled
+def bound_threes(states: Floats, until: Floats, pairs: Floats, since: Floats, power: Floats, out: Floats) -> None:
+    """Compute the combined bound of the first three vehicles for each of ``n`` worlds with unavoidable contact.
+
+    Args:
+        states: [n, LINE.WIDTH] the worlds, one row each, with the columns of ``line.LINE``.
+        until: [n] horizon, s.
+        pairs: [n, 2] bounds of the two pairs alone, m2/s2.
+        since: [n] time from which on the rear vehicle may hold back its brakes, s.
+        power: [n] largest acceleration by which it holds them back, m/s2.
+        out: [n] receives the bounds, m2/s2.
+
+    """
+    plan, other, pair, moved = empty_plan(), empty_plan(), np.empty(PAIR_WIDTH), np.empty(LINE.WIDTH)
+    heap, heap_behind = np.empty((CELLS, NEAR)), np.empty((SEARCHED + 4, HEAP_WIDTH))
+    for k in range(states.shape[0]):
+        out[k] = combined_bound_of_team(
+            states[k], until[k], pairs[k, 0], pairs[k, 1], since[k], power[k], pair, moved, plan, other, heap,
+            heap_behind,
+        )  # fmt: skip

@@ -1,0 +1,462 @@
+"""``lower_bound``: a proven lower bound on the harm of every world, whatever the controlled vehicle does.
+
+A *meeting* is a first contact of the controlled vehicle with a neighbour. In the compiled functions ``at`` is one world
+(columns of ``line.LINE``), and ``plan``, ``other`` and ``heap`` are working memory.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.extensions.proofs.avoidability import avoidability, check_covered, largest_behind, spare_gap
+from ethbrake_marl.extensions.proofs.branch_and_bound import CELLS, NEAR, least_harm
+from ethbrake_marl.extensions.proofs.followers import obstacle_harm
+from ethbrake_marl.extensions.proofs.line import (
+    BOUNDS,
+    COMBINED_BOUND,
+    FRONT_BOUND,
+    FRONT_FIRST,
+    HALVINGS,
+    LARGE,
+    LINE,
+    REAR_BOUND,
+    REAR_FIRST,
+    TOUCH_HARM,
+    TOUCHING_M,
+)
+from ethbrake_marl.extensions.proofs.meetings import (
+    braking_to_rear,
+    gentlest_front,
+    meet_front,
+    meet_rear,
+    stays_ahead,
+    stays_behind,
+)
+from ethbrake_marl.extensions.proofs.obstacle import after, after_at_obstacle, beyond_rear
+from ethbrake_marl.extensions.proofs.plans import empty_plan, fill_braking, fill_drive_then_brake, walk
+from ethbrake_marl.extensions.proofs.ramped_bound import bound_ramped, ramped_states
+from ethbrake_marl.extensions.proofs.ramped_meetings import (
+    LEAST_PART,
+    LowerBound,
+    at_onset_of,
+    check_asked,
+    onset_states,
+    rounding,
+)
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.physics.jit import by_parts, compiled
+from ethbrake_marl.physics.motion import solo_motion
+from ethbrake_marl.physics.state import Bools, Floats, Worlds
+
+_GRAZE_S = 1e-3  # allowance for rounding in the time of a contact without closing speed
+
+_PARTS = 8  # number of parts into which the times of soft meetings are divided
+
+
+@compiled
+def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
+    """Return the least squared closing speed (m2/s2) at the rear pair's first contact, and its latest time (s).
+
+    The controlled vehicle reaches both by full drive.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], math.inf, at[LINE.A_F])
+    fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
+    _, time, squared = walk(
+        at[LINE.GAP_R], at[LINE.V_F], plan, at[LINE.V_R], other, at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
+    )
+    return squared, time
+
+
+@compiled(apart=True)
+def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
+    """Return whether the other neighbour has not arrived before the gentlest first contact at ``time`` (s).
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        time: time of the contact, s after the controlled vehicle may act.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    if kind == FRONT_FIRST:
+        return stays_ahead(at, gentlest_front(at, time)[1], time, plan, other)
+    return stays_behind(at, braking_to_rear(at, time, 0.0), time, plan, other)
+
+
+@compiled(apart=True)
+def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, other: Floats) -> float:
+    """Return the latest time (s) of a first contact with one neighbour at which the other neighbour has not arrived
+    yet.
+
+    It is found by halving the time, because a later contact leaves less room. A later contact with the front vehicle
+    needs a shorter drive before it, so the rear vehicle comes nearer. A later contact with the rear vehicle needs
+    shorter braking, so the front vehicle comes nearer.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        first: time of a first contact at which there is room, s.
+        last: latest time of a first contact with this neighbour, s; the result is at most this.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    if is_first(kind, at, last, plan, other):
+        return last
+    for _ in range(HALVINGS):
+        middle = 0.5 * (first + last)
+        if is_first(kind, at, middle, plan, other):
+            first = middle
+        else:
+            last = middle
+    return last
+
+
+@compiled(apart=True)
+def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple[float, float, bool]:
+    """Return the latest contact (s) with the front vehicle, and the latest one (s) that comes before the rear vehicle
+    arrives.
+
+    The third result says whether the front vehicle may be met first arbitrarily late and softly.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        first: earliest contact with the front vehicle, s.
+        plan: working memory, from ``empty_plan``.
+        other: further working memory of the same kind.
+
+    """
+    touches = spare_gap(at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F]) >= 0.0
+    last = meet_front(at, 0.0, plan, other)
+    if touches:
+        last = largest_behind(
+            at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F], at[LINE.U_F], at[LINE.LIMIT_F]
+        )[1]
+    end = last_first(FRONT_FIRST, at, first, last, plan, other)
+    return last, end, touches and end == last
+
+
+@compiled(apart=True)
+def front_first(
+    at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
+) -> float:
+    """Return the least harm (m2/s2), if below ``best``, where the front vehicle is met first or all three meet at once.
+
+    If all three meet at once, front and rear vehicle close with W; the front pair's part of W is at least the least
+    closing speed at that time. This case counts only if the front vehicle can be met that late.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        floor: known lower bound on the harm at the other pair, m2/s2.
+        best: least harm of a first contact that is known so far, m2/s2.
+        enough: if some contact does no more harm than this (m2/s2), 0 is returned at once.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: working memory of the search, [CELLS, NEAR].
+
+    """
+    first = meet_front(at, math.inf, plan, other)
+    if (
+        first == math.inf and at[LINE.GAP_L] <= TOUCHING_M
+    ):  # it stands in contact with the leader, so both are hit at once
+        return min(best, rear_bound(at, plan, other)[0])
+    if first == math.inf or not stays_ahead(at, first, first, plan, other):
+        return best
+    last, end, leans = last_meeting(at, first, plan, other)
+    best = least_harm(FRONT_FIRST, at, first, end, floor, best, enough, plan, other, heap)
+    if leans:
+        best = soft_harm(FRONT_FIRST, at, last, last, floor, best, plan, other)
+        stand = at[LINE.V_L] / at[LINE.A_L]
+        if last < stand:
+            best = soft_harm(FRONT_FIRST, at, stand, stand, floor, best, plan, other)
+    fill_braking(plan, 0.0, at[LINE.A_L])
+    fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
+    _, time, squared = walk(at[LINE.GAP_L] + at[LINE.GAP_R], at[LINE.V_L], plan, at[LINE.V_R], other, math.inf)
+    if time == math.inf or (time > end + _GRAZE_S and not leans):
+        return best
+    least = gentlest_front(at, min(time, last))[0] if time > first else 0.0
+    front = max(least, 0.5 * math.sqrt(squared))
+    rear = max(math.sqrt(squared) - front, 0.0)
+    beyond = 0.0
+    if at[LINE.WALL] > 0.0:
+        beyond = beyond_rear(at, time, time, rear, obstacle_harm(at, time, least), plan, other)
+    return min(best, front * front + rear * rear + beyond)
+
+
+@compiled(apart=True)
+def soft_harm(
+    kind: int, at: Floats, early: float, late: float, floor: float, best: float, plan: Floats, other: Floats
+) -> float:
+    """Return the least harm (m2/s2), if below ``best``, of first contacts from ``early`` to ``late`` with any closing
+    speed.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        floor: known lower bound on the harm at the other pair, m2/s2.
+        best: least harm of a first contact that is known so far, m2/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    soft = 0.0
+    while soft * soft < best:
+        hard = soft + 0.02 * (1.0 + soft)
+        follows = max(after(kind, at, early, late, hard, late, 0.0, plan, other), floor)
+        if kind == FRONT_FIRST:
+            follows = after_at_obstacle(at, early, late, soft, hard, follows, plan, other)
+        best = min(best, soft * soft + follows)
+        soft = hard
+    return best
+
+
+@compiled(apart=True)
+def rear_first(
+    at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
+) -> float:
+    """Return the least harm (m2/s2), if below ``best``, where the rear vehicle is met first.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        floor: known lower bound on the harm at the other pair, m2/s2.
+        best: least harm of a first contact that is known so far, m2/s2.
+        enough: if some contact does no more harm than this (m2/s2), 0 is returned at once.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: working memory of the search, [CELLS, NEAR].
+
+    """
+    high = max(at[LINE.V_F] / at[LINE.A_F], at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R])
+    first = meet_rear(at, high, plan, other)
+    if first == math.inf or not stays_behind(at, first, first, plan, other):
+        return best
+    last = meet_rear(at, 0.0, plan, other)
+    if last < math.inf:
+        end = last_first(REAR_FIRST, at, first, last, plan, other)
+        return least_harm(REAR_FIRST, at, first, end, floor, best, enough, plan, other, heap)
+    low, top = 0.0, high
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + top)
+        if meet_rear(at, middle, plan, other) < math.inf:
+            top = middle
+        else:
+            low = middle
+    last = meet_rear(at, top, plan, other)
+    end = last_first(REAR_FIRST, at, first, last, plan, other)
+    best = least_harm(REAR_FIRST, at, first, end, floor, best, enough, plan, other, heap)
+    if end < last:
+        return best
+    late = max(last_soft(at, high, plan, other), last) + _GRAZE_S
+    part = (late - last) / _PARTS
+    for k in range(_PARTS):
+        best = soft_harm(REAR_FIRST, at, last + k * part, last + (k + 1) * part, floor, best, plan, other)
+    return best
+
+
+@compiled(apart=True)
+def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
+    """Return a time (s) after which no first contact with the rear vehicle is possible.
+
+    By then the rear vehicle has passed neither the front vehicle nor the controlled one. If it brakes harder than the
+    controlled vehicle by b, it was faster by ``b t`` at time t before the contact, from its onset on.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        rest: time at which the controlled and the rear vehicle stand by full braking, s.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    fill_braking(plan, 0.0, at[LINE.A_L])
+    fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
+    last = min(
+        max(rest, at[LINE.V_L] / at[LINE.A_L]),
+        walk(at[LINE.GAP_L] + at[LINE.GAP_R], at[LINE.V_L], plan, at[LINE.V_R], other, math.inf)[1],
+    )
+    if at[LINE.A_F] >= at[LINE.A_R]:
+        return float(last)
+    harder, onset, closing = at[LINE.A_R] - at[LINE.A_F], at[LINE.ONSET_R], at[LINE.V_R] - at[LINE.V_F]
+    gap = max(at[LINE.GAP_R] + (0.5 * at[LINE.U_F] * onset - closing) * onset, 0.0)
+    ahead = max(closing + at[LINE.A_F] * onset, 0.0)
+    return float(min(last, onset + min(ahead / harder, math.sqrt(2.0 * gap / harder))))
+
+
+@compiled(apart=True)
+def last_rest(at: Floats) -> tuple[float, float]:
+    """Return the time (s) by which all harm has happened if all vehicles brake, and the time (s) at which the rear
+    vehicle stands.
+
+    ``at`` is one world, an array with the columns of ``line.LINE``.
+    """
+    stand = at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
+    way = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, stand)[1]
+    room = at[LINE.GAP_L] + at[LINE.V_L] * at[LINE.V_L] / (2.0 * at[LINE.A_L]) + at[LINE.GAP_R] - way
+    rest = at[LINE.ONSET_R] + at[LINE.V_R] / min(at[LINE.A_R], at[LINE.A_F])
+    return max(rest, stand + math.sqrt(2.0 * max(room, 0.0) / at[LINE.A_F])), stand
+
+
+@compiled(apart=True)
+def combined_bound(
+    at: Floats, until: float, front: float, rear: float, plan: Floats, other: Floats, heap: Floats
+) -> float:
+    """Return the least harm (m2/s2) of a world with unavoidable contact, whoever is met first.
+
+    Returns 0 if the harm may come after ``until``.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        until: horizon, s; harm after it does not count.
+        front: bound on the harm of the front pair alone, m2/s2.
+        rear: bound on the harm of the rear pair alone, m2/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: working memory of the search, [CELLS, NEAR].
+
+    """
+    if not last_rest(at)[0] < until:
+        return 0.0
+    step, least = at[LINE.TIME_STEP], 0.0
+    for time_step in (0.0, step):  # a bound for all commands also holds for commands that change at decisions only
+        at[LINE.TIME_STEP] = time_step
+        best = front_first(at, rear, LARGE, front + rear, plan, other, heap)
+        best = rear_first(at, front, best, front + rear, plan, other, heap)
+        least = max(least, best - TOUCH_HARM if best < LARGE else 0.0)
+        if step <= 0.0:
+            break
+    return least
+
+
+@compiled
+def bound_worlds(
+    states: Floats, until: Floats, has_front: Bools, has_rear: Bools, unavoidable: Bools, out: Floats
+) -> None:
+    """Compute lower bounds on the harm of ``n`` worlds: of each pair alone, and of both together.
+
+    Args:
+        states: [n, LINE.WIDTH] the worlds, one row each, with the columns of ``line.LINE``.
+        until: [n] horizon, s.
+        has_front: [n] True if the front pair exists and its next impact counts.
+        has_rear: [n] True if the rear pair exists and its next impact counts.
+        unavoidable: [n] True if contact is unavoidable; only there the combined bound is computed.
+        out: [n, BOUNDS] receives columns FRONT_BOUND, REAR_BOUND and COMBINED_BOUND, m2/s2.
+
+    """
+    plan, other, heap = empty_plan(), empty_plan(), np.empty((CELLS, NEAR))
+    for k in range(states.shape[0]):
+        front, rear = 0.0, 0.0
+        if has_front[k]:
+            # least squared closing speed at the front pair's first contact, and the latest time of that contact
+            at = states[k]
+            fill_braking(plan, 0.0, at[LINE.A_L])
+            fill_braking(other, 0.0, at[LINE.A_F])
+            _, time, squared = walk(
+                at[LINE.GAP_L], at[LINE.V_L], plan, at[LINE.V_F], other, at[LINE.V_F] / at[LINE.A_F]
+            )
+            if at[LINE.A_F] < at[LINE.A_L] and at[LINE.V_F] < at[LINE.V_L]:
+                squared = min(squared, 2.0 * (at[LINE.A_L] - at[LINE.A_F]) * at[LINE.GAP_L])
+            front = squared if time < until[k] and squared > TOUCH_HARM else 0.0
+            if front > 0.0 and at[LINE.WALL] > 0.0:
+                front += obstacle_harm(at, time, math.sqrt(squared))
+        if has_rear[k]:
+            squared, time = rear_bound(states[k], plan, other)
+            rear = squared if time < until[k] and squared > TOUCH_HARM else 0.0
+        out[k, FRONT_BOUND], out[k, REAR_BOUND], out[k, COMBINED_BOUND] = front, rear, 0.0
+        if unavoidable[k]:
+            out[k, COMBINED_BOUND] = combined_bound(states[k], until[k], front, rear, plan, other, heap)
+
+
+def lower_bound(
+    worlds: Worlds,
+    vehicle: int = 1,
+    *,
+    harm_count: HarmCount = "first",
+    horizon_s: float = 8.0,
+    scripts: Mapping[int, str] | None = None,
+    time_step_s: float | None = None,
+) -> LowerBound:
+    """Return a proven lower bound on the harm of every world, over all commands of one vehicle.
+
+    ``harm = early + max((front_pair + rear_pair), combined)``, each part lowered by the largest possible rounding error
+    (``rounding``). The combined bound is 0 where contact can be avoided. Harm that may come only after the horizon
+    counts as 0.
+
+    With brake build-up the bound holds for any command at any time and is looser. It has no verdict on contact:
+    ``contact`` is None if brakes build up in any of the worlds.
+
+    Args:
+        worlds: the worlds now, [n].
+        vehicle: index of the controlled vehicle, from 0.
+        harm_count: ``first`` or ``total``. With ``first``, the next impact of a pair that was hit before counts as 0.
+        horizon_s: time until which harm counts, s (absolute).
+        scripts: name of each other vehicle's script by index; only checked to be full_brake. None: full_brake.
+        time_step_s: time between two decisions, s. The bound is then proven only for commands that change at decisions:
+            the first one when the vehicle may act, then one every ``time_step_s``, as for every agent. That is sharper,
+            and takes ten times as long. None: commands may change at any time.
+
+    Covers the same lines as ``avoidability``. Raises ``InvalidInput`` for other lines, for an unknown ``harm_count``, a
+    time step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before the vehicle may act.
+
+    """
+    check_asked("lower_bound", harm_count, horizon_s, time_step_s)
+    slow = worlds.vehicles.build_up
+    if worlds.vehicles.in_pieces.any():
+        worlds.refuse_build_up("lower_bound")
+    if slow.any() and not slow.all():
+        asked = partial(
+            lower_bound, vehicle=vehicle, harm_count=harm_count, horizon_s=horizon_s, scripts=scripts,
+            time_step_s=time_step_s,
+        )  # fmt: skip
+        order = np.argsort(np.concatenate([np.flatnonzero(slow), np.flatnonzero(~slow)]))
+        halves = asked(worlds.take(slow)), asked(worlds.take(~slow))
+        each = ((part.harm, part.early, part.front_pair, part.rear_pair, part.combined) for part in halves)
+        harm, early, front, rear, combined = (np.concatenate(columns)[order] for columns in zip(*each, strict=True))
+        return LowerBound(harm, early, front, rear, combined, None)
+    if slow.any():
+        check_covered(worlds, vehicle, scripts)
+        verdict, reason = None, np.full(worlds.n, 2)  # assume unavoidable contact: the bound itself finds out
+    else:
+        verdict = avoidability(worlds, vehicle, scripts=scripts)
+        reason = verdict.reason
+    at_onset, start, early, counts = at_onset_of("lower_bound", worlds, np.array([vehicle]), harm_count, horizon_s)
+    none = np.zeros(worlds.n, dtype=np.bool_)
+    has_front = counts[:, vehicle - 1] if vehicle > 0 else none
+    has_rear = counts[:, vehicle] if vehicle < worlds.N - 1 else none
+    struck = at_onset.obstacle_hit & (harm_count == "first")  # a further impact with the obstacle is not counted
+    unavoidable = has_front & has_rear & (reason >= 2) & ~struck
+    out = np.empty((worlds.n, BOUNDS))
+    given: tuple[Any, ...] = (has_front, has_rear, unavoidable, out)
+    kernel: Callable[..., None] = bound_worlds
+    if slow.any():
+        # the bound does not cover a neighbour that still drives because of an earlier command
+        left_alone = np.delete(at_onset.command_mps2, vehicle, axis=1).max(axis=1) <= 0.0
+        given = (has_front, has_rear & left_alone, unavoidable & left_alone, out)
+        given, kernel = (ramped_states(at_onset, vehicle, horizon_s - start), *given), bound_ramped
+    else:
+        states = onset_states(at_onset, vehicle, time_step_s)
+        ahead = states[:, LINE.OBSTACLE]
+        states[:, LINE.WALL] = np.where(np.isfinite(ahead) & ~struck, ahead, 0.0)
+        states[:, LINE.UNTIL] = horizon_s - start
+        given = (states, horizon_s - start, *given)
+    threads = min(os.cpu_count() or 1, worlds.n // LEAST_PART + 1)
+    by_parts(lambda part: kernel(*(array[part] for array in given)), worlds.n, threads)
+    parts = (early, *(out[:, column] for column in (FRONT_BOUND, REAR_BOUND, COMBINED_BOUND)))
+    early, front, rear, combined = (np.maximum(part - rounding(worlds, vehicle), 0.0) for part in parts)
+    return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined, verdict)

@@ -1,0 +1,410 @@
+"""Harm that must follow a first meeting if an obstacle stands ahead of the leader.
+
+``beyond`` is the squared speed with which the leader hits the obstacle; it bounds how far ahead the leader is.
+Positions count from the position of the controlled vehicle at its onset; masses are in units of its mass.
+docs/proofs/lower-bound-obstacle.md has the proofs.
+"""
+
+from __future__ import annotations
+
+import math
+
+from ethbrake_marl.extensions.proofs.followers import (
+    after_front,
+    braking_after,
+    obstacle_harm,
+    pushed_by_rear,
+    slowed_by_rear,
+)
+from ethbrake_marl.extensions.proofs.line import AHEAD_M, FRONT_FIRST, LARGE, LINE, RAMPED_FRONT, follower, leader
+from ethbrake_marl.extensions.proofs.plans import fill_braking, fill_plan, walk
+from ethbrake_marl.extensions.proofs.ramped_meetings import after_ramped
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Floats
+
+CELL = 1e-3  # relative and absolute (m2/s2) precision of a minimum
+
+ZONE_M = 1.0  # distance from the obstacle within which a vehicle that was stopped there is assumed to stay
+
+_BEYOND_PARTS, _BEYOND_FINEST = 4, 4  # number of parts of the range of ``beyond``, and of a part that is divided again
+
+_MOST = 400.0  # m2/s2; harm at the rear pair is cut to this
+
+_FLIGHTS = 6  # number of lengths of a last drive that are tried
+
+_SHORTEST_S = 1e-3  # shortest time or last drive to divide by
+
+
+@compiled
+def all_three(at: Floats) -> tuple[float, float, float, float]:
+    """Return the masses of front and rear vehicle, and the largest deceleration of the centre of mass of all three
+    (m/s2).
+
+    Masses are in units of the controlled vehicle's mass. The fourth result is the part of that deceleration that comes
+    from the rear vehicle (m/s2). ``at`` is one world, an array with the columns of ``line.LINE``.
+    """
+    front, rear = at[LINE.FRONT_SHARE] / (1.0 - at[LINE.FRONT_SHARE]), at[LINE.REAR_SHARE] / (1.0 - at[LINE.REAR_SHARE])
+    whole = front + 1.0 + rear
+    return front, rear, (front * at[LINE.A_L] + max(at[LINE.A_F], at[LINE.A_R])) / whole, rear * at[LINE.A_R] / whole
+
+
+@compiled
+def leader_pushed(at: Floats, early: float, beyond: float) -> tuple[float, float]:
+    """Return the speed (m/s) to which a push at ``early`` must bring the front vehicle, and the time (s) of its impact
+    with the obstacle.
+
+    It then hits the obstacle with the speed ``sqrt(beyond)``.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: time of the push, s.
+        beyond: squared speed at the obstacle, m2/s2.
+
+    """
+    v = math.sqrt(max(beyond + 2.0 * at[LINE.A_L] * (at[LINE.WALL] - leader(at, early)[1]), 0.0))
+    return v, early + (v - math.sqrt(beyond)) / at[LINE.A_L]
+
+
+@compiled(apart=True)
+def least_beyond(
+    at: Floats, early: float, late: float, place: float, speed: float, least: float, plan: Floats, other: Floats
+) -> float:
+    """Return the least squared speed (m2/s2) with which the front vehicle, pushed at ``early``, hits the obstacle.
+
+    It follows from the centre of mass of all three vehicles, which must not reach the obstacle before the front
+    vehicle.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: time of the push, s.
+        late: time for which ``place`` and ``speed`` hold, s.
+        place: least position of the centre of mass of all three at ``late``, m.
+        speed: speed of that centre of mass at ``late``, m/s.
+        least: bound that is known before, m2/s2; the result is at least this.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    if not speed > 0.0:
+        return least
+    _, _, pull, rear_pull = all_three(at)
+    onset = max(at[LINE.ONSET_R] - late, 0.0)
+    fill_plan(plan, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    fill_plan(other, onset, -pull, onset, 0.0, onset, 0.0, -pull - rear_pull)
+    wall = at[LINE.GAP_L] + at[LINE.WALL]
+    time = late - early + walk(max(wall - place, 0.0), 0.0, plan, speed, other, math.inf)[1]
+    if not _SHORTEST_S < time < at[LINE.UNTIL] - early:
+        return least
+    v = (at[LINE.WALL] - leader(at, early)[1]) / time - 0.5 * at[LINE.A_L] * time
+    return float(max(least, v * v)) if v > 0.0 else least
+
+
+@compiled(apart=True)
+def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float, float, float]:
+    """Return the least position (m) and speed (m/s) at ``late`` of a vehicle that brakes after its first contact.
+
+    The third result is its deceleration (m/s2): the hardest of all three vehicles, so that no vehicle falls further
+    behind.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        faster: speed by which it left the contact faster than the front vehicle, m/s.
+
+    """
+    v_l, way = leader(at, late)
+    brakes = max(at[LINE.A_F], at[LINE.A_L], at[LINE.A_R])
+    slack = brakes - at[LINE.A_L] if late * at[LINE.A_L] <= at[LINE.V_L] else brakes
+    span = late - early
+    return at[LINE.GAP_L] + way - 0.5 * slack * span * span, max(v_l + faster - slack * span, 0.0), brakes
+
+
+@compiled
+def last_drive(room: float, speed: float, brakes: float, drive: float, time: float) -> float:
+    """Return for how long (s) a vehicle must drive at the end of ``time``, after braking, to have travelled ``room`` m
+    by then.
+
+    Infinite if it cannot.
+
+    Args:
+        room: distance to travel, m.
+        speed: speed now, m/s.
+        brakes: deceleration while braking, m/s2.
+        drive: acceleration while driving, m/s2.
+        time: total time, s.
+
+    """
+    stand = speed / brakes
+    if time > stand:
+        flight = math.sqrt(2.0 * max(room - 0.5 * speed * stand, 0.0) / drive) if drive > 0.0 else math.inf
+        if time - flight > stand:
+            return flight
+    return math.sqrt(2.0 * max(room - (speed - 0.5 * brakes * time) * time, 0.0) / (brakes + drive))
+
+
+@compiled(apart=True)
+def stopped_there(
+    at: Floats, early: float, late: float, hard: float, beyond: float, struck: float, until: float, place: float,
+    speed: float, brakes: float,
+) -> tuple[float, float, float]:  # fmt: skip
+    """Return three limits for a vehicle that the front vehicle stops at the obstacle: distance, backward speed and
+    time.
+
+    These are its largest distance from the obstacle (m; infinite if it is not known), its largest backward speed (m/s)
+    and the largest time it spends there (s).
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        hard: largest closing speed of the contact, m/s.
+        beyond: squared speed with which the front vehicle hits the obstacle, m2/s2.
+        struck: time of that impact, s.
+        until: time by which the rear vehicle arrives, s.
+        place: least position of the vehicle at ``late``, m.
+        speed: its least speed at ``late``, m/s.
+        brakes: its deceleration, m/s2.
+
+    """
+    bounce, drive, wall = at[LINE.RESTITUTION], at[LINE.U_F], at[LINE.GAP_L] + at[LINE.WALL]
+    v_l, way = leader(at, early)
+    most, top = at[LINE.WALL] - way, v_l + hard
+    fastest = math.sqrt(top * top + 2.0 * drive * most)
+    soonest = early + 2.0 * most / max(top + fastest, _SHORTEST_S)
+    wait = max(until - max(soonest, struck, late), 0.0)
+    back = bounce * max((1.0 - at[LINE.FRONT_SHARE]) * (1.0 + bounce), 1.0)
+    # what it arrives with falls with the time, until it can stop on the way
+    time, stand, room = max(struck, late) - late, speed / brakes, wall - place
+    flight = last_drive(room, speed, brakes, drive, time)
+    if time < stand and flight <= time and room > (speed - 0.5 * brakes * time) * time:
+        quick = speed - brakes * (time - flight) + drive * flight
+        quick = max(quick * quick, 2.0 * drive * (room - 0.5 * speed * stand)) + 2.0 * drive * ZONE_M
+        quick = back * math.sqrt(max(quick, beyond))
+        near = 0.5 * quick * quick / at[LINE.A_L]
+        if near + quick * wait < ZONE_M:
+            return near, quick, wait
+    back *= fastest
+    near = 0.5 * back * back / at[LINE.A_L]
+    return near if near + back * wait < most else math.inf, back, wait
+
+
+@compiled(apart=True)
+def behind_leader(
+    at: Floats, early: float, late: float, soft: float, hard: float, beyond: float, place: float, speed: float,
+    plan: Floats, other: Floats,
+) -> float:  # fmt: skip
+    """Return the least squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
+
+    It assumes that the front vehicle hits the obstacle with at most ``sqrt(beyond)`` m/s, and that no vehicle passes
+    it. Returns LARGE (a huge number) if that is impossible.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        soft: least closing speed of the contact, m/s.
+        hard: largest closing speed of the contact, m/s.
+        beyond: largest squared speed with which the front vehicle hits the obstacle, m2/s2.
+        place: least position of the centre of mass of all three at ``late``, m.
+        speed: speed of that centre of mass at ``late``, m/s.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    wall, drive, onset = at[LINE.GAP_L] + at[LINE.WALL], at[LINE.U_F], at[LINE.ONSET_R]
+    kept = 1.0 - at[LINE.FRONT_SHARE] * (1.0 + at[LINE.RESTITUTION])
+    # time by which the rear vehicle must have arrived: at the leader, or at the obstacle
+    v_l, way_l = leader(at, early)
+    v_r, way_r = follower(at, early)
+    v, struck = leader_pushed(at, early, beyond)
+    gap = max(at[LINE.GAP_L] + at[LINE.GAP_R] + way_l - way_r, 0.0)
+    fill_braking(plan, 0.0, at[LINE.A_L])
+    fill_braking(other, max(onset - early, 0.0), at[LINE.A_R])
+    until = early + walk(gap, v, plan, v_r, other, struck - early)[1]
+    at_wall = until > struck
+    if at_wall:
+        until = early + walk(gap + at[LINE.WALL] - way_l, 0.0, plan, v_r, other, math.inf)[1]
+    least, low, brakes = slowest(at, early, late, kept * soft)
+    time, stand = until - late, low / brakes
+    if not _SHORTEST_S < time < math.inf:
+        return 0.0
+    # largest speed of the controlled vehicle then: it was never further back than by braking, or where it was stopped
+    v_r, goal = follower(at, until)
+    goal -= at[LINE.GAP_R]
+    longest = last_drive(goal - least, low, brakes, drive, time)
+    near, back, wait = 0.0, 0.0, 0.0
+    if at_wall:
+        near, back, wait = stopped_there(at, early, late, hard, beyond, struck, until, least, low, brakes)
+        if near == math.inf:
+            return 0.0
+        room = goal - near - back * wait - least
+        left = low * low - 2.0 * brakes * room
+        if left >= 0.0:
+            longest = max(longest, time - 2.0 * room / (low + math.sqrt(left)))
+    elif goal < least + (low - 0.5 * brakes * min(time, stand)) * min(time, stand) - AHEAD_M:
+        return LARGE
+    fastest = v_l + kept * hard + drive * (until - early)
+    for k in range(_FLIGHTS if at_wall else 1):
+        flight = min(max(longest * (1.0 - k / _FLIGHTS), _SHORTEST_S), time)
+        braked = min(time - flight, stand)
+        behind = least + (low - 0.5 * brakes * braked) * braked
+        if at_wall:
+            behind = min(behind, wall - near - back * max(wait - flight, 0.0))
+        fastest = min(fastest, (goal - behind) / flight + 0.5 * drive * flight)
+    closing = max(v_r - fastest, 0.0)
+    if not at_wall:
+        # the drive that makes this meeting so soft brings all three nearer to the obstacle
+        fill_braking(plan, 0.0, brakes)
+        fill_braking(other, max(onset - late, 0.0), at[LINE.A_R])
+        v_r, way_r = follower(at, late)
+        since = min(walk(max(least - way_r + at[LINE.GAP_R], 0.0), low, plan, v_r, other, time)[1], time)
+        v_r, way_r = follower(at, late + since)
+        v_l, way_l = leader(at, late)
+        v_f, weak = v_l + kept * hard, max(at[LINE.A_F], at[LINE.A_R])
+        further = way_r - at[LINE.GAP_R] - at[LINE.GAP_L] - way_l - kept * hard * (late - early)
+        further -= (v_f - 0.5 * weak * since) * since
+        front, rear, pull, rear_pull = all_three(at)
+        left = struck - late
+        braked = max(left - max(onset - late, 0.0), 0.0)
+        room = wall - place - (speed - 0.5 * pull * left) * left + 0.5 * rear_pull * braked * braked
+        if left - since > _SHORTEST_S:
+            faster, span = (v_r - v_f + weak * since) * (left - since), late - early if since <= 0.0 else 0.0
+            faster += further - (front + 1.0 + rear) * room - span * weak * (left + span)
+            closing = max(closing, faster / (left - since + span))
+    return float(closing * closing)
+
+
+@compiled(apart=True)
+def after_at_obstacle(
+    at: Floats, early: float, late: float, soft: float, hard: float, follows: float, plan: Floats, other: Floats
+) -> float:
+    """Return the least harm (m2/s2) at rear pair and obstacle together after a first contact with the front vehicle.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        soft: least closing speed of the contact, m/s.
+        hard: largest closing speed of the contact, m/s.
+        follows: known lower bound on the harm at the rear pair, m2/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    share = at[LINE.FRONT_SHARE]
+    least = obstacle_harm(at, late, soft)
+    if not at[LINE.WALL] > 0.0 or share * (1.0 + at[LINE.RESTITUTION]) > 1.0:
+        return follows + least
+    front, rear = all_three(at)[:2]
+    v_r, way_r = follower(at, late)
+    place, speed, _ = slowest(at, early, late, (1.0 - share) * soft)
+    place = ((front + 1.0) * place + rear * (way_r - at[LINE.GAP_R])) / (front + 1.0 + rear)
+    speed = ((front + 1.0) * speed + rear * v_r) / (front + 1.0 + rear)
+    least = least_beyond(at, early, late, place, speed, least, plan, other)
+    # the harder the leader hits the obstacle, the softer the meeting with the rear vehicle can be
+    first = min(max(behind_leader(at, early, late, soft, hard, least, place, speed, plan, other), follows), _MOST)
+    step, begin, known = (first - follows) / _BEYOND_PARTS, least, least + first
+    size, proven = step, known
+    while begin + follows < proven:
+        squared = max(behind_leader(at, early, late, soft, hard, begin + size, place, speed, plan, other), follows)
+        known = min(known, begin + size + squared)
+        if begin + squared < known - 10.0 * CELL * (1.0 + known) and size > step / _BEYOND_FINEST:
+            size *= 0.5
+            continue
+        proven = min(proven, begin + squared)
+        begin, size = begin + size, step
+    return proven
+
+
+@compiled(apart=True)
+def beyond_rear(
+    at: Floats, early: float, late: float, closing: float, least: float, plan: Floats, other: Floats
+) -> float:
+    """Return the least squared speed (m2/s2) of the front vehicle at the obstacle after the rear vehicle was met first.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        least: bound that is known before, m2/s2; the result is at least this.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    v_l, way_l = leader(at, late)
+    v_r, way_r = follower(at, late)
+    front, rear = all_three(at)[:2]
+    lost, slack = closing / (1.0 + rear), max(at[LINE.A_F], at[LINE.A_R]) * (late - early)
+    place = way_r - at[LINE.GAP_R] - (lost + 0.5 * slack) * (late - early)
+    place = (front * (at[LINE.GAP_L] + way_l) + (1.0 + rear) * place) / (front + 1.0 + rear)
+    speed = (front * v_l + (1.0 + rear) * (v_r - lost - slack)) / (front + 1.0 + rear)
+    return least_beyond(at, early, late, place, speed, least, plan, other)
+
+
+@compiled(apart=True)
+def after_rear(
+    at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
+) -> float:
+    """Return the least harm (m2/s2) at front pair and obstacle after a first contact with the rear vehicle.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        end: time until which the command of the earlier decision stays in force, s.
+        lack: least amount by which that command falls short of the best one, m/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
+    v_l, way_l = leader(at, early)
+    v_r, way_r = follower(at, early)
+    speed = v_r - rest * closing
+    if share * (1.0 + at[LINE.RESTITUTION]) <= 1.0:
+        speed += share * at[LINE.RESTITUTION] * closing
+    speed = max(speed - max(at[LINE.A_R] - at[LINE.A_F], 0.0) * (late - early), 0.0)
+    gap = max(at[LINE.GAP_L] + at[LINE.GAP_R] + way_l - way_r, 0.0)
+    least = gap - max(follower(at, late)[1] - way_r - (leader(at, late)[1] - way_l), 0.0)
+    squared = braking_after(gap, least, v_l, at[LINE.A_L], speed, at[LINE.A_F], plan, other)
+    if at[LINE.A_F] >= at[LINE.A_R]:
+        pushed = pushed_by_rear(at, early, late, closing, end, lack, gap, plan, other)
+        pushed = max(pushed, slowed_by_rear(at, early, closing, gap, plan, other))
+        squared = max(squared, pushed * pushed)
+    if at[LINE.WALL] > 0.0:
+        fill_braking(plan, 0.0, at[LINE.A_L])
+        fill_braking(other, 0.0, at[LINE.A_F])
+        met_by = early + walk(gap, v_l, plan, speed, other, math.inf)[1]
+        beyond = obstacle_harm(at, met_by, math.sqrt(squared))
+        squared += beyond_rear(at, early, late, closing, beyond, plan, other)
+    return squared
+
+
+@compiled(apart=True)
+def after(
+    kind: int, at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats,
+    other: Floats,
+) -> float:  # fmt: skip
+    """Return the least harm (m2/s2) at the other pair (and the obstacle) after a first contact with one neighbour.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        end: time until which the command of the earlier decision stays in force, s.
+        lack: least amount by which that command falls short of the best one, m/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
+    if kind >= RAMPED_FRONT:
+        return after_ramped(kind, at, early, late, closing, plan, other)
+    if kind == FRONT_FIRST:
+        return after_front(at, early, late, closing, end, lack, plan, other)
+    return after_rear(at, early, late, closing, end, lack, plan, other)

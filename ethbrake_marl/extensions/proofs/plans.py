@@ -1,0 +1,169 @@
+"""Two vehicles on plans of piecewise constant acceleration: how close they come, and where they first meet.
+
+A *plan* is an array [2, PIECES]: row ENDS holds the end of each piece (seconds from now, the last one infinite), row
+ACCELERATIONS its acceleration (m/s2). A vehicle that brakes to rest stays at rest. There is no time step: each piece
+has a closed form.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.motion import contact
+from ethbrake_marl.physics.state import Floats
+
+ENDS, ACCELERATIONS = 0, 1
+
+PIECES = 4
+
+
+@compiled
+def empty_plan() -> Floats:
+    """Return an uninitialised plan [2, PIECES] to fill in: row 0 the ends of its pieces (s), row 1 their accelerations
+    (m/s2).
+    """
+    return np.empty((2, PIECES))
+
+
+@compiled
+def fill_plan(
+    plan: Floats, end_0: float, u_0: float, end_1: float, u_1: float, end_2: float, u_2: float, u_3: float
+) -> None:
+    """Write a plan: acceleration ``u_0`` until ``end_0``, then ``u_1`` until ``end_1``, ``u_2`` until ``end_2``, then
+    ``u_3``.
+
+    ``plan`` [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
+    """
+    plan[ENDS, 0], plan[ENDS, 1], plan[ENDS, 2], plan[ENDS, 3] = end_0, end_1, end_2, math.inf
+    plan[ACCELERATIONS, 0], plan[ACCELERATIONS, 1] = u_0, u_1
+    plan[ACCELERATIONS, 2], plan[ACCELERATIONS, 3] = u_2, u_3
+
+
+@compiled
+def fill_braking(plan: Floats, onset: float, braking: float) -> None:
+    """Write a plan: coast until ``onset`` (s), then brake to rest with ``braking`` (m/s2, positive).
+
+    ``plan`` [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
+    """
+    fill_plan(plan, onset, 0.0, onset, 0.0, onset, 0.0, -braking)
+
+
+@compiled
+def fill_window(plan: Floats, u: float, late: float, end: float, change: float, turn: float, step: float) -> None:
+    """Write a plan: acceleration ``u``, plus ``step`` from ``turn`` on, plus ``change`` from ``late`` to ``end``.
+
+    ``plan`` [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
+    """
+    first, second, third = min(turn, late), min(max(turn, late), end), max(turn, end)
+    u_1 = u + step if turn < late else u + change
+    u_2 = u + step + change if turn < end else u
+    fill_plan(plan, first, u, second, u_1, third, u_2, u + step)
+
+
+@compiled
+def time_to_limit(v: float, u: float, limit: float) -> float:
+    """Return for how long (s) the acceleration ``u`` (m/s2) acts until the speed rises from ``v`` to ``limit`` (m/s).
+
+    0 at or above the limit, and if ``u <= 0``.
+    """
+    return (limit - v) / u if u > 0.0 and v < limit else 0.0
+
+
+@compiled
+def fill_drive_then_brake(plan: Floats, v: float, u: float, limit: float, drive: float, braking: float) -> None:
+    """Write a plan: drive for ``drive`` s (at most to the speed limit), then brake to rest.
+
+    Args:
+        plan: [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
+        v: speed now, m/s.
+        u: driving acceleration, m/s2.
+        limit: speed limit, m/s.
+        drive: duration of the drive, s.
+        braking: deceleration, m/s2, positive.
+
+    """
+    cap = min(time_to_limit(v, u, limit), drive)
+    fill_plan(plan, cap, u, drive, 0.0, drive, 0.0, -braking)
+
+
+@compiled
+def fill_brake_then_drive(plan: Floats, v: float, u: float, limit: float, brake: float, braking: float) -> None:
+    """Write a plan: brake for ``brake`` s (at most to rest), then drive to the speed limit and stay there.
+
+    Args:
+        plan: [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
+        v: speed now, m/s.
+        u: driving acceleration, m/s2.
+        limit: speed limit, m/s.
+        brake: duration of the braking, s.
+        braking: deceleration, m/s2, positive.
+
+    """
+    cap = brake + time_to_limit(max(v - braking * brake, 0.0), u, limit)
+    fill_plan(plan, brake, -braking, cap, u, cap, 0.0, 0.0)
+
+
+@compiled
+def piece_at(plan: Floats, now: float, v: float) -> tuple[float, float, bool]:
+    """Return the acceleration in force at ``now`` (m/s2), the time at which it ends (s), and whether the vehicle then
+    stops.
+
+    ``plan`` [2, PIECES] holds the ends (s) and accelerations (m/s2) of the pieces of its motion, ``v`` its speed at
+    ``now`` (m/s).
+    """
+    k = 0
+    while now >= plan[ENDS, k]:
+        k += 1
+    u, end = plan[ACCELERATIONS, k], plan[ENDS, k]
+    if u < 0.0:
+        if v <= 0.0:
+            return 0.0, end, False
+        rest = now + v / -u
+        if rest < end:
+            return u, rest, True
+    return u, end, False
+
+
+@compiled
+def walk(
+    gap: float, v_front: float, front: Floats, v_rear: float, rear: Floats, until: float
+) -> tuple[float, float, float]:
+    """Follow two vehicles until ``until``. Return their smallest gap, and time and squared closing speed of their
+    contact.
+
+    Units are m, s and m2/s2. The time is infinite and the speed 0 if they do not meet. The two pass through each other,
+    so a negative smallest gap is the depth of the overlap. If the gap reaches 0 and opens again, that is no contact; if
+    it would become an overlap, it is a contact with closing speed 0. Needs speeds >= 0.
+
+    Args:
+        gap: gap now, m.
+        v_front: speed of the front vehicle, m/s.
+        front: [2, PIECES] ends (s) and accelerations (m/s2) of the pieces of its motion.
+        v_rear: speed of the rear vehicle, m/s.
+        rear: [2, PIECES] the same for the rear vehicle.
+        until: end of the motion, s.
+
+    """
+    lowest, now, met_at, squared = gap, 0.0, math.inf, 0.0
+    while now < until:
+        u_f, end_f, stops_f = piece_at(front, now, v_front)
+        u_r, end_r, stops_r = piece_at(rear, now, v_rear)
+        end = min(end_f, end_r, until)
+        w, b, step = v_rear - v_front, u_r - u_f, end - now
+        if met_at == math.inf:
+            after, speed = contact(max(gap, 0.0), w, b)
+            if after <= step and (speed > 0.0 or b > 0.0):
+                met_at, squared = now + after, speed * speed
+        if b < 0.0 and 0.0 < w < -b * step:
+            lowest = min(lowest, gap - w * w / (-2.0 * b))
+        if step == math.inf:
+            break
+        gap -= (w + 0.5 * b * step) * step
+        lowest = min(lowest, gap)
+        v_front = 0.0 if stops_f and end == end_f else max(v_front + u_f * step, 0.0)
+        v_rear = 0.0 if stops_r and end == end_r else max(v_rear + u_r * step, 0.0)
+        now = end
+    return lowest, met_at, squared

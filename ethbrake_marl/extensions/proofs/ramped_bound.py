@@ -1,0 +1,131 @@
+"""The lower bound with brakes that build up at finite rates."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ethbrake_marl.extensions.proofs.branch_and_bound import CELLS, NEAR, least_harm
+from ethbrake_marl.extensions.proofs.line import (
+    COMBINED_BOUND,
+    FRONT_BOUND,
+    LARGE,
+    LINE,
+    RAMPED_FRONT,
+    RAMPED_REAR,
+    REAR_BOUND,
+    ROUGHLY,
+    TOUCH_HARM,
+    TOUCHING_M,
+)
+from ethbrake_marl.extensions.proofs.ramped_meetings import (
+    fill_follower,
+    fill_leader,
+    gentlest_ramped,
+    is_first_ramped,
+    meet_ramped,
+    onset_states,
+)
+from ethbrake_marl.extensions.proofs.ramps import empty_legs, meeting
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Bools, Floats, Worlds
+
+
+@compiled(apart=True)
+def combined_ramped(
+    at: Floats, until: float, front: float, rear: float, contact_s: float, plan: Floats, other: Floats, heap: Floats
+) -> float:
+    """Return the least harm of both pairs together (m2/s2), whoever is met first, with brake build-up.
+
+    Returns 0 if nothing is proven.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        until: horizon, s; harm after it does not count.
+        front: bound on the harm of the front pair alone, m2/s2.
+        rear: bound on the harm of the rear pair alone, m2/s2.
+        contact_s: time by which some contact is certain, s; infinite: unknown.
+        plan: working memory, from ``empty_legs``.
+        other: further working memory of the same kind.
+        heap: working memory of the search, [CELLS, NEAR].
+
+    """
+    if min(at[LINE.GAP_L], at[LINE.GAP_R]) <= TOUCHING_M:
+        return 0.0
+    fill_leader(at, plan)
+    fill_follower(at, other)
+    squeezed, closing, _ = meeting(
+        at[LINE.GAP_L] + at[LINE.GAP_R], 0.0, at[LINE.V_L], plan, math.inf, at[LINE.V_R], other, math.inf, 0.0, math.inf
+    )
+    last, best = min(contact_s, squeezed), LARGE
+    if not last < until:
+        return 0.0
+    for kind, sign, floor in ((RAMPED_FRONT, 1.0, rear), (RAMPED_REAR, -1.0, front)):
+        first = meet_ramped(kind, at, sign, plan, other)[0]
+        if first > last or not is_first_ramped(kind, at, first, plan, other):
+            continue
+        early, late = first, last
+        if not is_first_ramped(kind, at, last, plan, other):
+            for _ in range(ROUGHLY):
+                middle = 0.5 * (early + late)
+                if is_first_ramped(kind, at, middle, plan, other):
+                    early = middle
+                else:
+                    late = middle
+        best = least_harm(kind, at, first, late, floor, best, front + rear, plan, other, heap)
+    if squeezed <= last:
+        most = max(min(gentlest_ramped(RAMPED_FRONT, at, squeezed), closing), 0.5 * closing)
+        best = min(best, most * most + (closing - most) * (closing - most))
+    return best - TOUCH_HARM if best < LARGE else 0.0
+
+
+@compiled
+def bound_ramped(states: Floats, has_front: Bools, has_rear: Bools, both: Bools, out: Floats) -> None:
+    """Compute lower bounds on the harm of ``n`` worlds with brake build-up: of each pair alone, and of both together.
+
+    Args:
+        states: [n, LINE.WIDTH] the worlds, one row each, with the columns of ``line.LINE``.
+        has_front: [n] True if the front pair exists and its next impact counts.
+        has_rear: [n] True if the rear pair exists and its next impact counts.
+        both: [n] True for worlds in which the combined bound is computed.
+        out: [n, BOUNDS] receives columns FRONT_BOUND, REAR_BOUND and COMBINED_BOUND, m2/s2.
+
+    """
+    plan, other, heap = empty_legs(), empty_legs(), np.empty((CELLS, NEAR))
+    for k in range(states.shape[0]):
+        at, contact_s = states[k], math.inf
+        for kind, sign, there in ((RAMPED_FRONT, -1.0, has_front[k]), (RAMPED_REAR, 1.0, has_rear[k])):
+            out[k, kind - RAMPED_FRONT] = 0.0
+            if there:
+                time, closing, least = meet_ramped(kind, at, sign, plan, other)
+                found = least * least if kind == RAMPED_FRONT else closing * closing
+                contact_s = min(contact_s, time)
+                if time < at[LINE.UNTIL] and found > TOUCH_HARM:
+                    out[k, kind - RAMPED_FRONT] = found
+        out[k, COMBINED_BOUND] = 0.0
+        if both[k]:
+            front, rear = out[k, FRONT_BOUND], out[k, REAR_BOUND]
+            out[k, COMBINED_BOUND] = combined_ramped(at, at[LINE.UNTIL], front, rear, contact_s, plan, other, heap)
+
+
+def ramped_states(worlds: Worlds, i: int, until: Floats) -> Floats:
+    """Return worlds with brake build-up in the columns of ``line.LINE``, [n, WIDTH].
+
+    A controlled vehicle that already brakes or drives is treated as if its rates were infinite.
+
+    Args:
+        worlds: the worlds, [n], at the moment when vehicle ``i`` may act.
+        i: index of the controlled vehicle.
+        until: [n] horizon, s from then; the bounds cover only harm within it.
+
+    """
+    v, at = worlds.vehicles, onset_states(worlds, i, None)
+    moved = worlds.command_mps2[:, i] != 0.0
+    at[:, LINE.FALL_F] = np.where(moved, np.inf, v.brake_rate_mps3[:, i])
+    at[:, LINE.RISE_F] = np.where(moved, np.inf, v.release_rate_mps3[:, i])
+    at[:, LINE.UNTIL] = until
+    for j, force, fall in ((i - 1, LINE.FORCE_L, LINE.FALL_L), (i + 1, LINE.FORCE_R, LINE.FALL_R)):
+        if 0 <= j < worlds.N:
+            at[:, force], at[:, fall] = worlds.command_mps2[:, j], v.brake_rate_mps3[:, j]
+    return at

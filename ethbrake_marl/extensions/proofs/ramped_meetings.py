@@ -1,0 +1,502 @@
+"""Meetings with brake build-up, and what must follow them; and the parts that all lower bounds share.
+
+A *meeting* is a first contact of the controlled vehicle. ``sign`` is 1 for meetings with the leader and -1 for meetings
+with the rear vehicle, which are the mirror image: forces times ``sign`` first rise (drive, or brake) and later fall.
+``place`` is a position times ``sign``. docs/proofs/lower-bound-cases.md has the proofs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from numbers import Real
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.proofs.avoidability import Avoidability
+from ethbrake_marl.extensions.proofs.line import AHEAD_M, FORCE_HALVINGS, HALVINGS, LINE, RAMPED_FRONT, ROUGHLY
+from ethbrake_marl.extensions.proofs.ramps import (
+    FORCES,
+    empty_legs,
+    fill_build_up,
+    fill_switch,
+    force_of,
+    meeting,
+    travel,
+)
+from ethbrake_marl.game.harm import HarmCount, check_harm_count, empty_ledger
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+
+
+@compiled
+def fill_leader(at: Floats, plan: Floats) -> None:
+    """Write the plan of the front vehicle, if nobody touches it, to ``plan`` [3, LEGS].
+
+    A *plan* is a profile of piecewise linear acceleration. ``at`` is one world, an array with the columns of
+    ``line.LINE``.
+    """
+    fill_build_up(plan, 0.0, at[LINE.FORCE_L], -at[LINE.A_L], at[LINE.FALL_L])
+
+
+@compiled
+def fill_follower(at: Floats, plan: Floats) -> None:
+    """Write the plan of the rear vehicle, if nobody touches it, to ``plan`` [3, LEGS].
+
+    A *plan* is a profile of piecewise linear acceleration. ``at`` is one world, an array with the columns of
+    ``line.LINE``.
+    """
+    fill_build_up(plan, at[LINE.ONSET_R], at[LINE.FORCE_R], -at[LINE.A_R], at[LINE.FALL_R])
+
+
+@compiled
+def range_of(sign: float, at: Floats) -> tuple[float, float, float, float]:
+    """Return the range of ``sign`` times the controlled vehicle's force: largest force, rate up, size of the least
+    force, rate down.
+
+    A *force* is an acceleration in m/s2; the least one is returned with its sign dropped. Rates are in m/s3. With
+    ``sign`` 1 the largest force is full drive, with -1 it is full braking. ``at`` is one world, an array with the
+    columns of ``line.LINE``.
+    """
+    if sign > 0.0:
+        return at[LINE.U_F], at[LINE.RISE_F], at[LINE.A_F], at[LINE.FALL_F]
+    return at[LINE.A_F], at[LINE.FALL_F], at[LINE.U_F], at[LINE.RISE_F]
+
+
+@compiled
+def fill_controlled(at: Floats, sign: float, switch: float, time: float, final: float, plan: Floats) -> None:
+    """Write a plan of the controlled vehicle: its force (times ``sign``) rises fully until ``switch``, then falls
+    fully.
+
+    A *force* is an acceleration in m/s2.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        sign: 1 if the front vehicle is met, -1 for the rear vehicle.
+        switch: time at which the force begins to fall, s.
+        time: time of the contact, s.
+        final: force times ``sign`` at ``time``; -inf: no such condition.
+        plan: [3, LEGS] receives the plan.
+
+    """
+    high, rise, low, fall = range_of(sign, at)
+    fill_switch(plan, sign, sign * at[LINE.FORCE_F], high, rise, low, fall, switch, time, final)
+
+
+@compiled(apart=True)
+def switch_for(
+    at: Floats, sign: float, time: float, place: float, final: float, halvings: int, plan: Floats
+) -> tuple[float, float, float]:
+    """Return two times (s) just before and after the switch that leads the controlled vehicle to ``place`` at ``time``.
+
+    The *switch* is the time at which its force (acceleration times ``sign``) turns from rising to falling. The third
+    result is the speed (m/s) at ``time`` after the earlier switch.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        sign: 1 if the front vehicle is met, -1 for the rear vehicle.
+        time: time of the contact, s after the controlled vehicle may act.
+        place: position times ``sign`` at ``time``, m.
+        final: largest force at ``time``, m/s2; -inf: no limit.
+        halvings: number of halvings of the interval.
+        plan: [3, LEGS] working memory.
+
+    """
+    low, high = (-1.0 if range_of(sign, at)[1] == math.inf else 0.0), time
+    for _ in range(halvings):
+        middle = 0.5 * (low + high)
+        fill_controlled(at, sign, middle, time, final, plan)
+        if sign * travel(plan, at[LINE.V_F], at[LINE.LIMIT_F], time)[1] < place:
+            low = middle
+        else:
+            high = middle
+    fill_controlled(at, sign, low, time, final, plan)
+    return low, high, travel(plan, at[LINE.V_F], at[LINE.LIMIT_F], time)[0]
+
+
+@compiled
+def met_at(kind: int, at: Floats, time: float, plan: Floats) -> tuple[float, float, float]:
+    """Return sign, speed (m/s) and place (m) at ``time`` of the neighbour that is met, if nobody touches it before.
+
+    The *sign* is 1 for the front vehicle and -1 for the rear one; the *place* is the position times the sign.
+
+    Args:
+        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        time: time of the contact, s after the controlled vehicle may act.
+        plan: [3, LEGS] working memory.
+
+    """
+    if kind == RAMPED_FRONT:
+        fill_leader(at, plan)
+        v, way = travel(plan, at[LINE.V_L], math.inf, time)
+        return 1.0, v, at[LINE.GAP_L] + way
+    fill_follower(at, plan)
+    v, way = travel(plan, at[LINE.V_R], math.inf, time)
+    return -1.0, v, at[LINE.GAP_R] - way
+
+
+@compiled(apart=True)
+def gentlest_ramped(kind: int, at: Floats, time: float) -> float:
+    """Return the least closing speed (m/s) of a first contact at ``time``, with brake build-up.
+
+    Args:
+        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        time: time of the contact, s after the controlled vehicle may act.
+
+    """
+    plan = empty_legs()
+    sign, v, place = met_at(kind, at, time, plan)
+    return max(sign * (switch_for(at, sign, time, place, -math.inf, HALVINGS, plan)[2] - v), 0.0)
+
+
+@compiled
+def slack_of(
+    kind: int, at: Floats, early: float, late: float, v: float, hard: float, plan: Floats
+) -> tuple[float, float]:
+    """Return the largest distance (m) to the neighbour at ``early``, and by how much (m/s) the closing speed may then
+    exceed ``hard``.
+
+    The controlled vehicle meets the neighbour between ``early`` and ``late``.
+
+    Args:
+        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        v: speed of the neighbour at ``early``, m/s.
+        hard: largest closing speed of the contact, m/s.
+        plan: [3, LEGS] working memory.
+
+    """
+    span = late - early
+    if kind == RAMPED_FRONT:
+        return (hard + at[LINE.A_F] * span) * span, at[LINE.A_F] * span
+    slower = v - met_at(kind, at, late, plan)[1]
+    return (hard + at[LINE.U_F] * span + slower) * span, at[LINE.U_F] * span + slower
+
+
+@compiled(apart=True)
+def gentlest_ramped_between(kind: int, at: Floats, early: float, late: float) -> float:
+    """Return the least closing speed (m/s) of first contacts between ``early`` and ``late``, with brake build-up.
+
+    Args:
+        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+
+    """
+    plan = empty_legs()
+    hard = gentlest_ramped(kind, at, early)
+    sign, v, place = met_at(kind, at, early, plan)
+    far, faster = slack_of(kind, at, early, late, v, hard, plan)
+    closing = sign * (switch_for(at, sign, early, place - far, -math.inf, HALVINGS, plan)[2] - v)
+    if kind == RAMPED_FRONT:
+        fill_leader(at, plan)
+        if travel(plan, at[LINE.V_L], math.inf, late)[0] > 0.0:
+            faster = max(at[LINE.A_F] + force_of(plan, early), 0.0) * (late - early)
+    return max(min(closing - faster, hard), 0.0)
+
+
+@compiled(apart=True)
+def force_of_meeting(kind: int, at: Floats, early: float, late: float, hard: float) -> float:
+    """Return the largest acceleration (m/s2) of the controlled vehicle with which it can meet a neighbour at no more
+    than ``hard``.
+
+    For a contact with the rear vehicle, accelerations count with the opposite sign, so the largest one is the hardest
+    braking.
+
+    Args:
+        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        hard: largest closing speed of the contact, m/s.
+
+    """
+    plan = empty_legs()
+    sign, v, place = met_at(kind, at, early, plan)
+    far, faster = slack_of(kind, at, early, late, v, hard, plan)
+    high, rise, low, _ = range_of(sign, at)
+    if rise == math.inf:
+        return high
+    least, most = -low, high
+    for k in range(FORCE_HALVINGS):
+        tried = most if k == 0 else 0.5 * (least + most)
+        final = tried - rise * (late - early)
+        if sign * (switch_for(at, sign, early, place - far, final, ROUGHLY, plan)[2] - v) <= hard + faster:
+            least = tried
+        else:
+            most = tried
+    return most
+
+
+@compiled(apart=True)
+def after_ramped(
+    kind: int, at: Floats, early: float, late: float, hard: float, plan: Floats, other: Floats
+) -> float:  # fmt: skip
+    """Return the least squared closing speed (m2/s2) at the other neighbour after a first contact, with brake build-up.
+
+    The bound uses the motion of the controlled vehicle alone.
+
+    Args:
+        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        hard: largest closing speed of the contact, m/s.
+        plan: [3, LEGS] working memory.
+        other: [3, LEGS] working memory.
+
+    """
+    sign = 1.0 if kind == RAMPED_FRONT else -1.0
+    share = at[LINE.FRONT_SHARE] if kind == RAMPED_FRONT else at[LINE.REAR_SHARE]
+    kept = 1.0 - share * (1.0 + at[LINE.RESTITUTION])
+    if kind == RAMPED_FRONT and (kept < 0.0 or at[LINE.OBSTACLE] < math.inf):
+        return 0.0  # the controlled vehicle may be thrown back
+    kept, span = max(kept, 0.0), late - early
+    high, rise, _, _ = range_of(sign, at)
+    force = high
+    if rise < math.inf:
+        force = min(force_of_meeting(kind, at, early, late, hard) + rise * span, high)
+    fill_leader(at, plan)
+    v_l, way_l = travel(plan, at[LINE.V_L], math.inf, early)
+    fill_follower(at, other)
+    v_r, way_r = travel(other, at[LINE.V_R], math.inf, early)
+    gap = max(at[LINE.GAP_L] + at[LINE.GAP_R] + way_l - way_r, 0.0)
+    if kind == RAMPED_FRONT:
+        # until ``late`` the controlled vehicle does not fall behind the leader
+        least = force_of(plan, early) if travel(plan, at[LINE.V_L], math.inf, late)[0] > 0.0 else 0.0
+        fill_build_up(plan, late, force, high, rise)
+        plan[FORCES, 0] = max(force, least)
+        found = meeting(
+            gap, kept * hard * span, v_l + kept * hard, plan, math.inf, v_r, other, math.inf, early, at[LINE.UNTIL]
+        )
+    else:
+        v = v_r - kept * hard
+        if v <= 0.0:
+            return 0.0
+        most = force_of(other, late)
+        since, begins = late, -force
+        fastest = (1.0 + at[LINE.RESTITUTION]) * v_r + at[LINE.U_F] * at[LINE.U_F] / rise
+        if begins > 0.0 and fastest >= at[LINE.LIMIT_F]:  # beyond its speed limit a driving vehicle coasts
+            since, begins = late + begins / rise, 0.0
+        fill_build_up(other, since, begins, -high, rise)
+        other[FORCES, 0] = min(begins, most)
+        found = meeting(gap, kept * hard * span, v_l, plan, math.inf, v, other, math.inf, early, at[LINE.UNTIL])
+    return found[2] * found[2]
+
+
+@compiled(apart=True)
+def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
+    """Return whether the other neighbour never arrives before a first contact at ``time`` or later.
+
+    Args:
+        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        time: time of the contact, s after the controlled vehicle may act.
+        plan: [3, LEGS] working memory.
+        other: [3, LEGS] working memory.
+
+    """
+    sign, _, place = met_at(kind, at, time, plan)
+    switch = switch_for(at, sign, time, place, -math.inf, HALVINGS, plan)[1]
+    fill_controlled(at, sign, switch, time, -math.inf, plan)
+    if kind == RAMPED_FRONT:
+        fill_follower(at, other)
+        gap = at[LINE.GAP_R] + AHEAD_M
+        return meeting(
+            gap, 0.0, at[LINE.V_F], plan, at[LINE.LIMIT_F], at[LINE.V_R], other, math.inf, 0.0, time
+        )[0] == math.inf  # fmt: skip
+    fill_leader(at, other)
+    gap = at[LINE.GAP_L] + AHEAD_M
+    return (
+        meeting(gap, 0.0, at[LINE.V_L], other, math.inf, at[LINE.V_F], plan, at[LINE.LIMIT_F], 0.0, time)[0] == math.inf
+    )
+
+
+@compiled(apart=True)
+def meet_ramped(kind: int, at: Floats, sign: float, plan: Floats, other: Floats) -> tuple[float, float, float]:
+    """Return time and closing speed of the contact with a neighbour under full drive or full braking, with brake
+    build-up.
+
+    The time (s) is infinite and the speed (m/s) 0 if they never meet. The third result is the least closing speed (m/s)
+    of any motion of the pair that is at no time farther apart than these two.
+
+    Args:
+        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        sign: 1: the controlled vehicle drives fully; -1: it brakes fully.
+        plan: [3, LEGS] working memory.
+        other: [3, LEGS] working memory.
+
+    """
+    fill_controlled(at, sign, math.inf, math.inf, -math.inf, plan)
+    if kind == RAMPED_FRONT:
+        fill_leader(at, other)
+        return meeting(
+            at[LINE.GAP_L], 0.0, at[LINE.V_L], other, math.inf, at[LINE.V_F], plan, at[LINE.LIMIT_F], 0.0, math.inf
+        )
+    fill_follower(at, other)
+    return meeting(
+        at[LINE.GAP_R], 0.0, at[LINE.V_F], plan, at[LINE.LIMIT_F], at[LINE.V_R], other, math.inf, 0.0, math.inf
+    )
+
+
+EPS = 2.0**-52  # the spacing of doubles at 1
+
+# Bounds are lowered by this many eps of the largest squared speeds of a world: a segment of motion or a round of
+# impacts changes a squared closing speed by at most 8 eps of these, and an episode has up to 500 of them.
+BOUND_EPS = 2.0**12
+
+LEAST_TIME_STEP_S = 1e-3  # least time between decisions, because shorter steps need more work
+
+LEAST_PART = 100  # least number of worlds per thread; fewer are not worth a thread
+
+
+@dataclass(frozen=True, slots=True)
+class LowerBound:
+    """Proven bounds on the harm of each world, [n] m2/s2 each."""
+
+    harm: Floats  # lower bound on the total harm: no command profile does less
+    early: Floats  # harm before the controlled vehicle may act
+    front_pair: Floats  # bound of the front pair alone, from that moment on
+    rear_pair: Floats  # bound of the rear pair alone, from that moment on
+    combined: Floats  # bound of both pairs together; 0 if nothing is proven
+    # verdict on contact, on which the combined bound rests; None if brakes build up in any world
+    contact: Avoidability | None
+
+    @property
+    def impact_proven(self) -> Bools:
+        """True for worlds in which every command profile certainly has an impact, [n].
+
+        False means that none is proven, not that an impact can be avoided.
+        """
+        return np.asarray(self.harm > 0.0, np.bool_)
+
+
+def at_onset_of(
+    where: str, worlds: Worlds, vehicles: Ints, harm_count: HarmCount, horizon_s: float
+) -> tuple[Worlds, Floats, Floats, Bools]:
+    """Simulate worlds until the first of ``vehicles`` may act. Return these worlds, that time, the harm so far, and a
+    mask of pairs.
+
+    The time is [n] s, the harm [n] m2/s2. The mask [n, P] is True for pairs whose next impact counts and whose vehicles
+    move forward.
+
+    Args:
+        where: name of the caller, for error messages.
+        worlds: the worlds now, [n].
+        vehicles: indices of the controlled vehicles.
+        harm_count: ``first`` or ``total`` impacts.
+        horizon_s: horizon, s; ``InvalidInput`` if it is not finite or lies before that moment.
+
+    """
+    start = np.maximum(worlds.vehicles.latency_s[:, vehicles].min(axis=1), worlds.time_s)
+    if not (np.all(start <= horizon_s) and horizon_s < np.inf):
+        raise InvalidInput(f"{where}: horizon_s {horizon_s!r}: must be finite and at least {start.max():g} s")
+    now, impacts = advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=start)
+    early = empty_ledger(worlds).add(impacts).world_harm(harm_count)
+    forward = now.speeds_mps >= 0.0
+    counts = (~now.pair_hit if harm_count == "first" else True) & forward[:, 1:] & forward[:, :-1]
+    return now, start, early, counts
+
+
+def check_asked(where: str, harm_count: str, horizon_s: object, time_step_s: object) -> None:
+    """Raise ``InvalidInput`` for an unknown harm count, a horizon that is not a number, or an invalid time step.
+
+    Args:
+        where: name of the caller, which begins the error message.
+        harm_count: must be ``first`` or ``total``.
+        horizon_s: must be a number.
+        time_step_s: must be None or a number of at least ``LEAST_TIME_STEP_S``.
+
+    """
+    check_harm_count(harm_count)
+    if not _is_number(horizon_s):
+        raise InvalidInput(f"{where}: horizon_s {horizon_s!r}: must be a number of seconds")
+    if time_step_s is not None and not (_is_number(time_step_s) and LEAST_TIME_STEP_S <= time_step_s < np.inf):  # type: ignore[operator]  # a number
+        raise InvalidInput(
+            f"{where}: time_step_s {time_step_s!r}: must be a number of seconds from {LEAST_TIME_STEP_S:g} on, or None"
+        )
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -> Floats:
+    """Return how far apart floating-point arithmetic can bring a bound and the simulated harm, at most; [n] m2/s2.
+
+    A squared closing speed is ``D = w^2 + 2 b g``. Let ``V`` be the largest speed in the line, ``G`` the sum of its
+    gaps (plus ``way_m`` [n]), ``A`` the largest closing acceleration and ``a`` the weakest brakes. Then ``w^2`` is at
+    most ``V^2``, and no gap grows beyond ``G + V^2 / 2a`` (plus ``V a / r`` if brakes build up at rate r), so all terms
+    of D stay below ``S = V^2 (1 + A / a) + 2 A G``. A segment of motion rounds each speed twice and each gap five
+    times; a round of impacts rounds each speed by up to 8 eps of the largest speed. Either changes D by at most 8 eps
+    S. These errors add up and do not multiply, because the proofs compare a motion with itself. ``BOUND_EPS`` covers
+    500 of them: an episode of 8 s has 80 steps, and the bound's own arithmetic is a few hundred roundings. For several
+    vehicles (a team) the largest speed is a speed limit if any of them may drive, and the largest closing acceleration
+    uses the strongest drive.
+
+    Args:
+        worlds: the worlds, [n].
+        vehicle: index of the controlled vehicle, or several indices.
+        way_m: further distance to add to the gaps, a number or [n], m.
+
+    """
+    v, chosen = worlds.vehicles, np.atleast_1d(vehicle)
+    driving = v.driving_capacity_mps2[:, chosen]
+    limits = np.where(driving > 0.0, v.speed_limit_mps[:, chosen], 0.0)
+    fastest = np.maximum(worlds.speeds_mps.max(axis=1), limits.max(axis=1))
+    closing = v.braking_capacity_mps2.max(axis=1) + driving.max(axis=1)
+    weakest = v.braking_capacity_mps2.min(axis=1)
+    longest = worlds.gaps_m.sum(axis=1) + way_m + fastest * (v.braking_capacity_mps2 / v.brake_rate_mps3).max(axis=1)
+    scale = fastest * fastest * (1.0 + closing / weakest) + 2.0 * closing * longest
+    return np.asarray(BOUND_EPS * EPS * scale, np.float64)
+
+
+def onset_states(worlds: Worlds, i: int, time_step_s: float | Floats | None) -> Floats:
+    """Return the worlds in the columns of ``line.LINE``, [n, WIDTH].
+
+    Columns of a missing neighbour stay 0.
+
+    Args:
+        worlds: the worlds, [n], at the moment when vehicle ``i`` may act.
+        i: index of the controlled vehicle.
+        time_step_s: time between two decisions, a number or [n], s; None: commands may change at any time; the column
+            is then 0.
+
+    """
+    v = worlds.vehicles
+    at = np.zeros((worlds.n, LINE.WIDTH))
+    columns = {
+        LINE.V_F: worlds.speeds_mps[:, i],
+        LINE.A_F: v.braking_capacity_mps2[:, i],
+        LINE.U_F: v.driving_capacity_mps2[:, i],
+        LINE.LIMIT_F: v.speed_limit_mps[:, i],
+        LINE.RESTITUTION: v.restitution,
+        LINE.OBSTACLE: worlds.obstacle_gap_m if i == 1 else np.inf,
+        LINE.TIME_STEP: 0.0 if time_step_s is None else time_step_s,
+    }
+    if i > 0:
+        columns |= {
+            LINE.GAP_L: worlds.gaps_m[:, i - 1],
+            LINE.V_L: worlds.speeds_mps[:, i - 1],
+            LINE.A_L: v.braking_capacity_mps2[:, i - 1],
+            LINE.FRONT_SHARE: v.mass_t[:, i - 1] / (v.mass_t[:, i - 1] + v.mass_t[:, i]),
+        }
+    if i < worlds.N - 1:
+        columns |= {
+            LINE.GAP_R: worlds.gaps_m[:, i],
+            LINE.V_R: worlds.speeds_mps[:, i + 1],
+            LINE.A_R: v.braking_capacity_mps2[:, i + 1],
+            LINE.ONSET_R: np.maximum(v.latency_s[:, i + 1] - worlds.time_s, 0.0),
+            LINE.REAR_SHARE: v.mass_t[:, i + 1] / (v.mass_t[:, i + 1] + v.mass_t[:, i]),
+        }
+    for column, values in columns.items():
+        at[:, column] = values
+    return at

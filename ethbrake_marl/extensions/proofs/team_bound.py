@@ -1,0 +1,235 @@
+"""``team_bound``: a proven lower bound on the harm of every world, whatever several controlled vehicles do.
+
+The first three vehicles are bounded together if Vehicle 2 is the first controlled one. If Vehicle 1 is controlled, an
+obstacle ahead takes the place of a first vehicle that nothing moves. docs/avoidability.md, "Teams", has the proofs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.extensions.proofs.avoidability import avoidability
+from ethbrake_marl.extensions.proofs.closing import (
+    FOLLOWER_A,
+    FOLLOWER_ONSET,
+    FOLLOWER_V,
+    LEADER_A,
+    LEADER_FREE,
+    LEADER_LIMIT,
+    LEADER_ONSET,
+    LEADER_U,
+    LEADER_V,
+    PAIR_GAP,
+    PAIR_WIDTH,
+    bound_pairs,
+)
+from ethbrake_marl.extensions.proofs.front_three import bound_threes
+from ethbrake_marl.extensions.proofs.ramped_meetings import at_onset_of, check_asked, onset_states, rounding
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.physics.motion import stopping_distances
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Vehicles, Worlds
+
+_MIDDLE, _REAR = 1, 2
+
+_UNMOVED_T = 1e30  # mass of an obstacle: its share of two masses is 1
+
+
+def _combined_bound_of_line(
+    now: Worlds, onset: Floats, counts: Bools, chosen: Ints, until: Floats, pairs: Floats, time_step_s: float | None
+) -> Floats:
+    """Return the combined bound of the first two pairs, [n] m2/s2, or 0 if nothing is proven.
+
+    The first vehicle must brake by now. The second one is treated as if it may act from now on.
+
+    Args:
+        now: the worlds now, [n].
+        onset: [n, N] time from now at which each vehicle may act, s.
+        counts: [n, P] True for pairs whose next impact counts and whose vehicles move forward.
+        chosen: indices of the controlled vehicles; the second vehicle is one of them.
+        until: [n] horizon, s from now.
+        pairs: [n, 2] bounds of both pairs alone, m2/s2.
+        time_step_s: time between two decisions, s; None: commands may change at any time.
+
+    """
+    v = now.vehicles
+    stops = (
+        stopping_distances(now.speeds_mps[:, 0], onset[:, 0], v.braking_capacity_mps2[:, 0], v.brake_rate_mps3[:, 0])
+        < now.obstacle_gap_m
+    )
+    rows = np.flatnonzero((onset[:, 0] <= 0.0) & counts[:, 0] & counts[:, 1] & stops & ~now.obstacle_hit)
+    # the first three vehicles of these worlds; Vehicle 2 may act at once
+    some = now.take(rows)
+    given = some.vehicles
+    braking, driving, latency, mass, limit = (
+        np.ascontiguousarray(each[:, :3])
+        for each in (
+            given.braking_capacity_mps2,
+            given.driving_capacity_mps2,
+            given.latency_s,
+            given.mass_t,
+            given.speed_limit_mps,
+        )
+    )
+    latency[:, _MIDDLE] = np.minimum(latency[:, _MIDDLE], some.time_s)
+    three = replace(
+        some,
+        vehicles=Vehicles.at_once(braking, driving, latency, mass, limit, given.restitution),
+        gaps_m=some.gaps_m[:, :2].copy(),
+        speeds_mps=some.speeds_mps[:, :3].copy(),
+        pair_hit=some.pair_hit[:, :2].copy(),
+        command_mps2=some.command_mps2[:, :3].copy(),
+        messages=np.zeros((some.n, 0)),
+    )
+    if not len(rows):
+        return np.zeros(now.n)
+    unavoidable = avoidability(three, _MIDDLE).reason >= 2
+    rows, three = rows[unavoidable], three.take(np.flatnonzero(unavoidable))
+    steps = np.where(onset[rows, _MIDDLE] <= 0.0, 0.0 if time_step_s is None else time_step_s, 0.0)
+    since, power = np.zeros(len(rows)), np.full(len(rows), np.inf)
+    if now.N == 3:  # nobody pushes the last vehicle
+        full = v.braking_capacity_mps2[rows, _REAR] + v.driving_capacity_mps2[rows, _REAR]
+        since, power = onset[rows, _REAR], full if _REAR in chosen else np.zeros(len(rows))
+    found, out = np.zeros(now.n), np.empty(len(rows))
+    bound_threes(onset_states(three, _MIDDLE, steps), until[rows], pairs[rows], since, power, out)
+    found[rows] = out
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class TeamBound:
+    """Proven bounds on the harm of each world, [n] m2/s2 each."""
+
+    harm: Floats  # lower bound on the total harm, whatever the controlled vehicles do
+    early: Floats  # harm before any controlled vehicle may act
+    obstacle: Floats  # bound of Vehicle 1 and the obstacle ahead, from that moment on
+    pairs: Floats  # [n, P] bound of each pair alone, from that moment on
+    combined: Floats  # bound of the first two pairs together (see ``team_bound``); 0 if nothing is proven
+
+    @property
+    def impact_proven(self) -> Bools:
+        """True for worlds in which an impact is certain whatever the controlled vehicles do, [n]. False means that none
+        is proven.
+        """
+        return np.asarray(self.harm > 0.0, np.bool_)
+
+
+def team_bound(
+    worlds: Worlds,
+    vehicles: Iterable[int],
+    *,
+    harm_count: HarmCount = "first",
+    horizon_s: float = 8.0,
+    scripts: Mapping[int, str] | None = None,
+    time_step_s: float | None = None,
+) -> TeamBound:
+    """Return a proven lower bound on the harm of every world, whatever several controlled vehicles do together.
+
+    ``harm = early + obstacle + max((pairs[:, 0] + pairs[:, 1]), combined) + pairs[:, 2:].sum(axis=1)``, each part
+    lowered by the largest possible rounding error. If Vehicle 1 is controlled, ``combined`` covers the obstacle and
+    Vehicles 1 and 2: ``early + max((obstacle + pairs[:, 0]), combined) + pairs[:, 1:].sum(axis=1)``. Harm that may come
+    only after the horizon counts as 0.
+
+    All other vehicles brake with their whole capacity from their latencies on. A single controlled vehicle is allowed;
+    ``lower_bound`` is sharper where it covers the line.
+
+    Args:
+        worlds: the worlds now, [n].
+        vehicles: indices of the controlled vehicles, from 0.
+        harm_count: ``first`` or ``total``. With ``first``, the next impact of a pair that was hit before counts as 0.
+        horizon_s: time until which harm counts, s (absolute).
+        scripts: name of each other vehicle's script by index; only checked to be full_brake. None: full_brake.
+        time_step_s: time between two decisions, s. The bound is then proven only for commands that change at decisions:
+            the first one when the first of the vehicles may act, then one every ``time_step_s``. That is sharper if
+            Vehicle 2 is the first one. None: commands may change at any time.
+
+    Raises ``InvalidInput`` for vehicles that are empty, unknown or repeated, another script, an unknown count, a time
+    step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before any of them may act.
+
+    """
+    check_asked("team_bound", harm_count, horizon_s, time_step_s)
+    # sort the controlled vehicles, and refuse what the bound does not cover
+    if not isinstance(vehicles, Iterable):
+        raise InvalidInput(f"team_bound: vehicles {vehicles!r}: must be a list of vehicles, for instance (1, 2)")
+    given = tuple(vehicles)
+    for vehicle in given:
+        check_whole_number("team_bound: a vehicle", vehicle, 0, worlds.N - 1)
+    if not given or len(set(given)) != len(given):
+        raise InvalidInput(f"team_bound: vehicles {given}: at least one is needed, each once")
+    for index, script in (scripts or {}).items():
+        check_whole_number("team_bound: a vehicle of scripts", index, 0, worlds.N - 1)
+        if index not in given and script != "full_brake":
+            raise InvalidInput(f"team_bound: vehicle_{index + 1} follows {script!r}; must be 'full_brake'")
+    chosen = np.array(sorted(given), np.int64)
+    worlds.refuse_build_up("team_bound")
+    now, start, early, counts = at_onset_of("team_bound", worlds, chosen, harm_count, horizon_s)
+    onset = np.maximum(worlds.vehicles.latency_s - start[:, np.newaxis], 0.0)
+    until, v = horizon_s - start, now.vehicles
+    each: list[dict[int, Floats | float]] = [
+        {
+            PAIR_GAP: now.gaps_m[:, p],
+            LEADER_V: now.speeds_mps[:, p],
+            LEADER_ONSET: onset[:, p],
+            LEADER_A: v.braking_capacity_mps2[:, p],
+            LEADER_FREE: float(p in chosen),
+            LEADER_U: v.driving_capacity_mps2[:, p],
+            LEADER_LIMIT: v.speed_limit_mps[:, p],
+            FOLLOWER_V: now.speeds_mps[:, p + 1],
+            FOLLOWER_ONSET: onset[:, p + 1],
+            FOLLOWER_A: v.braking_capacity_mps2[:, p + 1],
+        }
+        for p in range(worlds.N - 1)
+    ]
+    pairs = np.stack([_pair_bound(columns, until, counts[:, p]) for p, columns in enumerate(each)], axis=1)
+    ahead = np.isfinite(now.obstacle_gap_m) & ~(now.obstacle_hit & (harm_count == "first"))
+    ahead &= now.speeds_mps[:, 0] >= 0.0
+    standing: dict[int, Floats | float] = {  # the obstacle as the front vehicle of a pair
+        PAIR_GAP: np.where(ahead, now.obstacle_gap_m, 0.0),
+        LEADER_A: 1.0,
+        FOLLOWER_V: now.speeds_mps[:, 0],
+        FOLLOWER_ONSET: onset[:, 0],
+        FOLLOWER_A: v.braking_capacity_mps2[:, 0],
+    }
+    obstacle = _pair_bound(standing, until, ahead)
+    combined, walled = np.zeros(worlds.n), bool(chosen[0] == 0)
+    if walled and ahead.any():
+        # the line with its obstacle as a standing first vehicle that nothing moves
+        line = now.with_obstacle()
+        braking, mass = line.vehicles.braking_capacity_mps2.copy(), line.vehicles.mass_t.copy()
+        braking[:, 0], mass[:, 0] = 1.0, _UNMOVED_T
+        behind = replace(line.vehicles, braking_capacity_mps2=braking, mass_t=mass)
+        line = replace(
+            line, vehicles=behind, obstacle_gap_m=np.ones(line.n)
+        )  # finite: disables the centre-of-mass bounds
+        onsets, counted = np.column_stack([np.zeros(line.n), onset]), np.column_stack([ahead, counts])
+        both = np.stack([obstacle, pairs[:, 0]], axis=1)
+        combined = _combined_bound_of_line(line, onsets, counted, chosen + 1, until, both, time_step_s)
+    elif worlds.N >= 3 and chosen[0] == 1:
+        combined = _combined_bound_of_line(now, onset, counts, chosen, until, pairs[:, :2], time_step_s)
+    outward = rounding(worlds, chosen, np.where(np.isfinite(worlds.obstacle_gap_m), worlds.obstacle_gap_m, 0.0))
+    early, obstacle, combined = (np.maximum(part - outward, 0.0) for part in (early, obstacle, combined))
+    pairs = np.maximum(pairs - outward[:, np.newaxis], 0.0)
+    alone = np.column_stack([obstacle, pairs])
+    together = alone[:, :2] if walled else alone[:, 1:3]
+    harm = early + alone.sum(axis=1) + np.maximum(combined - together.sum(axis=1), 0.0)
+    return TeamBound(harm, early, obstacle, pairs, combined)
+
+
+def _pair_bound(columns: Mapping[int, Floats | float], until: Floats, counts: Bools) -> Floats:
+    """Return the bound on the harm of one pair alone, [n] m2/s2; 0 where its next impact does not count.
+
+    Args:
+        columns: maps a column of a pair (``PAIR_GAP`` to ``FOLLOWER_A``) to its values; missing columns are 0.
+        until: [n] horizon, s.
+        counts: [n] True for worlds in which the next impact of the pair counts.
+
+    """
+    at, found, out = np.zeros((len(until), PAIR_WIDTH)), np.zeros(len(until)), np.empty(int(counts.sum()))
+    for column, values in columns.items():
+        at[:, column] = values
+    bound_pairs(at[counts], until[counts], out)
+    found[counts] = out
+    return found

@@ -1,0 +1,1 @@
+"""Scenarios from recorded traffic: highD, NGSIM, OpenACC."""

@@ -1,0 +1,49 @@
+"""The command ``watch``: write films of episodes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ethbrake_marl.cli.command import (
+    AgentsOption,
+    ForceOption,
+    Out,
+    ScenarioOption,
+    SeedOption,
+    SettingsOption,
+    example,
+)
+from ethbrake_marl.cli.evaluate import make_drivers, read_task
+from ethbrake_marl.registry import Part
+
+
+def watch_command(
+    output: Annotated[Path, typer.Option(metavar="FILE.gif|FILE.mp4|FILE.svg", help="The film to write.")],
+    agents: AgentsOption = "e_v2x_bm",
+    scenario: ScenarioOption = "paper-random",
+    world: Annotated[int, typer.Option(help="Number of the world in the list.", min=0)] = 0,
+    seed: SeedOption = 7,
+    settings: SettingsOption = None,
+    force: ForceOption = False,
+) -> None:
+    """Write a film of agents in one world, in real time.
+
+    The film shows the road to scale, commands, impacts and harm.
+    """
+    # imported here, because matplotlib takes a second to load and most commands do not draw
+    from ethbrake_marl.extensions.report.film import check_film, film
+
+    with Out(force=force) as out:
+        out.check(output)
+        check_film(output.suffix.lower())
+        task = read_task(scenario, settings)
+        worlds = task.scenario.sample(1, seed, first=world).worlds
+        named = make_drivers(agents, task).items()
+        titled = {f"{name}: world {world} of {task.scenario.name}": agent for name, agent in named}
+        out.write(output, film(worlds, titled, output.suffix.lower(), scenario=task.scenario), what="film")
+
+
+WATCH = Part(watch_command, epilog=example("watch --agents full_brake,e_v2x_bm --world 3 --output both.gif"))

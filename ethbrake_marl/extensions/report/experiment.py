@@ -1,0 +1,216 @@
+"""The report of ``ethbrake run``: three figures, an HTML page, and the policy's results on the other two tests."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.agents.learned import TRAINED_POLICY
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.errors import Unfamiliar
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.record import record_episode
+from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.evaluation.summary import SummaryTable, summarise
+from ethbrake_marl.evaluation.summary_row import SummaryRow
+from ethbrake_marl.extensions.report.episode_figure import trajectories
+from ethbrake_marl.extensions.report.page import Part
+from ethbrake_marl.extensions.report.paper_rows import is_papers_test, with_paper_rows
+from ethbrake_marl.extensions.report.report import Report
+from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap, learning_curve
+from ethbrake_marl.extensions.report.style import write_picture
+from ethbrake_marl.extensions.report.three_tests import TESTS, brief, other_tests
+from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.game.rewards import RewardParams
+from ethbrake_marl.policies.manifest import installed_versions
+from ethbrake_marl.progress import OnProgress, Progress
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.training.experiment import Experiment, RunReport, compared_agents, write_results
+
+BESIDE = ("full_brake", "e_v2x_bm")  # agents shown with the policy in its figures and on the other two tests
+
+MOST_WORLDS = 2_000  # largest number of worlds of each of the other two tests
+
+
+def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
+    """Evaluate the policy on the other two tests, draw the figures, and write ``report.html``; return what to print.
+
+    Args:
+        experiment: the finished run: its folder, policy and evaluation.
+        tell: called with a ``Progress`` object at each stage.
+
+    """
+    evaluation, folder = experiment.evaluation, experiment.run.path
+    others, done = other_tests(evaluation.scenario), count()
+
+    def begin(stage: str) -> None:
+        """Report the progress: ``stage`` begins, or all stages have ended if it is empty."""
+        tell(Progress(f"report{stage and ': '}{stage}", next(done), 2 + len(others)))
+
+    is_papers = is_papers_test(evaluation.task, evaluation.seed)
+    rows = with_paper_rows(experiment.rows) if is_papers else experiment.rows
+    beside: dict[str, SummaryTable] = {}
+    for other in others:  # the policy was trained only on the scenario of the run
+        begin(f"the same policy on {other.name}")
+        beside[other.name] = _drive_other_test(experiment, other)
+    if beside:
+        flat = [row for table in beside.values() for row in table]
+        write_results(folder, "other_tests", flat, experiment.harm_count)
+    begin("figures")
+    config = read_object(experiment.run.config)
+    figures = write_figures(
+        folder,
+        evaluation,
+        rows,
+        course=experiment.trained.evaluations,
+        course_caption=_caption(experiment, config),
+        agents=experiment.agents,
+        harm_count=experiment.harm_count,
+    )
+    begin("the page and its episodes")
+    page = folder / "report.html"
+    report = _page(experiment, rows, beside, figures, config)
+    report.driven(experiment.agents).write(page, force=True)
+    begin("")
+    return RunReport(
+        (brief(rows, beside), *rows.tables()[1:]), f"report, with every measure and the paper's rows: {page}"
+    )
+
+
+def _drive_other_test(experiment: Experiment, test: Scenario) -> SummaryTable:
+    """Evaluate the trained policy, the policy behind its shield, and the baselines on another test; return the
+    table.
+    """
+    evaluation = experiment.evaluation
+    worlds = test.sample(min(evaluation.worlds.n, MOST_WORLDS), experiment.list_seed)
+    agents = compared_agents(experiment.trained.policy, test, experiment.harm_count, BESIDE)
+    with warnings.catch_warnings():  # the page says that the policy was not trained for this test
+        warnings.simplefilter("ignore", Unfamiliar)
+        return summarise(evaluate(worlds, agents, scenario=test, seed=experiment.list_seed))
+
+
+def write_figures(
+    folder: Path,
+    evaluation: Evaluation,
+    rows: Sequence[SummaryRow],
+    *,
+    course: Sequence[Mapping[str, float]],
+    course_caption: str,
+    agents: Mapping[str, Agent],
+    harm_count: HarmCount = "first",
+) -> list[Part]:
+    """Draw the three figures, write them as PNG files into ``folder``, and return them as parts (pieces of HTML) of the
+    report.
+
+    Args:
+        folder: folder of the run.
+        evaluation: evaluation of the trained policy and the baselines.
+        rows: summary of that evaluation, one ``SummaryRow`` for each agent; baselines are drawn as level lines.
+        course: evaluations during the training; each has ``steps``, both harms and ``collision_rate``.
+        course_caption: caption of the learning curve.
+        agents: the evaluated agents, by name.
+        harm_count: harm that the policy minimises.
+
+    """
+    references = [row for row in rows if row.agent in BESIDE]
+    shown = telling_world(evaluation, harm_count)
+    world, row = int(evaluation.index[shown]), evaluation.worlds.take([shown])
+    records = {
+        name: record_episode(row, agents[name], scenario=evaluation.scenario, vehicle=evaluation.vehicle)
+        for name in (*BESIDE, TRAINED_POLICY)
+    }
+    drawn = {
+        "learning_curve.png": (
+            "Learning curve",
+            "Harm and collisions of the policy on a fixed list of worlds while it learns; level lines: baselines.",
+            learning_curve(course, references=references, caption=course_caption),
+        ),
+        "harm_against_gap.png": (
+            "Harm against the total initial gap",
+            "Mean harm of each agent in worlds grouped by the sum of their gaps at the alert.",
+            harm_against_total_gap(evaluation),
+        ),
+        "trajectories.png": (
+            "One episode",
+            f"World {world} of the list, driven by three agents: the world whose saving of harm, policy against full"
+            " braking, is the median of all worlds in which full braking collides.",
+            trajectories(records),
+        ),
+    }
+    for name, (_, _, figure) in drawn.items():
+        write_picture(folder / name, figure, force=True)
+    return [Part.drawing(figure, title, description) for title, description, figure in drawn.values()]
+
+
+def telling_world(evaluation: Evaluation, harm_count: HarmCount = "first") -> int:
+    """Return the index of a typical world to draw: the one with the median reduction of harm by the policy.
+
+    The reduction is the harm of full braking minus the policy's harm. Only worlds in which full braking does harm
+    count.
+
+    Returns 0 if there are none. ``harm_count`` is ``first`` or ``total``.
+    """
+    before = evaluation.outcome(BESIDE[0]).world_harm(harm_count)
+    rows = np.flatnonzero(before > 0.0)
+    if not len(rows):
+        return 0
+    saved = before[rows] - evaluation.outcome(TRAINED_POLICY).world_harm(harm_count)[rows]
+    order = np.argsort(saved, kind="stable")
+    return int(rows[order[(len(order) - 1) // 2]])
+
+
+def _caption(experiment: Experiment, config: Mapping[str, Any]) -> str:
+    plan, seed = config["recipe"]["evaluation"], config["seeds"]["training"]
+    return (
+        f"{experiment.evaluation.scenario.name}: worlds 0 to {plan['worlds'] - 1} of the list of seed {plan['seed']} at"
+        f" every point; training seed {seed}. Level lines: {experiment.rows[0].parameters.line}."
+    )
+
+
+def _page(
+    experiment: Experiment,
+    rows: SummaryTable,
+    beside: Mapping[str, SummaryTable],
+    figures: Sequence[Part],
+    config: Mapping[str, Any],
+) -> Report:
+    trained, evaluation, harm_count = experiment.trained, experiment.evaluation, experiment.harm_count
+    reward = RewardParams(**config["recipe"]["reward"]).model_dump(exclude_defaults=True)
+    told = {
+        "Training": f"{config['recipe']['title'] or config['recipe']['name']}: {trained.steps:,} steps"
+        f" of {config['recipe']['total_steps']:,} ({trained.status}), {trained.wall_s:.0f} s",
+        "Start": trained.training.begins,
+        "Seeds": f"training {config['seeds']['training']}, evaluation list {evaluation.seed}",
+        "Reward": ", ".join(f"{name} {value}" for name, value in reward.items()) or "minus the first-impact harm",
+        "Harm that agents minimise": "first impacts only" if harm_count == "first" else "every impact",
+        "Whole run": f"{time.monotonic() - experiment.started:.0f} s",
+        "Settings": ", ".join(config.get("settings", ())),
+    }
+    manifest, name = trained.policy.manifest, evaluation.scenario.name
+    which = (
+        f"The {TRAINED_POLICY} is by {manifest.algorithm}, after {manifest.steps:,} steps (least harm on its own list)"
+    )
+    summary = f"{which}; hybrid is the same behind its shield."
+    if beside:
+        summary += f" {TESTS[name]} The other two tests stand below."
+    stopped = f"The training was interrupted: this is the policy after {manifest.steps:,} steps."
+    return Report(
+        f"ethbrake run: {name}",
+        rows,
+        evaluation,
+        focus=TRAINED_POLICY,
+        figures=figures,
+        tests=[(TESTS[name].partition(":")[0], TESTS[name], other) for name, other in beside.items()],
+        harm_count=harm_count,
+        remarks=[stopped] if trained.status == "interrupted" else [],
+        summary=summary,
+        settings={name: value for name, value in told.items() if value},
+        versions=installed_versions(),
+    )

@@ -1,0 +1,156 @@
+"""Films of episodes in real time: the environment's own pictures as GIF or MP4, or an animated drawing as SVG."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from ethbrake_marl.agents.driving import episode_engine
+from ethbrake_marl.agents.protocol import Driver, Team
+from ethbrake_marl.envs.rendering import Frame, Scene
+from ethbrake_marl.envs.trace import Trace
+from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, need
+from ethbrake_marl.extensions.report.moving_drawing import animate_films
+from ethbrake_marl.physics.state import Worlds
+from ethbrake_marl.scenario.schema import Scenario
+
+Films = Mapping[str, Sequence[Scene]]  # scenes of each film of one world, by title
+
+FILM_FPS = 25
+
+MOST_FILMS = 12  # most films in one file, one below the other
+
+MOST_PICTURES = 2_500  # most pictures of all films together, which need 1.8 GB of memory
+
+_COLOURS = 64
+
+
+def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float = FILM_FPS) -> list[Scene]:
+    """Return the scenes of one world from the alert to the end of its episode, ``fps`` per second, and the final scene.
+
+    Args:
+        world: the world at the alert, n = 1.
+        agent: agent of the learner, or a team of agents. It is not changed.
+        scenario: scenario of the world; its scripts control the other vehicles.
+        fps: scenes per second.
+
+    Raises ``InvalidInput`` for more than one world, ``PhysicsError`` for a world that could not be advanced.
+
+    """
+    if world.n != 1:
+        raise InvalidInput(f"film_scenes: {count_of(world.n, 'world')} given; exactly 1 is needed: worlds.take([0])")
+    engine = episode_engine(world, Team.of(agent, scenario.learners), scenario)
+    trace = Trace(engine, whole=True, alert=world)
+    while not engine.ended.all():
+        engine.step({})
+    if engine.roster.failed:
+        raise PhysicsError(engine.roster.failed)
+    end = float(engine.worlds.time_s[0])
+    times = np.append(np.arange(int(np.ceil(end * fps - 1e-9))) / fps, end)
+    shown: list[Scene] = []
+    for motion in trace.motions(engine):
+        start, until = float(motion.start.time_s[0]), float(motion.until_s[0])
+        mine = times[(times >= start if motion.fresh[0] else times > start) & (times <= until)]
+        shown += motion.scenes(engine, 0, mine) if len(mine) else []
+    return shown
+
+
+def film(world: Worlds, agents: Mapping[str, Driver], ending: str, *, scenario: Scenario) -> bytes:
+    """Let several agents control the same world, and return a film of their episodes as the bytes of a file.
+
+    Args:
+        world: the world at the alert, n = 1.
+        agents: the agents, by the title above their film.
+        ending: ``.gif``, ``.mp4`` or ``.svg``. Other endings raise ``InvalidInput`` before any work.
+        scenario: scenario of the world.
+
+    """
+    check_film(ending, len(agents))
+    films = {title: film_scenes(world, agent, scenario=scenario) for title, agent in agents.items()}
+    return film_bytes(films, ending)
+
+
+def film_bytes(films: Films, ending: str, *, fps: int = FILM_FPS) -> bytes:
+    """Return films of one world, one below the other, in real time, as the bytes of a GIF, SVG (both endless) or MP4
+    file.
+
+    A film that ends before the others keeps showing its end. Raises ``InvalidInput`` without films, for more than
+    ``MOST_FILMS`` films or ``MOST_PICTURES`` pictures, for an ``ending`` other than ``.gif``, ``.mp4`` and ``.svg``,
+    and for an ``fps`` that does not divide 100 (a GIF counts hundredths of a second). Raises ``MissingExtra`` for an
+    MP4 without the library that writes it.
+
+    Args:
+        films: scenes of each film, by its title.
+        ending: ``.gif``, ``.mp4`` or ``.svg``.
+        fps: scenes per second.
+
+    """
+    check_film(ending, len(films))
+    if not films or not all(films.values()):
+        raise InvalidInput("film_bytes: no films given")
+    if not fps > 0 or 100 % fps:
+        raise InvalidInput(f"film_bytes: fps = {fps}: must divide 100, for instance 10, 20, 25 or 50")
+    pictures = len(films) * max(map(len, films.values()))
+    if pictures > MOST_PICTURES:
+        raise InvalidInput(
+            f"film of {len(films)} agents for {pictures // len(films) / fps:g} s: needs {pictures:,} pictures,"
+            f" and at most {MOST_PICTURES:,} are kept; give fewer agents, or a scenario with a shorter horizon_s"
+        )
+    return _WRITERS[ending](films, fps)
+
+
+def check_film(ending: str, films: int = 1) -> None:
+    """Raise ``InvalidInput`` if ``film_bytes`` cannot write a file with this ``ending``, or this number of ``films``.
+
+    Raises ``MissingExtra`` for an MP4 without the library that writes it.
+    """
+    if ending not in _WRITERS:
+        raise InvalidInput(f"a film that ends in {ending!r}: films are written as {', '.join(_WRITERS)}")
+    if ending == ".mp4":
+        need("imageio_ffmpeg")
+    if films > MOST_FILMS:
+        raise InvalidInput(f"film: {films} agents, one below the other; at most {MOST_FILMS} are shown")
+
+
+def _stacked(films: Films) -> Iterator[Frame]:
+    """Yield the pictures of the film file: each shows the present frame of all films, one below the other."""
+    for k in range(max(map(len, films.values()))):
+        each = (shown[min(k, len(shown) - 1)]._replace(title=title) for title, shown in films.items())
+        yield np.concatenate([scene.frame() for scene in each])
+
+
+def _write_gif(films: Films, fps: int) -> bytes:
+    from PIL import Image
+
+    pictures = [
+        Image.fromarray(frame).quantize(_COLOURS, method=Image.Quantize.FASTOCTREE) for frame in _stacked(films)
+    ]
+    buffer = io.BytesIO()
+    pictures[0].save(buffer, "GIF", save_all=True, append_images=pictures[1:], duration=1000 // fps, loop=0)
+    return buffer.getvalue()
+
+
+def _write_mp4(films: Films, fps: int) -> bytes:
+    from imageio_ffmpeg import write_frames
+
+    frames = list(_stacked(films))
+    height, width, _ = frames[0].shape
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "film.mp4"
+        writer = write_frames(str(path), (width, height), fps=fps, quality=8)
+        writer.send(None)
+        for frame in frames:
+            writer.send(frame)
+        writer.close()
+        return path.read_bytes()
+
+
+_WRITERS: dict[str, Callable[[Films, int], bytes]] = {
+    ".gif": _write_gif,
+    ".mp4": _write_mp4,
+    ".svg": lambda films, fps: animate_films(films, fps=fps).encode(),
+}

@@ -1,0 +1,337 @@
+"""HTML pages: one file that loads nothing, can be opened from disk, and shows every input as text.
+
+A page is a title, a short lead, and sections. A section holds strings, which become paragraphs, and parts: tables,
+figures, the episode player. Strings are never markup: they are escaped, and control and direction characters are
+written as in Python.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from ethbrake_marl.envs.rendering import BODY_M
+from ethbrake_marl.errors import InvalidInput, plain_text
+from ethbrake_marl.evaluation.conditions import Conditions
+from ethbrake_marl.extensions.report.player import DATA, PLAYER_SCRIPTS, Played
+from ethbrake_marl.files.sheet import Sheet
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_STAY = "\u00a0"  # no-break space
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A piece of a page: its HTML, and the style sheets and scripts that it needs.
+
+    Class methods make the usual parts, for instance ``Part.paragraph("Text")``.
+    """
+
+    html: Markup  # markup of the piece
+    styles: tuple[str, ...] = ()  # names of style sheets in this folder
+    scripts: tuple[str, ...] = ()  # names of scripts in this folder
+
+    @classmethod
+    def paragraph(cls, text: str, kind: str = "") -> Part:
+        """Return a part with ``text`` as a paragraph.
+
+        ``kind`` is its style: ``quiet`` (conditions), ``note`` (important remark), ``alarm``, or empty.
+        """
+        return cls(Markup('<p class="{}">{}</p>\n').format(kind, shown(text)))
+
+    @classmethod
+    def heading(cls, text: str) -> Part:
+        """Return a part with ``text`` as a heading inside a section."""
+        return cls(Markup("<h3>{}</h3>\n").format(shown(text)))
+
+    @classmethod
+    def facts(cls, found: Mapping[str, object]) -> Part:
+        """Return a part that lists names with their values, one below the other; ``found`` maps names to values."""
+        lines = [Markup("<dt>{}</dt><dd>{}</dd>").format(shown(name), _text(value)) for name, value in found.items()]
+        return cls(Markup("<dl>\n{}\n</dl>\n").format(Markup("\n").join(lines)))
+
+    @classmethod
+    def remarks(cls, texts: Sequence[str]) -> Part:
+        """Return a part with ``texts`` as a list of important remarks, one line each; an empty part if none."""
+        lines = [Markup("<li>{}</li>").format(shown(text)) for text in texts]
+        return cls(Markup('<ul class="remarks">\n{}\n</ul>\n').format(Markup("\n").join(lines)) if lines else Markup())
+
+    @classmethod
+    def box(cls, title: str, meanings: Mapping[str, str]) -> Part:
+        """Return a part that explains words in a box; ``meanings`` maps each word to its meaning."""
+        return cls(Markup('<aside class="box"><strong>{}</strong>{}</aside>\n').format(title, cls.facts(meanings).html))
+
+    @classmethod
+    def beside(cls, parts: Sequence[Part]) -> Part:
+        """Return one part that shows ``parts`` side by side in equal widths; below each other on a narrow screen."""
+        return cls._around('<div class="beside">{}</div>\n', parts)
+
+    @classmethod
+    def opened(cls, title: str, parts: Sequence[Part]) -> Part:
+        """Return one part with ``parts`` under a title; they are hidden until the reader clicks on the title."""
+        return cls._around("<details><summary>{}</summary>\n{}</details>\n", parts, shown(title))
+
+    @classmethod
+    def _around(cls, markup: str, parts: Sequence[Part], *texts: str) -> Part:
+        inside = Markup("").join(part.html for part in parts)
+        styles, scripts = (tuple(n for part in parts for n in getattr(part, what)) for what in ("styles", "scripts"))
+        return cls(Markup(markup).format(*texts, inside), styles, scripts)
+
+    @classmethod
+    def data(cls, name: str, content: object, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = ()) -> Part:
+        """Return a part that holds ``content`` as JSON inside a script element, for a script of the page to read.
+
+        The text can neither end its element nor begin another one.
+
+        Args:
+            name: id of the element.
+            content: plain data: mappings, lists, texts and numbers.
+            styles: style sheets that the reading script needs.
+            scripts: names of the scripts that read it.
+
+        """
+        text = json.dumps(content, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+        for sign in "<>&":
+            text = text.replace(sign, f"\\u{ord(sign):04x}")
+        html = Markup('<script type="application/json" id="{}">{}</script>\n').format(name, Markup(text))
+        return cls(html, styles, scripts)
+
+    @classmethod
+    def template(cls, file: str, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = (), **values: object) -> Part:
+        """Return a part: the template ``file`` of this folder, filled with ``values``. Text is escaped, ``Markup`` is
+        not.
+
+        ``styles`` and ``scripts`` are names of files in this folder that it needs.
+        """
+        return cls(Markup(_environment().get_template(file).render(**values)), styles, scripts)
+
+    @classmethod
+    def table(cls, sheet: Sheet) -> Part:
+        """Return a part that shows ``sheet`` as a table, which scrolls if it is wider than the page.
+
+        A cell may be a ``Shown`` whose value is ``Markup``, for instance a button; other texts are escaped.
+        """
+        return cls(Markup(sheet.html() + "\n"))
+
+    @classmethod
+    def drawing(
+        cls,
+        figure: Figure | bytes,
+        title: str,
+        description: str,
+        *,
+        alone: bool = False,
+        known: str = "",
+        where: object = "",
+    ) -> Part:
+        """Return a part that shows a figure, or the SVG of a figure of this package, with a title and a description.
+
+        The caption is removed from the SVG and becomes text of the page below it, which a phone can show.
+
+        Args:
+            figure: the figure, or the bytes of its SVG. It takes the colours of the page, light or dark.
+            title: title above it.
+            description: what it shows, in words.
+            alone: keep the colours, as a map needs them, on a white background.
+            known: part of the caption that stands elsewhere on the page; it is left out here.
+            where: file that the SVG was read from, for the error message about a foreign SVG.
+
+        """
+        from ethbrake_marl.extensions.report.svg import inline_svg
+
+        try:
+            svg, caption = inline_svg(figure, f"{title}. {description}", recolour=not alone)
+        except InvalidInput as error:
+            raise InvalidInput(f"{where}: {error}") from None
+        for told in (known.strip(), description):
+            caption = caption.replace(told, "").strip() if told else caption
+        below = Markup('<p class="quiet">{}</p>').format(shown(caption)) if caption else Markup()
+        return cls(
+            Markup(
+                "<figure><figcaption><strong>{}</strong> <span>{}</span></figcaption>"
+                '<div class="drawing{}" tabindex="0" role="group" aria-label="{}">{}</div>{}</figure>\n'
+            ).format(shown(title), shown(description), " map" * alone, shown(title), Markup(svg), below)
+        )
+
+    @classmethod
+    def player(
+        cls,
+        worlds: Sequence[Played],
+        driven: Sequence[int] | Mapping[str, Sequence[int]],
+        *,
+        focus: str = "",
+        shown_first: Sequence[int] = (),
+        folded: bool = False,
+    ) -> Part:
+        """Return a part with the player of episodes, in which a reader watches the same worlds under different agents.
+
+        Args:
+            worlds: at least one world, with its episode under each agent.
+            driven: indices (0 = front) of the controlled vehicles; a mapping by agent if agents control different
+                vehicles.
+            focus: name of an agent that is shown at first, besides the first and the last ones.
+            shown_first: positions (from 0) of the agents that are shown at first instead; empty: the first, the focus
+                and the last.
+            folded: hide the traces until their title is clicked.
+
+        """
+        agents, one = list(worlds[0].motions), next(iter(worlds[0].motions.values())).world
+        by_agent = driven if isinstance(driven, Mapping) else dict.fromkeys(agents, driven)
+        middle = [agents.index(focus)] if focus in agents else []
+        order = dict.fromkeys([*middle, 0, *reversed(range(len(agents)))])
+        told: list[dict[str, Any]] = []
+        for world in worlds:
+            alert = next(iter(world.motions.values())).world
+            title = shown(world.title or f"World {world.number}")
+            episodes = [Played.episode(motion, by_agent[agent]) for agent, motion in world.motions.items()]
+            told.append({
+                "conditions": f"{title}: {Conditions.of(alert).quantities}.",
+                "episodes": episodes,
+                "number": world.number,
+                "title": title,
+                "kind": shown(world.kind),
+                "why": shown(world.why),
+            })  # fmt: skip
+        content = {
+            "vehicles": one.N,
+            "agents": [shown(agent) for agent in agents],
+            # the first agent, the focus, and the last ones, up to three
+            "shown": list(shown_first) or sorted(list(order)[:3]),
+            "worlds": told,
+        }
+        shielded = any(episode["stepped"] for world in told for episode in world["episodes"])
+        return cls.template(
+            "player.html.j2",
+            ("player.css",),
+            PLAYER_SCRIPTS,
+            vehicles=one.N,
+            shielded=shielded,
+            folded=folded,
+            name=DATA,
+            episodes=cls.data(DATA, content).html,
+            body=BODY_M,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """Section of a page."""
+
+    title: str  # heading, and entry in the table of contents
+    body: Sequence[str | Part]  # strings, which become paragraphs, and parts
+
+    @property
+    def parts(self) -> list[Part]:
+        """The body of the section as parts; every string becomes a paragraph."""
+        return [Part.paragraph(each) if isinstance(each, str) else each for each in self.body]
+
+
+@dataclass(frozen=True)
+class Page:
+    """A whole HTML page.
+
+    Args:
+        title: title of the page.
+        sections: sections in order; each has an entry in the table of contents.
+        lead: one or two sentences below the title that say what the page is about.
+        opening: parts between the lead and the table of contents.
+
+    >>> from ethbrake_marl.extensions.report.page import Page, Part, Section
+    >>> section = Section("Results", ["Text with <b> stays text.", Part.paragraph("small print")])
+    >>> "Text with &lt;b&gt; stays text." in Page("A page", [section]).html
+    True
+
+    """
+
+    title: str  # title of the page
+    sections: Sequence[Section]  # sections in order
+    lead: str = ""  # text below the title
+    opening: Sequence[Part] = ()  # parts between the lead and the table of contents
+
+    @cached_property
+    def _parts(self) -> list[Part]:
+        return [*self.opening, *(part for section in self.sections for part in section.parts)]
+
+    @cached_property
+    def _code(self) -> tuple[str, str]:
+        """Text of all style sheets and of all scripts of the page; each file is included once."""
+        styles = dict.fromkeys(["page.css", *(name for part in self._parts for name in part.styles)])
+        scripts = dict.fromkeys(name for part in self._parts for name in part.scripts)
+        return "\n".join(map(read_file, styles)), "\n".join(map(read_file, scripts))
+
+    @property
+    def policy(self) -> str:
+        """Content security policy of the page: its own styles and scripts, embedded pictures, and nothing else."""
+        styles, script = (
+            f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" if text else "'none'"
+            for text in self._code
+        )
+        return (
+            f"default-src 'none'; style-src {styles}; script-src {script}; img-src data:;"
+            " base-uri 'none'; form-action 'none'"
+        )
+
+    @staticmethod
+    def anchors(titles: Sequence[str]) -> list[str]:
+        """Return a unique link name for each title, of letters, digits and hyphens, for instance "worst-ten-worlds"."""
+        found: list[str] = []
+        for k, title in enumerate(titles):
+            name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:40]
+            found.append(f"{name}-{k + 1}" if name in found or not name else name)
+        return found
+
+    @cached_property
+    def html(self) -> str:
+        """The whole page as HTML text."""
+        styles, script = self._code
+        names = self.anchors([section.title for section in self.sections])
+        whole = Part.template(
+            "page.html.j2",
+            title=self.title,
+            lead=self.lead,
+            opening=self.opening,
+            sections=list(zip(names, self.sections, strict=True)),
+            policy=self.policy,
+            style=Markup(styles),
+            script=Markup(script),
+        )
+        return str(whole.html)
+
+
+def shown(value: object) -> str:
+    """Return ``value`` as text for a page, with control and direction characters escaped."""
+    return plain_text(str(value), keep=_STAY)
+
+
+@cache
+def read_file(name: str) -> str:
+    """Return the text of the file ``name`` in this folder."""
+    return files(__package__).joinpath(name).read_text("utf-8")
+
+
+@cache
+def _environment() -> Environment:
+    return Environment(
+        loader=PackageLoader("ethbrake_marl.extensions.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=_text,
+    )
+
+
+def _text(value: object) -> str:
+    return value if isinstance(value, Markup) else shown(value)

@@ -1,0 +1,95 @@
+"""Data of the episode player: what a page holds of each episode, exact between events."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.agents.protocol import Driver
+from ethbrake_marl.evaluation.motion import EpisodeMotion, follow_episodes
+from ethbrake_marl.physics.state import Worlds
+from ethbrake_marl.scenario.schema import Scenario
+
+PLAYER_SCRIPTS = ("player-motion.js", "player-view.js", "player.js")
+
+DATA = "episode_data"  # id of the data in a page; no section has it
+
+_BIN_S = 1e-3  # of several impacts of a pair within this time only the last is drawn; all are counted
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """One world of the episode player, with the motion of the vehicles under every agent."""
+
+    number: int  # number of the world in its list
+    kind: str  # reason why the world is shown, as a heading
+    why: str  # special property of the world, in a few words
+    motions: dict[str, EpisodeMotion] = field(default_factory=dict)  # motion of the vehicles, by name of the agent
+    title: str = ""  # name of the world; empty: "World" and its number
+
+    @staticmethod
+    def drive(played: Sequence[Played], worlds: Worlds, name: str, agent: Driver, scenario: Scenario) -> None:
+        """Let one agent control the worlds of ``played``, and store the motion in the ``motions`` of each entry, under
+        the agent's name.
+
+        Args:
+            played: one entry for each world.
+            worlds: the worlds at the alert, in the same order.
+            name: name of the agent on the page.
+            agent: the agent; it is not changed.
+            scenario: scenario of the worlds; its learners are the controlled vehicles.
+
+        """
+        for one, motion in zip(played, follow_episodes(worlds, agent, scenario), strict=True):
+            one.motions[name] = motion
+
+    @staticmethod
+    def episode(motion: EpisodeMotion, driven: Sequence[int]) -> dict[str, Any]:
+        """Return the data of one episode for the player's script, as a mapping.
+
+        Args:
+            motion: motion of the vehicles.
+            driven: indices of the controlled vehicles.
+
+        """
+        obstacle = float(motion.world.obstacle_gap_m[0])
+        without = 1 + 3 * motion.world.N
+        jerks = bool(motion.pieces[:, without:].any())
+        pieces = np.ascontiguousarray(motion.pieces if jerks else motion.pieces[:, :without], np.dtype("<f8"))
+        return {
+            **({"jerks": True} if jerks else {}),
+            "pieces": base64.b64encode(pieces.tobytes()).decode("ascii"),
+            "end": motion.end_s,
+            "impacts": _impacts(motion),
+            "stepped": motion.stepped_in_s.tolist(),
+            "driven": list(driven),
+            "rest": motion.at_rest,
+            "obstacle": obstacle if np.isfinite(obstacle) else None,
+        }
+
+
+def _impacts(motion: EpisodeMotion) -> list[list[float]]:
+    """Return the impacts of an episode as lists, in order of time.
+
+    Entries of a list: time (s), index of the pair, closing speed (m/s), 1 for the first impact of the pair (else 0),
+    number of the impact in the episode from 1, first-impact harm so far, total harm so far (m2/s2).
+
+    Of several impacts of a pair within ``_BIN_S`` only the last is kept. The harm after the last impact is exactly the
+    recorded harm of the episode.
+    """
+    rows = motion.impacts
+    order = np.argsort(rows.time_s, kind="stable")
+    harm = rows.closing_speed_mps[order] ** 2
+    first, total = np.cumsum(harm * rows.first[order]), np.cumsum(harm)
+    if len(harm):
+        first[np.flatnonzero(rows.first[order])[-1] :], total[-1] = motion.harm
+    told: dict[tuple[int, int, bool], list[float]] = {}
+    for number, k in enumerate(order.tolist()):
+        time, pair, is_first = float(rows.time_s[k]), int(rows.pair[k]), bool(rows.first[k])
+        entry = [time, pair, float(rows.closing_speed_mps[k]), int(is_first), number + 1]
+        told[pair, int(time / _BIN_S), is_first] = [*entry, float(first[number]), float(total[number])]
+    return sorted(told.values(), key=lambda entry: (entry[0], entry[4]))

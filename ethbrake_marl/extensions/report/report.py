@@ -1,0 +1,460 @@
+"""The HTML report of an evaluation: results, episodes, worst worlds, avoidable harm, and the value of the shield."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from ethbrake_marl.agents.learned import TRAINED_POLICY
+from ethbrake_marl.agents.protocol import Driver
+from ethbrake_marl.errors import count_of
+from ethbrake_marl.evaluation.conditions import Conditions
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.notes import identity_line
+from ethbrake_marl.evaluation.shield_modes import ShieldModes, compare_modes
+from ethbrake_marl.evaluation.statistics import mean, rate
+from ethbrake_marl.evaluation.summary import SummaryTable
+from ethbrake_marl.evaluation.summary_row import SummaryRow
+from ethbrake_marl.extensions.report.harm_figures import harm_by_agent, harm_in_parts, regret_distribution
+from ethbrake_marl.extensions.report.page import Page, Part, Section
+from ethbrake_marl.extensions.report.player import Played
+from ethbrake_marl.extensions.report.shown_worlds import BASELINE, NAMES, ROUNDING, WORDS, choose_shown, worst_rows
+from ethbrake_marl.extensions.search.limits import Unproven
+from ethbrake_marl.extensions.search.regret import limits_of, regrets_of
+from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown
+from ethbrake_marl.files.store import write_output
+from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.scenario.task import Task
+
+SHIELD_WORLDS = 200  # number of worlds in which a shield's replacements are simulated again
+
+
+def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) -> Section:
+    """Return the section on the ten worlds in which the agent ``focus`` did worst.
+
+    ``watched`` are the numbers of worlds that the page's player shows; they get a button that starts it.
+    """
+    regrets, outcome = regrets_of(evaluation), evaluation.outcome(focus)
+    avoidable = None if regrets is None else regrets.limits.proof.avoidable
+    columns: dict[str, NDArray[Any] | None] = {
+        "First-impact harm": outcome.first_impact_harm,
+        "Total harm": outcome.total_harm,
+        "Best known, first": None if regrets is None else regrets.first_impact_harm,
+        "Best known, total": None if regrets is None else regrets.total_harm,
+        "Contact": None if avoidable is None else np.where(avoidable, "avoidable", "unavoidable"),
+        "Impacts": outcome.impacts,
+    }
+    told = {name: column.tolist() for name, column in columns.items() if column is not None}
+    rows = []
+    for k in worst_rows(evaluation, focus).tolist():
+        number = int(evaluation.index[k])
+        button = Markup('{} <button type="button" data-watch="{}">Watch</button>').format(number, number)
+        rows.append([Shown(button) if number in watched else number, *(column[k] for column in told.values())])
+    why = ", as nothing is proven of these worlds" if regrets is None else " above the best known"
+    body: list[str | Part] = [f"{focus} did no harm above the best known in any of these worlds."]
+    if rows:
+        table = Part.table(Sheet(f"Worlds of {focus}", list(map(Column, ("World", *told))), rows))
+        body = [f"Of {focus}, by total harm{why}. Harm in m²/s².", table]
+    return Section("Worst ten worlds", body)
+
+
+def avoidable_section(evaluation: Evaluation) -> Section:
+    """Return the section that shows collisions, harm and regret separately for avoidable and for unavoidable
+    contact.
+    """
+    regrets, limits = regrets_of(evaluation), limits_of(evaluation)
+    body: list[str | Part] = []
+    avoidable = None if regrets is None else regrets.limits.proof.avoidable
+    if isinstance(limits, Unproven):
+        told = "Nothing is proven of these worlds, so what was avoidable is not told apart."
+        body.append(f"{told} Reason: {limits.because}.")
+    elif regrets is None or avoidable is None:
+        body.append("Where contact can be avoided is not decided for these vehicles, so that is not told apart.")
+    else:
+        share = rate(int(avoidable.sum()), len(avoidable)).in_words(digits=1, scale=100.0, unit=" %")
+        body.append(
+            f"Contact can be avoided in {share} of these worlds (proven, world by world); in the others no command can."
+        )
+        for where, among in (("Contact avoidable", avoidable), ("Contact unavoidable", ~avoidable)):
+            if among.any():
+                part = evaluation.take(among)
+                caption = f"{where}: {count_of(part.worlds.n, 'world')}"
+                rows = [
+                    (
+                        agent,
+                        rate(int(each.collided.sum()), part.worlds.n),
+                        *(mean(each.world_harm(count)) for count in HARM_COUNTS),
+                        *(mean(regrets.regret(evaluation.outcomes[agent], count)[among]) for count in HARM_COUNTS),
+                    )
+                    for agent, each in part.outcomes.items()
+                ]
+                body.append(Part.table(Sheet(caption, _SPLIT, rows)))
+        about = "Mean harm per world as the least that is known, and what each agent did above it."
+        body.append(Part.drawing(harm_in_parts(evaluation), "What the harm is made of", about))
+    title, words = "Harm world by world", "For each harm x, the share of the worlds in which an agent did more."
+    if regrets is not None:
+        title = "Regret world by world"
+        words = "For each regret x, the share of the worlds in which an agent did more than x above the best known."
+    body.append(Part.drawing(regret_distribution(evaluation), title, words))
+    return Section("What was avoidable", body)
+
+
+_SPLIT: tuple[Column | str, ...] = (
+    "Agent", Column("Collided", digits=1, scale=100.0, unit=" %"),
+    *map(Column, ("First-impact harm", "Total harm", "Regret, first-impact", "Regret, total")),
+)  # fmt: skip
+
+
+def shield_section(rows: ShieldModes, conditions: str) -> Section:
+    """Return the section that compares the shield's modes, and counts how many interventions of step mode were needed,
+    harmless or costly.
+
+    ``rows`` are the results by agent and mode, ``conditions`` a line on the worlds. The section is empty without rows.
+    """
+    if not rows:
+        return Section("Shield", ())
+    told = (
+        "Each agent alone and behind every mode of the shield. Each decision that step mode replaced was simulated"
+        " again without it: needed (harm would have been higher), harmless (the same), costly (lower)."
+    )
+    body: list[str | Part] = [told, *map(Part.table, rows.sheets()), Part.paragraph(conditions, "quiet")]
+    if left_out := rows[0].left_out:
+        told_of = count_of(len(left_out), "world")
+        body.append(Part.paragraph(f"Left out: {told_of}, which the physics could not advance.", "note"))
+    return Section("Shield", body)
+
+
+_SHORT = {"collision_rate", "first_impact_harm", "total_harm"}  # columns of the first table on the page
+
+_CAPTION = "Means with 95 % intervals, m²/s²"
+
+_OTHERS = {"Knows", "sampled_harm", "vehicle_1_shoved_m", "vehicle_1_shoved_far_rate", "predicted_harm"}
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Content of the HTML report of an evaluation.
+
+    ``html`` is the page, ``write`` writes it to a file, and ``driven`` adds episodes to watch.
+    """
+
+    title: str  # title of the page
+    rows: Sequence[SummaryRow]  # summary of each agent
+    evaluation: Evaluation  # evaluation that the rows summarise
+    played: Sequence[Played] = ()  # episodes to watch
+    shield: Section | None = None  # section on the shield; None: no shield was measured
+    focus: str = ""  # agent whose worst worlds are shown; empty: no such section
+    figures: Sequence[Part] = ()  # figures to show, as parts of a page
+    # other tests: title, how the test differs, summary of each agent
+    tests: Sequence[tuple[str, str, Sequence[SummaryRow]]] = ()
+    harm_count: HarmCount = "first"  # harm count that the agents minimised
+    remarks: Sequence[str] = ()  # important remarks, below the first sentence
+    summary: str = ""  # one or two sentences on what was compared
+    # name -> value of command, seeds and training set-up, printed unchanged
+    settings: Mapping[str, object] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)  # name -> version of software, printed unchanged
+
+    def driven(self, agents: Mapping[str, Driver], *, on_agent: Callable[[str], None] | None = None) -> Report:
+        """Return the report with episodes to watch and with the section on shields.
+
+        For the episodes every agent drives once more. Shields are measured in the first ``SHIELD_WORLDS`` worlds, in
+        every mode and without a shield.
+
+        Args:
+            agents: the evaluated agents by name; they are not changed.
+            on_agent: called with the name of each agent that is done.
+
+        """
+        evaluation, focus, harm_count = self.evaluation, self.about, self.harm_count
+        chosen = choose_shown(evaluation, focus)
+        worlds, played = evaluation.worlds.take(np.array(list(chosen), np.int64)), list(chosen.values())
+        scenario = evaluation.scenario
+        if evaluation.vehicles != scenario.learners:
+            scenario = scenario.with_learners(evaluation.vehicles)
+        for name, agent in agents.items():
+            Played.drive(played, worlds, name, agent, scenario)
+            if on_agent is not None:
+                on_agent(name)
+        some = evaluation.worlds.take(np.arange(min(evaluation.worlds.n, SHIELD_WORLDS)))
+        modes = compare_modes(agents, some, Task(evaluation.scenario, evaluation.vehicles, harm_count), behind=True)
+        line = Conditions({**evaluation.conditions, "count": some.n}).line
+        count = "First-impact" if harm_count == "first" else "Total"
+        shield = shield_section(modes, f"{count} harm, which the shield bounds, in m²/s². {line}.")
+        return replace(self, played=played, shield=shield, focus=focus)
+
+    @property
+    def about(self) -> str:
+        """Name of the agent that the page is about.
+
+        It is ``focus``, else the last agent with a trained policy, else the last agent.
+        """
+        learned = [row.agent for row in self.rows if row.policy_sha256]
+        return self.focus or (learned or [row.agent for row in self.rows] or [""])[-1]
+
+    @property
+    def html(self) -> str:
+        """The whole page as HTML text. It loads no other file."""
+        sections: list[Section | None] = [self._results(), self._episodes()]
+        if self.focus:
+            sections.append(worst_section(self.evaluation, self.focus, [one.number for one in self.played]))
+        sections += [avoidable_section(self.evaluation), self.shield, Section("Figures", self.figures)]
+        all_rows = _table_of(self.rows)
+        sheet, nowhere = all_rows.sheet(), set(_empty(all_rows))
+        for title, about, told_rows in self.tests:
+            rows = _table_of(told_rows)
+            notes = [Part.paragraph(text, "note") for text in _remarks(rows)]
+            told = [_short_table(rows), *notes, *_measured(rows), Part.paragraph(identity_line(rows), "quiet")]
+            sections.append(Section(title, [about, *told]))
+            nowhere.intersection_update(_empty(rows))
+        unseen = tuple(name for name in sheet.headings[2:] if name in nowhere)
+        seen = tuple(name for name in sheet.headings[2:] if name not in nowhere)
+        meanings = {
+            name: meaning
+            for name, meaning in all_rows.meanings().items()
+            if any(each.startswith(name) for each in seen) or not any(each.startswith(name) for each in unseen)
+        }
+        versions = [Part.facts(self.versions)] if self.versions else []
+        versions += [Part.paragraph(identity_line(all_rows), "quiet")] if all_rows else []
+        sections += [
+            Section("How to read the tables", [Part.facts(meanings)]),
+            Section("Settings and seeds", [Part.facts(self.settings)] if self.settings else ()),
+            Section("Versions", versions),
+        ]
+        shown = [section for section in sections if section is not None and section.body]
+        return Page(self.title, shown, self.first_sentence, opening=self._opening(all_rows)).html
+
+    def write(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the page to the file ``path``.
+
+        Raises ``AlreadyExists`` for an existing file unless ``force``, ``InvalidInput`` if the folder does not exist.
+        """
+        write_output(path, self.html.encode("utf-8"), force=force)
+
+    @property
+    def first_sentence(self) -> str:
+        """Sentence at the top of the page: the agent's harm against full braking and the best known harm, and where it
+        fails.
+
+        It fails in another test where it does no less harm than full braking. If it fails in none, the share of worlds
+        in which it does more harm is named.
+        """
+        rows, harm = {row.agent: row for row in self.rows}, NAMES[self.harm_count]
+        if self.about not in rows:
+            return ""
+        row, before = rows[self.about], rows.get(BASELINE)
+        name = {BASELINE: "Full braking", TRAINED_POLICY: f"The {TRAINED_POLICY}"}.get(self.about, self.about)
+        value, best = row[harm], row[f"best_known_{harm}"]
+        known = "" if best is None else f"; best known {_words(best)}"
+        impacts = "first impacts" if self.harm_count == "first" else "all impacts"
+        if before is None or row is before:
+            return f"{name} does {_words(value)} m²/s² of harm per emergency ({impacts}{known})."
+        change, decrease = _change(row, harm), row[f"harm_decrease_{self.harm_count}"]
+        much = "" if decrease is None else f"{abs(100.0 * decrease.value):.0f} % "  # None: full braking does none
+        told = "about as much harm as" if change == "as much" else f"{much}{change} harm than"
+        numbers = f"{impacts}: {_words(value)} m²/s² per emergency instead of {_words(before[harm])}{known}"
+        fails = self._fails(harm)
+        joined = ", but " if fails and change == "less" else ", and "
+        return f"{name} does {told} full braking ({numbers}){joined}{fails or 'in none of these worlds more'}."
+
+    def _fails(self, harm: str) -> str:
+        """Return a clause on where the agent does no less harm than full braking; empty if nowhere.
+
+        ``harm`` is the measure to compare, for instance ``total_harm``.
+        """
+        found = []
+        for title, _, others in self.tests:
+            rows = {row.agent: row for row in others}
+            if self.about in rows and BASELINE in rows and (change := _change(rows[self.about], harm)) != "less":
+                numbers = f"{_words(rows[self.about][harm])} instead of {_words(rows[BASELINE][harm])}"
+                found.append(f"{change} in the {title.lower()} ({numbers})")
+        if found:
+            return " and ".join(found)
+        outcomes = (self.evaluation.outcome(agent) for agent in (self.about, BASELINE))
+        after, before = (outcome.world_harm(self.harm_count) for outcome in outcomes)
+        share = float((after > before + ROUNDING).mean())
+        most = float((after - before).max())
+        return f"more in {100.0 * share:.1f} % of these worlds, by {most:.2f} at most" if share else ""
+
+    def _opening(self, rows: SummaryTable) -> list[Part]:
+        """Return the parts at the top of the page: important remarks, one figure and one table."""
+        if not rows:
+            return []
+        which = "First-impact" if self.harm_count == "first" else "Total"
+        elsewhere = {title: told for title, _, told in self.tests}
+        marks = "; marks: the other tests" if elsewhere else ""
+        figure = harm_by_agent(rows, self.harm_count, elsewhere)
+        about = f"Mean and 95 % interval{marks}."
+        drawing = Part.drawing(figure, f"{which} harm of each agent", about)
+        return [Part.remarks([*self.remarks, *_remarks(rows)]), Part.beside([drawing, _short_table(rows)])]
+
+    def _results(self) -> Section:
+        rows, limits = _table_of(self.rows), limits_of(self.evaluation)
+        because = f" Nothing is proven of these worlds: {limits.because}." if isinstance(limits, Unproven) else ""
+        told: list[str | Part] = [self.summary] if self.summary else []
+        return Section("Results", [*told, Part.box("Three words", WORDS), *_measured(rows, because)])
+
+    def _episodes(self) -> Section:
+        """Return the section with episodes to watch. Notes name agents whose second drive differs from the
+        evaluation.
+        """
+        evaluation, played = self.evaluation, self.played
+        if not played:
+            return Section("Episodes", ())
+        rows = {int(number): row for row, number in enumerate(evaluation.index)}
+        unrepeated: dict[str, int] = {}
+        for world in played:
+            for agent, motion in world.motions.items():
+                outcome, row = evaluation.outcome(agent), rows[world.number]
+                counted = (float(outcome.first_impact_harm[row]), float(outcome.total_harm[row]))
+                unrepeated[agent] = unrepeated.get(agent, 0) + (motion.harm != counted)
+        notes = [
+            f"{agent} did not repeat itself in {count_of(count, 'world')} of these: what is played there is another"
+            " episode than the one that the tables count."
+            for agent, count in unrepeated.items()
+            if count
+        ]
+        moving = sum(not all(motion.at_rest for motion in world.motions.values()) for world in played)
+        until = (
+            f"from the alert to rest, or to the horizon of {evaluation.scenario.horizon_s:g} s: in"
+            f" {count_of(moving, 'world')} the line of some agent was not at rest then, and the player says whose"
+        )
+        until = until if moving else "from the alert to rest"
+        shown, every = len(played), evaluation.worlds.n
+        told = f"{shown} of the {every:,} worlds" if shown < every else f"All {shown} worlds"
+        player = Part.player(played, evaluation.vehicles, focus=self.focus)
+        body: list[str | Part] = [f"{told}, {until}.", *(Part.paragraph(text, "note") for text in notes), player]
+        return Section("Episodes", body)
+
+
+def _words(estimate: Estimate | None) -> str:
+    """Return a mean as text, without its interval; a dash if there is no estimate."""
+    return Column("").show(estimate).value
+
+
+def _change(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
+    """Compare an agent's harm with full braking in the same worlds: "less", "more" or "as much".
+
+    It is "as much" if the interval of the difference contains 0. ``harm`` is the measure, for instance ``total_harm``.
+    """
+    difference = row[f"{harm}_difference"]
+    low, high = (0.0, 0.0) if difference is None else difference.ends
+    return "less" if high < 0.0 else "more" if low > 0.0 else "as much"
+
+
+def _table_of(rows: Sequence[SummaryRow]) -> SummaryTable:
+    """Return ``rows`` as a summary table. A table is returned unchanged, with its rows of other sources."""
+    return rows if isinstance(rows, SummaryTable) else SummaryTable(rows)
+
+
+def _short_table(rows: SummaryTable) -> Part:
+    """Return a table of each agent's collision rate, first-impact harm and total harm."""
+    return _table(SummaryTable(rows).sheet(), _CAPTION, _SHORT)
+
+
+def _remarks(rows: SummaryTable) -> list[str]:
+    """Return the texts of the important remarks about these rows."""
+    return [text for kind, text in SummaryTable(rows).notes() if kind == "note"]
+
+
+def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
+    """Return parts with the conditions of these rows and, hidden until clicked, a table of all measures with the
+    paper's rows.
+
+    ``because`` is a sentence with the reason for empty columns.
+    """
+    ours = SummaryTable(rows)
+    whole, notes, empty = rows.sheet(), ours.notes(), _empty(rows)
+    folded = [
+        _table(whole, "Every harm and what it is compared with", set(whole.names) - _OTHERS),
+        _table(ours.sheet(), "In the same worlds", _OTHERS),
+    ]
+    left_out = f"Columns without a value in any row are left out: {'; '.join(empty)}.{because}"
+    told = [*([("quiet", left_out)] if empty else []), *(note for note in rows.notes() if note not in notes)]
+    folded += [Part.paragraph(text, kind) for kind, text in told]
+    quiet = [
+        *(f"{row.parameters.line}. Harm in m²/s²." for row in rows[:1]),
+        *(t for kind, t in notes if kind == "quiet"),
+    ]
+    title = "Every measure" + (", and the paper's rows" if len(whole.rows) > len(rows) else "")
+    return [*(Part.paragraph(text, "quiet") for text in quiet), Part.opened(title, folded)]
+
+
+def _empty(rows: SummaryTable) -> list[str]:
+    """Return the headings of the columns of a summary in which no row has a value."""
+    sheet = rows.sheet()
+    filled = sheet.filled()
+    return [name for k, name in enumerate(sheet.headings) if k not in filled]
+
+
+def _table(sheet: Sheet, caption: str, names: set[str]) -> Part:
+    """Return a table of some columns of ``sheet``: its first column (the agent) and the columns in ``names`` that have
+    a value.
+
+    ``caption`` is the title of the table.
+    """
+    filled = set(sheet.filled())
+    some = sheet.only(k for k, name in enumerate(sheet.names) if k == 0 or (name in names and k in filled))
+    rows = [
+        f"The paper's {row.removeprefix('paper, ')}, as printed" if isinstance(row, str) else row for row in some.rows
+    ]
+    return Part.table(replace(some, title=caption, rows=rows))
+
+
+def write_evaluation(
+    path: Path,
+    evaluation: Evaluation,
+    rows: SummaryTable,
+    agents: Mapping[str, Driver],
+    *,
+    harm_count: HarmCount,
+    force: bool = False,
+    tell: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write the page of ``ethbrake evaluate --report`` to the file ``path``.
+
+    Raises the exceptions of ``Report.write``.
+
+    Args:
+        path: the HTML file.
+        evaluation: the evaluation of the agents.
+        rows: its summary.
+        agents: the evaluated agents by name, which drive some worlds again to be watched.
+        harm_count: harm that the agents minimise.
+        force: replace an existing file.
+        tell: called with the number of agents that are done and their total.
+
+    """
+    done: list[str] = []
+
+    def on_agent(agent: str) -> None:
+        done.append(agent)
+        if tell is not None:
+            tell(len(done), len(agents))
+
+    scenario, names, asked = evaluation.scenario, ", ".join(row.agent for row in rows), rows[0].parameters
+    scripts = ", ".join(f"{vehicle} by {script}" for vehicle, script in asked["scripts"].items())
+    report = Report(
+        f"{scenario.name}: {names}" if len(names) <= 60 else f"{scenario.name}: {len(rows)} agents compared",
+        rows,
+        evaluation,
+        harm_count=harm_count,
+        summary=scenario.title or "Agents on the same worlds.",
+        settings={
+            "Command": "ethbrake " + " ".join(sys.argv[1:]),
+            "Agents": names,
+            "Harm that agents minimise": "first impacts only" if harm_count == "first" else "every impact",
+            "Worlds": asked.line,
+            "Driven by the agents": asked.get("controlled_vehicle") or ", ".join(asked["controlled_vehicles"]),
+            "Driven by scripts": scripts or "none",
+            "Time step, horizon": f"{asked['time_step_s']:g} s, {asked['horizon_s']:g} s",
+        },
+        versions=rows[0].versions,
+    )
+    report.driven(agents, on_agent=on_agent).write(path, force=force)

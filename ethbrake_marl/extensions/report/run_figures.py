@@ -1,0 +1,93 @@
+"""Figures of a run: the learning curve, and harm against the total gap."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, PercentFormatter
+
+from ethbrake_marl.envs.rendering import COLOURS
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.statistics import mean
+from ethbrake_marl.evaluation.summary_row import SummaryRow
+from ethbrake_marl.extensions.report.style import band, finish, label_text, name_axes, new_panels, series_style
+
+_PANELS = (
+    ("first_impact_harm", "First-impact harm (m²/s²)"),
+    ("total_harm", "Total harm (m²/s²)"),
+    ("collision_rate", "Worlds with a collision"),
+)
+
+_POLICY_NUMBER = 3  # number of the series whose colour the learning policy has
+
+_POLICY = COLOURS[_POLICY_NUMBER]
+
+
+def learning_curve(
+    points: Sequence[Mapping[str, float]], *, references: Sequence[SummaryRow] = (), caption: str = ""
+) -> Figure:
+    """Draw both harms and the collision rate of a policy on a fixed list of worlds while it learns.
+
+    Raises ``InvalidInput`` without points.
+
+    Args:
+        points: evaluations in order; each has ``steps``, ``first_impact_harm``, ``total_harm`` and ``collision_rate``.
+        references: summaries of other agents, drawn as level lines.
+        caption: text below the figure.
+
+    """
+    if not points:
+        raise InvalidInput("learning_curve: no points; evaluate the policy at least once during training")
+    figure, panels = new_panels((10.0, 3.9), columns=3)
+    steps = [point["steps"] for point in points]
+    for axes, (name, label) in zip(panels, _PANELS, strict=True):
+        axes.plot(steps, [point[name] for point in points], color=_POLICY, marker="o", markersize=3.5, label="policy")
+        for number, row in enumerate(references):
+            style = series_style(number if number < _POLICY_NUMBER else number + 1)
+            axes.axhline(
+                getattr(row, name).value, color=style["color"], linestyle=style["linestyle"], linewidth=1.2,
+                label=label_text(row.agent),
+            )  # fmt: skip
+        name_axes(axes, label, "Training steps")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.set_ylim(bottom=0.0)
+    panels[2].yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+    return finish(figure, caption, panels[0])
+
+
+def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | None = None, bins: int = 12) -> Figure:
+    """Draw the mean of both harms against the sum of the gaps at the alert, one line per agent, with 95 % bands.
+
+    Raises ``InvalidInput`` for an unknown agent or ``bins < 1``.
+
+    Args:
+        evaluation: worlds, and the outcome of each agent in them.
+        agents: names of the agents to draw; None: all.
+        bins: number of groups of worlds, of equal width in the sum of gaps.
+
+    """
+    if not bins >= 1:
+        raise InvalidInput(f"harm_against_total_gap: bins = {bins}; at least 1 is needed")
+    gap, gaps = evaluation.worlds.gaps_m.sum(axis=1), [f"d{p}" for p in range(1, evaluation.worlds.N)]
+    part = np.minimum(((gap - gap.min()) / (np.ptp(gap) or 1.0) * bins).astype(np.int64), bins - 1)
+    groups = [part == k for k in np.unique(part)]
+    sum_of_gaps = " + ".join(gaps) if len(gaps) <= 3 else f"d1 + … + {gaps[-1]}"
+    figure, panels = new_panels((10.0, 4.6), columns=2, sharey=True)
+    for axes, (name, label) in zip(panels, _PANELS[:2], strict=True):
+        for number, agent in enumerate(evaluation.outcomes if agents is None else agents):
+            harm, style = getattr(evaluation.outcome(agent), name), series_style(number)
+            estimates = [mean(harm[group]) for group in groups]
+            at = [float(gap[group].mean()) for group in groups]
+            axes.plot(at, [each.value for each in estimates], label=label_text(agent), **style)
+            ends = np.array([each.ends for each in estimates])
+            if len(groups) > 1:
+                band(axes, at, ends[:, 0], ends[:, 1], style)
+            else:
+                axes.vlines(at, ends[:, 0], ends[:, 1], color=str(style["color"]), linewidth=1.2)
+        name_axes(axes, label, f"Total gap at the alert, {sum_of_gaps} (m)")
+        axes.set_ylim(bottom=0.0)
+    caption = f"Mean per group of worlds; bands: 95 % intervals. {evaluation.conditions.line}."
+    return finish(figure, caption, panels[0])

@@ -1,0 +1,78 @@
+"""Curves of several trainings: harm over training steps, with the spread over seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.report.style import GREY, band, finish, name_axes, new_panels, series_style
+from ethbrake_marl.physics.state import Floats
+
+
+@dataclass(frozen=True, slots=True)
+class SeedCurve:
+    """One quantity during several trainings of one recipe that differ in their seeds, at common steps."""
+
+    steps: Floats  # [k] training steps (or another quantity of the x axis)
+    values: Floats  # [seeds, k] value of the quantity
+
+    @classmethod
+    def of(cls, trainings: Sequence[Mapping[int, float]]) -> Self:
+        """Return the curve of several trainings, at the steps that all of them have.
+
+        Each training maps steps to values. Raises ``InvalidInput`` if there is no common step.
+        """
+        common = sorted(set.intersection(*(set(training) for training in trainings))) if trainings else []
+        if not common:
+            raise InvalidInput("curves of several seeds: the trainings were never evaluated at the same step")
+        values = [[training[step] for step in common] for training in trainings]
+        return cls(np.array(common, np.float64), np.array(values, np.float64))
+
+
+def seed_curves(
+    panels: Mapping[str, Mapping[str, SeedCurve]],
+    *,
+    logarithmic: Collection[str] = (),
+    caption: str = "",
+    x_label: str = "Training steps",
+    known: Mapping[str, float] | None = None,
+) -> Figure:
+    """Draw one panel per quantity and one line per recipe: the mean over seeds, with a band of one standard deviation.
+
+    Raises ``InvalidInput`` without panels or lines.
+
+    Args:
+        panels: label of a quantity -> name of a recipe -> its curve.
+        logarithmic: labels of panels with a logarithmic axis, on which small harm late in the training is still
+            visible. The axis stays linear if a value is not positive.
+        caption: text below the figure.
+        x_label: label of the x axis.
+        known: best known value by label, marked by a dashed line; None: no line.
+
+    """
+    if not panels or not all(panels.values()):
+        raise InvalidInput("seed_curves: nothing to draw; at least one training with one evaluation is needed")
+    figure, every = new_panels((5.0 * len(panels), 4.2), columns=len(panels))
+    for axes, (label, curves) in zip(every, panels.items(), strict=True):
+        for number, (recipe, curve) in enumerate(curves.items()):
+            style = series_style(number + 1)
+            mean, seeds = curve.values.mean(axis=0), len(curve.values)
+            spread = curve.values.std(axis=0, ddof=1) if seeds > 1 else mean * 0.0  # one seed has no spread
+            axes.plot(curve.steps, mean, label=f"{recipe}, {seeds} seed{'s' * (seeds != 1)}", **style)
+            band(axes, curve.steps, mean - spread, mean + spread, style)
+        if label in logarithmic and all((curve.values > 0.0).all() for curve in curves.values()):
+            axes.set_yscale("log")
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.yaxis.set_minor_formatter(NullFormatter())
+        if known is not None:
+            axes.axhline(known[label], label="best known", color=GREY, linestyle="--", linewidth=1.0)
+        name_axes(axes, label, x_label)
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    return finish(figure, caption, every[0])

@@ -1,0 +1,82 @@
+"""Choice of the worlds that a report shows: the worst, the typical, and some at random."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.extensions.report.player import Played
+from ethbrake_marl.extensions.search.regret import regrets_of
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.physics.state import Bools, Floats, Ints
+
+MOST_WORLDS = 50
+
+WORST = 10
+
+_EACH = 5  # number of worlds of each other kind
+
+_RANDOM_SEED = 0
+
+BASELINE = "full_brake"
+
+ROUNDING = 1e-6  # m2/s2
+
+NAMES: dict[HarmCount, str] = {"first": "first_impact_harm", "total": "total_harm"}
+
+WORDS = {
+    "Contact": "Two vehicles, or Vehicle 1 and an obstacle, touch: the gap between them is 0.",
+    "Impact": "A contact with a closing speed above 0. The square of that speed is its harm.",
+    "Collision": "A world with at least one impact.",
+}
+
+
+def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS) -> dict[int, Played]:
+    """Choose up to ``most`` worlds to show. Return a mapping: index of the world in the evaluation -> its entry for the
+    episode player.
+
+    The worlds come in this order: those in which the agent ``focus`` did worst, had an avoidable collision, saved most
+    harm against full braking, or did more harm than full braking; then worlds with typical harm, and worlds drawn at
+    random. The entries hold no motion yet.
+    """
+    outcome = evaluation.outcome(focus)
+    found: dict[int, Played] = {}
+    total, first = outcome.total_harm, outcome.first_impact_harm
+
+    def add(kind: str, rows: Sequence[int] | Ints, most_of_kind: int) -> None:
+        fresh = [int(row) for row in rows if int(row) not in found][: min(most_of_kind, most - len(found))]
+        for row in fresh:
+            why = f"{focus}: harm {first[row]:.2f} first-impact, {total[row]:.2f} total"
+            found[row] = Played(int(evaluation.index[row]), kind, why)
+
+    add(f"Where {focus} did worst", worst_rows(evaluation, focus), WORST)
+    regrets = regrets_of(evaluation)
+    avoidable = None if regrets is None else regrets.limits.proof.avoidable
+    if avoidable is not None:
+        add(f"Avoidable, and {focus} collided", _largest(total, outcome.collided & avoidable), _EACH)
+    if BASELINE in evaluation.outcomes and focus != BASELINE:
+        saved = evaluation.outcome(BASELINE).total_harm - total
+        add(f"Where {focus} saved most against {BASELINE}", _largest(saved, saved > 0.0), _EACH)
+        add(f"Where {focus} did more harm than {BASELINE}", _largest(-saved, saved < 0.0), _EACH)
+    order = np.argsort(total, kind="stable")
+    add(f"Typical of {focus}", [order[int(q * (len(order) - 1))] for q in (0.5, 0.6, 0.7, 0.8, 0.9)], _EACH)
+    add("Drawn at random", np.random.default_rng(_RANDOM_SEED).permutation(len(total))[: 2 * most], most)
+    return found
+
+
+def worst_rows(evaluation: Evaluation, focus: str) -> Ints:
+    """Return the indices of at most ten worlds in which the agent ``focus`` did worst, the worst first.
+
+    These have the largest regret in total harm, or the largest total harm if no best harm is known. Worlds in which
+    that value is 0 are left out.
+    """
+    outcome, regrets = evaluation.outcome(focus), regrets_of(evaluation)
+    value = outcome.total_harm if regrets is None else regrets.regret(outcome, "total")
+    return _largest(value, value > 0.0)[:WORST]
+
+
+def _largest(value: Floats, among: Bools) -> Ints:
+    order = np.argsort(-value, kind="stable")
+    return order[among[order]]

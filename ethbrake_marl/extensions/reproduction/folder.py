@@ -1,0 +1,308 @@
+"""The folder of a reproduction: its settings, and the types that describe its items and their results."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import chain
+from pathlib import Path
+from typing import Annotated, Any
+
+from matplotlib.figure import Figure
+from pydantic import Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass as model
+
+from ethbrake_marl.errors import InvalidInput, count_of
+from ethbrake_marl.extensions.report.page import Part
+from ethbrake_marl.extensions.reproduction.trainings import Group, groups
+from ethbrake_marl.extensions.reproduction.verdicts import (
+    LIST_SEED,
+    MOST_EPISODES,
+    WRITTEN,
+    Mode,
+    Verdict,
+    summarise_verdicts,
+)
+from ethbrake_marl.files.sheet import Estimate, Sheet, Shown, csv_text as csv_of
+from ethbrake_marl.files.store import check_target
+from ethbrake_marl.progress import OnProgress
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.training.run_folder import RunDirectory
+
+SETTINGS, RESULT = "reproduction.json", "result.json"
+
+FORMAT = {"format": "ethbrake-reproduction", "format_version": 2}
+
+LIMIT_BYTES = 16 << 20  # largest size of a figure file that is read again
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reproduction:
+    """Settings of a reproduction of the paper's figures and tables."""
+
+    mode: Mode  # ``quick``: train nothing, use shipped policies; ``full``: also use trainings
+    folder: Path  # folder of all results, and of the trainings
+    episodes: int = MOST_EPISODES  # largest number of worlds of a list; the paper has 10,000
+    tell: OnProgress = lambda progress: None  # called with the progress
+    machine: str = ""  # description of the machine, for the results
+    docs: Path | None = None  # Markdown page of the results to write; None: no such page
+
+    def __post_init__(self) -> None:
+        """Raise ``InvalidInput`` if the name of the Markdown page does not end in ``.md``, or it cannot be written."""
+        if self.docs is not None:
+            if self.docs.suffix != ".md":
+                raise InvalidInput(f"{self.docs}: must end in .md")
+            check_target(self.docs, force=True)
+
+    def seeds_of(self, wanted: Collection[str]) -> list[tuple[Group, str, list[Path]]]:
+        """Return the trainings of the groups named in ``wanted``, as (group, name of the recipe, folder of each seed).
+
+        There is one entry for each recipe of each group. The list is empty in mode ``quick``.
+        """
+        return [
+            (
+                group,
+                name,
+                [self.folder / "trainings" / group.name / f"{name}-seed{seed}" for seed in range(group.seeds)],
+            )
+            for group in groups().values()
+            if group.name in wanted and self.mode == "full"
+            for name in group.trained
+        ]
+
+    def trained(self, wanted: Collection[str]) -> dict[str, list[Path]]:
+        """Return the recipes whose seeds are all trained, as ``group/recipe``, with the folder of each seed.
+
+        ``wanted`` are names of groups.
+        """
+        return {
+            f"{group.name}/{name}": paths
+            for group, name, paths in self.seeds_of(wanted)
+            if all(RunDirectory(path).is_finished for path in paths)
+        }
+
+    def seconds_left(self, wanted: Collection[str]) -> float:
+        """Return the time (s) that one core needs for the remaining trainings of the groups named in ``wanted``.
+
+        Unfinished trainings count in full.
+        """
+        return sum(
+            group.trained[name][0].decisions / group.trained[name][0].per_s
+            for group, name, paths in self.seeds_of(wanted)
+            for path in paths
+            if not RunDirectory(path).is_finished
+        )
+
+    def train(self, wanted: Collection[str]) -> bool:
+        """Run the remaining trainings of the groups named in ``wanted``, in order. Return False if Ctrl-C stopped
+        them.
+        """
+        from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
+
+        for group in groups().values():
+            if group.name in wanted:
+                plan = [(recipe, group.seeds) for _, recipe in group.trained.values()]
+                place = self.folder / "trainings" / group.name
+                if not LearningCurves(load_scenario(group.scenario), plan, place).train(tell=self.tell):
+                    return False
+        return True
+
+    def cost(self, items: Sequence[Item]) -> str:
+        """Return one line of text on the work left to do for ``items`` and the time it takes."""
+        wanted = {group for item in items for group in item.trained} if self.mode == "full" else set()
+        told = (
+            f"to do: {count_of(len(items), 'item')}, at most about {sum(item.most_s for item in items)} s of one core"
+        )
+        training_s = self.seconds_left(wanted)
+        return f"{told}; trainings before them about {training_s / 60.0:.0f} min of one core" if wanted else told
+
+
+@model(frozen=True, config=WRITTEN)
+class Parameter:
+    """A quantity that affects an item (a figure or table of the paper), and the origin of its value."""
+
+    name: str  # name of the quantity
+    value: str  # its value as text, with unit
+    origin: str = "our default"  # origin of the value: our default, or the place where the paper states it
+
+
+def stated(name: str, value: str, where: str) -> Parameter:
+    """Return a parameter with the place where the paper states it; if ``where`` is empty, the value is our default."""
+    return Parameter(name, value, f"stated in the paper ({where})") if where else Parameter(name, value)
+
+
+@model(frozen=True, config=WRITTEN)
+class Table:
+    """A table as text, as it is stored in a result."""
+
+    title: str  # title above the table
+    head: Sequence[str]  # headings of the columns
+    rows: Sequence[Sequence[Shown]]  # cells of each row: a value and, if there is one, an interval
+    note: str = ""  # text below the table
+
+
+@model(frozen=True, config=WRITTEN)
+class Drawn:
+    """Names of a figure of an item: the stem of its files, its title, and a description in words."""
+
+    stem: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,63}$")]  # name of its files without ending
+    title: str  # title above the figure
+    text: str  # description of what the figure shows
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """Result of reproducing an item (a figure or table of the paper), before it is written to files."""
+
+    verdicts: Sequence[Verdict]  # verdict on each comparison with the paper
+    parameters: Sequence[Parameter]  # quantities that affect the item
+    tables: Sequence[Sheet] = ()  # tables to show
+    figures: Mapping[Drawn, Figure] = field(default_factory=dict)  # figures to show, each with its names
+    data: Mapping[str, str] = field(default_factory=dict)  # CSV files: stem of the file name -> its text
+    notes: Sequence[str] = ()  # sentences on what was run and what was not
+
+
+@model(frozen=True, config=WRITTEN, kw_only=True)
+class Result:
+    """An item (a figure or table of the paper) and its result, as stored in its file and shown on pages."""
+
+    name: str  # name on the command line and of its folder
+    labels: Sequence[str]  # labels in the paper's source
+    title: str  # title of the item
+    what: str  # description of the paper's figure or table, one sentence
+    mode: Mode = "quick"  # ``quick`` or ``full`` (with trainings)
+    episodes: int = MOST_EPISODES  # largest number of worlds of a list
+    trained: Sequence[str]  # trainings that were used, as ``group/recipe``
+    processor_s: float  # processor time without the trainings, s
+    made_utc: str  # date and time (UTC, ISO 8601)
+    machine: str  # description of the machine
+    verdict: Verdict  # summary of all verdicts
+    comparisons: Sequence[Verdict]  # verdict on each comparison with the paper
+    parameters: Sequence[Parameter]  # quantities that affect the item
+    tables: Sequence[Table]  # tables to show
+    figures: Sequence[Drawn]  # names of the figures
+    data: Sequence[str]  # names of the CSV files
+    notes: Sequence[str]  # sentences on what was run and what was not
+
+    def in_words(self) -> dict[str, Any]:
+        """Return the result as plain data (mappings, lists and texts), in which each cell of a table is one text."""
+        tables = [
+            {**asdict(table), "rows": [[cell.in_words for cell in row] for row in table.rows]} for table in self.tables
+        ]
+        return asdict(self) | {"tables": tables}
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One figure or table of the paper, and the function that reproduces it."""
+
+    name: str  # name on the command line and of its folder
+    labels: tuple[str, ...]  # labels in the paper's source
+    title: str  # title of the item
+    what: str  # description of the paper's figure or table, one sentence
+    make: Callable[[Reproduction], Made]  # function that reproduces it with these settings
+    most_s: float  # upper estimate of processor seconds with the paper's numbers of worlds
+    trained: tuple[str, ...] = ()  # groups of trainings that it shows with ``--full``
+    play: Callable[[], Part] | None = None  # function that returns the player of episodes for its page; None: no player
+
+
+def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return a CSV file as text: the line ``head``, then ``rows``.
+
+    An ``Estimate`` in a row fills three columns: value, low, high; ``head`` needs a name for each of them.
+    """
+    parts = ([(e.value, *(e.interval or ("", ""))) if isinstance(e, Estimate) else (e,) for e in row] for row in rows)
+    return csv_of([dict(zip(head, chain(*row), strict=True)) for row in parts], head)
+
+
+_SETTING = "sec:result, text to Fig:Harm-ivds"
+
+_QUANTITIES = (  # name, key of a scenario, unit, place where the paper states it
+    ("braking capacities", "braking_capacity_mps2", "m/s²", _SETTING),
+    ("driving capacities", "driving_capacity_mps2", "m/s²", _SETTING),
+    ("masses", "mass_t", "t", _SETTING),
+    ("gaps", "gaps_m", "m", "the item's text"),
+    ("speeds", "speeds_mps", "m/s", "the item's text"),
+    ("latencies (Vehicle 1, 2, 3)", "latency_s", "s", _SETTING),
+    ("restitution e", "restitution", "", ""),
+    ("time step", "time_step_s", "s", ""),
+    ("horizon", "horizon_s", "s", ""),
+    ("speed limit v_max", "speed_limit_mps", "m/s", ""),
+)
+
+POLICIES = "PPO and SAC are the shipped policies, trained on paper-random at 0.5 and 0.8 s"
+
+FIRST_IMPACTS = stated("harm", "each pair's first impact", "sec:result, Experimental Set-Up")
+
+
+def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
+    """Return the quantities of a scenario as parameters, each with its origin.
+
+    The origin is the place in the paper that states the quantity (``_QUANTITIES``). ``places`` replaces it: key of the
+    scenario -> other place; an empty text marks our default.
+    """
+    content = scenario.model_dump(mode="json", exclude_none=True)
+    found = [
+        stated(name, f"{_plain(content[key])}{f' {unit}' if unit else ''}", places.get(key, where))
+        for name, key, unit, where in _QUANTITIES
+        if key in content
+    ]
+    early = "worlds in which Vehicle 2 is hit before it may act are drawn again"
+    return [*found, stated("early impacts", early, "sec:system_model, assumed away")]
+
+
+def list_parameter(episodes: int, where: str = "") -> Parameter:
+    """Return the number of worlds, ``episodes``, and the seed of their list as a parameter.
+
+    The paper states the number at ``where`` (empty: our default). The seed is ours: the paper only says "a fixed random
+    seed".
+    """
+    return stated("worlds", f"{episodes:,}, the first of the list of seed {LIST_SEED}", where)
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, Mapping):
+        return "; ".join(f"{name} {_plain(each)}" for name, each in value.items())
+    if isinstance(value, list):
+        return "(" + ", ".join(_plain(each) for each in value) + ")"
+    return f"{value:g}" if isinstance(value, int | float) else str(value)
+
+
+H_STAR = stated("H*", "realised (ours) and predicted pair by pair (the paper's)", "sec:baseline_drl, Hybrid DRL")
+
+NOT_THEIRS = Parameter("policies", f"{POLICIES}; not the paper's")
+
+
+def json_text(content: Mapping[str, Any]) -> bytes:
+    return (json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
+
+
+def checked_result(content: Mapping[str, Any], where: Path | str, name: str) -> Result:
+    """Return the result that an item's file holds.
+
+    Raises ``InvalidInput`` if an entry is missing or has another type than pages need, or if it is another item's.
+
+    Args:
+        content: content of the file.
+        where: path of the file, for the error message.
+        name: name of the item.
+
+    """
+    try:
+        result = TypeAdapter(Result).validate_json(json.dumps(content))
+    except ValidationError as error:
+        wrong = ": ".join(map(str, error.errors()[0]["loc"]))
+    else:
+        lines = [(each.head, row) for each in result.tables for row in [each.head, *each.rows]]
+        checks = {
+            "name": result.name == name,
+            "data": all(Path(file).name == file for file in result.data),
+            "tables: rows": all(head and len(row) == len(head) for head, row in lines),
+            "verdict": result.verdict == summarise_verdicts(result.comparisons),
+        }
+        wrong = next((what for what, is_right in checks.items() if not is_right), "")
+    if wrong:
+        raise InvalidInput(f"{where}: {wrong}: is not what a reproduction writes; make it again (--force)")
+    return result

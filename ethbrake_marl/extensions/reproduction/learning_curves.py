@@ -1,0 +1,175 @@
+"""Learning curves: several seeds of several recipes on one scenario, in one folder, with one figure."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.spec import split_names
+from ethbrake_marl.errors import InvalidInput, count_of
+from ethbrake_marl.evaluation.identity import result_identity, worlds_sha256
+from ethbrake_marl.evaluation.seeds import interquartile_mean
+from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
+from ethbrake_marl.extensions.report.style import write_picture
+from ethbrake_marl.extensions.studies.folder import StudyFolder
+from ethbrake_marl.extensions.studies.trainings import TrainingJob, train_all
+from ethbrake_marl.files.sheet import csv_text
+from ethbrake_marl.files.store import write_output
+from ethbrake_marl.game.harm import HARM_COUNTS
+from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.progress import OnProgress
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.training import Training
+
+_RETURNED = "return"  # name of the metric here
+
+_LABELS = {
+    "first_impact_harm": "First-impact harm on the fixed list (m²/s²)",
+    "total_harm": "Total harm on the fixed list (m²/s²)",
+    "return": "Mean return of training episodes",
+}
+
+Against = Literal["steps", "cpu"]  # training steps, or processor seconds of learning
+
+AXES: dict[Against, tuple[str, str, type]] = {  # column, label of the axis, type of its numbers
+    "steps": ("steps", "Training steps", int),
+    "cpu": ("cpu_s", "Processor time of learning (s)", float),
+}
+
+
+class LearningCurves(NamedTuple):
+    """Trainings of several recipes with several seeds each on one scenario, stored in ``folder/RECIPE-seedK``."""
+
+    scenario: Scenario  # scenario of all trainings
+    plan: Sequence[tuple[TrainingRecipe, int]]  # recipes, each with its number of seeds: 0, 1, ...
+    folder: Path  # folder of the trainings, the figure and the tables
+    against: Against = "steps"  # quantity on the x axis: ``steps`` or ``cpu``
+
+    @staticmethod
+    def parse(text: str) -> list[tuple[TrainingRecipe, int]]:
+        """Return recipes with their numbers of seeds from a text such as ``ppo:5,sac:3`` (names or paths).
+
+        Raises ``InvalidInput`` for another form or two recipes of the same name.
+        """
+        found = []
+        for part in split_names(text, lambda part: os.path.isfile(part.rpartition(":")[0])):
+            match = re.fullmatch(r"(.+):([1-9][0-9]{0,3})", part)
+            if match is None:
+                raise InvalidInput(f"recipes {text!r}: {part!r} must be RECIPE:SEEDS, for instance ppo:5,sac:3")
+            found.append((load_recipe(match[1]), int(match[2])))
+        if len({recipe.name for recipe, _ in found}) < len(found):
+            raise InvalidInput(f"recipes {text!r}: two recipes have the same name")
+        return found
+
+    def train(
+        self, *, steps: int | None = None, settings: Sequence[str] = (), jobs: int = 1, tell: OnProgress | None = None
+    ) -> bool:
+        """Train every seed of every recipe. Finished trainings are kept, unfinished ones continue.
+
+        Returns False if Ctrl-C stopped it. Raises ``InvalidInput`` before any training if the folder holds a different
+        training, and the exceptions of ``train_all``.
+
+        Args:
+            steps: training steps of each training; None: the recipe's.
+            settings: ``KEY=VALUE`` changes of scenario and recipe, only to be written to each training's
+                ``config.json``.
+            jobs: number of trainings at a time.
+            tell: called with the progress.
+
+        """
+        trainings = [
+            TrainingJob(
+                Training.of(
+                    recipe, self.scenario, seed=seed, total_steps=recipe.total_steps if steps is None else steps
+                ),
+                self._run(recipe, seed),
+                tuple(settings),
+            )
+            for recipe, seeds in self.plan
+            for seed in range(seeds)
+        ]
+        written = [f"learning_curves.{ending}" for ending in ("png", "csv", "json")]
+        with StudyFolder(self.folder, "learning curves", writes=written).work():
+            return train_all(trainings, jobs, tell)
+
+    def write(self) -> dict[str, Any]:
+        """Draw the finished trainings, write figure, table and summary to the folder, and return the summary.
+
+        For each recipe the summary has the harm of the policies that the trainings kept, and of their last policies:
+        each is an interquartile mean over seeds, with a stratified bootstrap interval. It also has the hashes of the
+        recipe's fixed list and of the kept policies.
+
+        Raises ``InvalidInput`` if the trainings have no common evaluation step.
+        """
+        scenario, curves, lists = self.scenario, self.curves(), set()
+        summary: dict[str, Any] = {
+            **result_identity("learning-curves", scenario, None),
+            "scenario": scenario.name,
+            "recipes": {},
+        }
+        for recipe, seeds in self.plan:
+            values = curves[RunDirectory.HARM[recipe.reward.harm_count]][recipe.name].values
+            fixed = scenario.sample(recipe.evaluation.worlds, recipe.evaluation.seed)
+            lists.add((recipe.evaluation.worlds, recipe.evaluation.seed))
+            reached = {}
+            for name, harms in {"kept": values.min(axis=1), "last": values[:, -1]}.items():
+                mean, each = interquartile_mean([harms]).to_json(), harms.tolist()
+                reached[name] = {"interquartile_mean": mean["value"], "interval": mean["interval"], "each": each}
+            summary["recipes"][recipe.name] = {
+                "worlds_sha256": worlds_sha256(fixed.worlds, fixed.index),
+                "policy_sha256": [
+                    load_policy(self._run(recipe, seed)).manifest.manifest_sha256 for seed in range(seeds)
+                ],
+                "seeds": seeds,
+                **reached,
+            }
+        fixed_lists = "; ".join(f"{count_of(worlds, 'world')} of seed {seed}" for worlds, seed in sorted(lists))
+        caption = f"{scenario.name}: mean over seeds, bands: one standard deviation. Fixed list: {fixed_lists}."
+        panels = {_LABELS[metric]: lines for metric, lines in curves.items()}
+        column, axis, number = AXES[self.against]
+        harms = [_LABELS[metric] for metric in curves if metric != _RETURNED]
+        figure = seed_curves(panels, logarithmic=harms, caption=caption, x_label=axis)
+        write_picture(self.folder / "learning_curves.png", figure, force=True)
+        rows = [
+            {"figure": metric, "recipe": recipe, "seed": seed, column: number(step), "value": float(value)}
+            for metric, lines in curves.items()
+            for recipe, curve in lines.items()
+            for seed, values in enumerate(curve.values)
+            for step, value in zip(curve.steps, values, strict=True)
+        ]
+        texts = {"csv": csv_text(rows), "json": json.dumps(summary, indent=2, allow_nan=False) + "\n"}
+        for ending, text in texts.items():
+            write_output(self.folder / f"learning_curves.{ending}", text.encode(), force=True)
+        return summary
+
+    def _run(self, recipe: TrainingRecipe, seed: int) -> Path:
+        return self.folder / f"{recipe.name}-seed{seed}"
+
+    def curves(self) -> dict[str, dict[str, SeedCurve]]:
+        """Return the learning curves: metric -> name of the recipe -> curve over all its seeds.
+
+        Metrics are the counts of harm that the recipes' rewards use, and the return; a metric without values is left
+        out. If ``against`` is ``cpu``, the x value of a step is the processor time that seeds took to it, on average.
+        """
+        counts = {recipe.reward.harm_count for recipe, _ in self.plan}
+        metrics = [RunDirectory.HARM[count] for count in HARM_COUNTS if count in counts]
+        curves: dict[str, dict[str, SeedCurve]] = {metric: {} for metric in (*metrics, _RETURNED)}
+        for recipe, seeds in self.plan:
+            runs = [RunDirectory(self._run(recipe, seed)) for seed in range(seeds)]
+            spent = [run.cpu_s() for run in runs] if self.against == "cpu" else []
+            for metric in curves:
+                values = [run.column(RunDirectory.RETURN if metric == _RETURNED else f"eval/{metric}") for run in runs]
+                if metric != _RETURNED or all(values):  # no episode may have ended in a very short training
+                    curve = SeedCurve.of(values)
+                    each = [np.interp(curve.steps, [*seconds], [*seconds.values()]) for seconds in spent]
+                    curves[metric][recipe.name] = replace(curve, steps=np.mean(each, axis=0)) if each else curve
+        return {metric: lines for metric, lines in curves.items() if lines}

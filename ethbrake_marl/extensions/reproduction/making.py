@@ -1,0 +1,133 @@
+"""Make the requested items in their folder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+
+from ethbrake_marl import __version__
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.extensions.report.style import write_picture
+from ethbrake_marl.extensions.reproduction.folder import (
+    FORMAT,
+    RESULT,
+    SETTINGS,
+    Item,
+    Reproduction,
+    Result,
+    Table,
+    json_text,
+)
+from ethbrake_marl.extensions.reproduction.items import ITEMS, read_results
+from ethbrake_marl.extensions.reproduction.pages import render_page, write_docs
+from ethbrake_marl.extensions.reproduction.verdicts import summarise_verdicts
+from ethbrake_marl.extensions.studies.folder import StudyFolder
+from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.files.store import write_file, write_output
+
+
+def choose_items(names: Sequence[str]) -> list[Item]:
+    """Return the items (figures and tables of the paper) with these names, in the order of the paper; if none is named,
+    all.
+
+    Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for a repeated name.
+    """
+    known = {item.name: item for item in ITEMS}
+    for k, name in enumerate(names):
+        if name not in known:
+            raise unknown_name("item", name, known)
+        if name in names[:k]:
+            raise InvalidInput(f"item {name!r} is given twice")
+    return [item for item in ITEMS if not names or item.name in names]
+
+
+def open_folder(asked: Reproduction, *, force: bool = False) -> StudyFolder:
+    """Return the folder of a reproduction as a ``StudyFolder``, which continues an earlier one with the same settings.
+
+    ``asked`` are the settings. With ``force`` the results in the folder are deleted; its trainings stay. Raises
+    ``InvalidInput`` if the folder is a link.
+    """
+    path, question = asked.folder, {"episodes": asked.episodes, "version": __version__}
+    if path.is_symlink():
+        raise InvalidInput(f"{path}: is no plain folder; give another (--output)")
+    if force and (path / SETTINGS).is_file() and read_object(path / SETTINGS).get("format") == FORMAT["format"]:
+        for item in ITEMS:  # figures and data are replaced when the item is made again
+            (path / item.name / RESULT).unlink(missing_ok=True)
+        write_file(path / SETTINGS, json_text({**FORMAT, **question}))
+    advice = "give another folder (--output), or replace it with force (--force)"
+    return StudyFolder(
+        path, "reproduction", question, record=SETTINGS, more=FORMAT, advice=advice, beside=("trainings",),
+        writes=("index.html",),
+    )  # fmt: skip
+
+
+def make_items(asked: Reproduction, items: Sequence[Item], *, force: bool = False) -> tuple[list[Result], bool]:
+    """Reproduce items (figures and tables of the paper). Return all results in the folder, and whether all trainings
+    ended.
+
+    Items without trainings come first. An existing result from the same trainings is kept. After each item the page is
+    rewritten. Ctrl-C during a training ends all trainings, and items use the finished ones; a second Ctrl-C stops at
+    once. Raises the exceptions of ``open_folder`` and ``StudyFolder.work``.
+
+    Args:
+        asked: settings of the reproduction.
+        items: items to reproduce.
+        force: make existing results again.
+
+    """
+    full, finished = asked.mode == "full", True
+    with open_folder(asked, force=force).work():
+        for item in sorted(items, key=lambda each: len(each.trained) if full else 0):
+            if full and finished:
+                finished = asked.train(item.trained)
+            trained = list(asked.trained(item.trained))
+            kept = {result.name: list(result.trained) for result in read_results(asked.folder)}
+            if kept.get(item.name) != trained:
+                _make_item(asked, item, trained)
+                write_file(asked.folder / "index.html", render_page(asked.folder, read_results(asked.folder)).encode())
+        results = read_results(asked.folder)
+    if asked.docs is not None:
+        write_docs(asked.docs, asked.folder, results)
+    return results, finished
+
+
+def _make_item(asked: Reproduction, item: Item, trained: Sequence[str]) -> None:
+    """Reproduce an item; write its figures and data, then its result file, which marks it as complete.
+
+    ``trained`` names the trainings that it uses, as ``group/recipe``.
+    """
+    place, started = asked.folder / item.name, time.process_time()
+    made = item.make(asked)
+    result = Result(
+        name=item.name,
+        labels=item.labels,
+        title=item.title,
+        what=item.what,
+        mode=asked.mode,
+        episodes=asked.episodes,
+        trained=trained,
+        processor_s=round(time.process_time() - started, 1),
+        made_utc=datetime.now(UTC).isoformat(timespec="seconds"),
+        machine=asked.machine,
+        verdict=summarise_verdicts(made.verdicts),
+        comparisons=made.verdicts,
+        parameters=made.parameters,
+        tables=[
+            Table(each.title, each.headings, [row for row in each.shown() if not isinstance(row, str)], each.note)
+            for each in made.tables
+        ],
+        figures=list(made.figures),
+        data=sorted(f"{stem}.csv" for stem in made.data),
+        notes=made.notes,
+    )
+    if place.is_symlink() or (place.exists() and not place.is_dir()):
+        raise InvalidInput(f"{place}: is no plain folder; move it away")
+    place.mkdir(exist_ok=True)
+    for drawn, figure in made.figures.items():
+        for ending in (".svg", ".png"):
+            write_picture(place / f"{drawn.stem}{ending}", figure, force=True)
+    for stem, text in made.data.items():
+        write_output(place / f"{stem}.csv", text.encode(), force=True)
+    write_output(place / RESULT, json_text(asdict(result)), force=True)

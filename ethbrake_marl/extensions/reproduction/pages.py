@@ -1,0 +1,174 @@
+"""Pages of a reproduction: one self-contained HTML file, and a Markdown page with figures beside it."""
+
+from __future__ import annotations
+
+import json
+import re
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from urllib.parse import quote
+
+from markupsafe import Markup
+
+from ethbrake_marl.errors import plain_text
+from ethbrake_marl.extensions.report.page import Page, Part, Section, shown
+from ethbrake_marl.extensions.reproduction.folder import LIMIT_BYTES, Result
+from ethbrake_marl.extensions.reproduction.items import ITEMS
+from ethbrake_marl.extensions.reproduction.verdicts import HOW_JUDGED, MOST_EPISODES
+from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.files.sheet import Column, Sheet, Shown
+from ethbrake_marl.files.store import write_output
+
+_TITLE = "The paper, made again"
+
+_PAPER = "How to Brake? Ethical Emergency Braking with Deep Reinforcement Learning"
+
+_LEAD = f" of {_PAPER}, with the paper's numbers and statements. {HOW_JUDGED}"
+
+_NUMERAL = re.compile(r"[-+−]?\d[\d,.]*( ?%)?|–|")
+
+
+def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
+    """Return four texts on the results and the run that made them.
+
+    These are the lead sentence; the command that makes the results; date, machines and processor time; and a list with
+    a remark if lists are shorter than the paper's, else empty.
+    """
+    every = len(results) == len(ITEMS)
+    most = max((result.episodes for result in results), default=MOST_EPISODES)
+    fewer = most < MOST_EPISODES
+    names = [] if every else [result.name for result in results]
+    mode = "--full" if any(result.mode == "full" for result in results) else "--quick"
+    command = ["ethbrake reproduce", *names, mode, *(["--episodes", str(most)] if fewer else [])]
+    unloaded = [
+        re.sub(r", load [0-9.]+", "", each.machine) for each in results
+    ]  # without the load, which differs between items
+    machines = (f"{each.made_utc[:10]}, {machine}" for each, machine in zip(results, unloaded, strict=True))
+    seconds = sum(each.processor_s for each in results)
+    return (
+        f"Every figure and table{_LEAD}" if every else f"{len(results)} of the {len(ITEMS)} items{_LEAD}",
+        " ".join(command),
+        f"{'; '.join(dict.fromkeys(machines))}; {seconds:.0f} s of one core without the trainings",
+        [f"At most {most:,} worlds of each list are driven here; the paper has {MOST_EPISODES:,}."] if fewer else [],
+    )
+
+
+def render_page(folder: Path, results: Sequence[Result]) -> str:
+    """Return the page with all results as HTML text; ``folder`` holds their figures.
+
+    Raises ``InvalidInput`` for a missing figure, or a figure with elements that our figures do not contain.
+    """
+    lead, command, made, few = _account(results)
+    _, *names = Page.anchors(["Overview", *(result.title for result in results)])
+    link = Markup('<a href="#{}">{}</a>')
+    rows = [
+        [Shown(link.format(name, shown(each.title))), Shown(_outcome(each.verdict.outcome), each.verdict.because)]
+        for name, each in zip(names, results, strict=True)
+    ]
+    overview = [
+        Part(Markup("<p>Made by <code>{}</code> ({}).</p>\n").format(shown(command), shown(made))),
+        *(Part.paragraph(text, "note") for text in few),
+        Part.table(Sheet("Verdict on each item", ["Item", "Verdict"], rows)),
+    ]
+    return Page(_TITLE, [Section("Overview", overview), *(_section(folder, each) for each in results)], lead).html
+
+
+def _section(folder: Path, result: Result) -> Section:
+    code, link = Markup("<code>{}</code>"), Markup('<a href="./{}/{}">{}</a>')
+    data = [
+        link.format(quote(result.name, ""), quote(file, ""), shown(f"{result.name}/{file}")) for file in result.data
+    ]
+    account = {
+        "Verdict": _outcome(result.verdict.outcome),
+        "Because": result.verdict.because,
+        "In the paper's source": Markup(", ").join(code.format(shown(label)) for label in result.labels),
+        "Data": Markup(", ").join(data),
+    }
+    facts = Part.facts({name: value for name, value in account.items() if value})
+    body: list[str | Part] = [result.what, facts, *result.notes]
+    for drawn in result.figures:
+        file = folder / result.name / f"{drawn.stem}.svg"
+        body.append(Part.drawing(read_plain(file, LIMIT_BYTES), drawn.title, drawn.text, where=file))
+    for item in ITEMS:
+        if item.name == result.name and item.play is not None:
+            body += [Part.heading("Episodes"), item.play()]
+    for each in result.tables:
+        words = [not all(_NUMERAL.fullmatch(value) for value, _ in column) for column in zip(*each.rows, strict=True)]
+        columns = [
+            Column(name, text=wordy) for name, wordy in zip(each.head, words or [False] * len(each.head), strict=True)
+        ]
+        body.append(Part.table(Sheet(each.title, columns, [[row[0].in_words, *row[1:]] for row in each.rows])))
+        body += [Part.paragraph(each.note, "quiet")] if each.note else []
+    compared = [[each.what, Shown(_outcome(each.outcome), each.because)] for each in result.comparisons]
+    comparisons = Part.table(Sheet("Comparisons with the paper", ["What", "Verdict"], compared))
+    shaped = [[each.name, each.value, each.origin] for each in result.parameters]
+    parameters = Part.table(Sheet("What shapes the item", ["Parameter", "Value", "Origin"], shaped))
+    rest = (
+        Part.opened(f"Comparisons: {len(compared)}", [comparisons]),
+        Part.opened(f"Parameters: {len(shaped)}", [parameters]),
+    )
+    return Section(result.title, [*body, *rest])
+
+
+def _outcome(word: str) -> Markup:
+    """Return the outcome of a verdict, such as "agrees", as HTML with a sign and a colour."""
+    return Markup('<span class="outcome {}">{}</span>').format(word.replace(" ", "-"), word)
+
+
+FIGURES, PREFIX = "figures", "reproduction-"  # folder and file prefix of the figures of docs/reproduction.md
+
+
+def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
+    """Write the Markdown page to ``file``, the results as ``.json`` beside it, and the figures into a folder
+    ``figures``.
+
+    Existing files are replaced. ``folder`` holds the figures of the results.
+    """
+    figures = file.parent / FIGURES
+    figures.mkdir(exist_ok=True)
+    for result in results:
+        for drawn in result.figures:
+            data = read_plain(folder / result.name / f"{drawn.stem}.svg", LIMIT_BYTES)
+            write_output(figures / f"{PREFIX}{drawn.stem}.svg", data, force=True)
+    content = json.dumps([each.in_words() for each in results], indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    write_output(file.with_suffix(".json"), content.encode(), force=True)
+    write_output(file, docs_page(results).encode(), force=True)
+
+
+def docs_page(results: Sequence[Result]) -> str:
+    """Return the Markdown page of these results, with the verdict on each item. The ``.json`` file has all the rest."""
+    lead, command, made, few = _account(results)
+    blocks = [
+        f"# {_TITLE}",
+        "What comes out where the paper's experiments are made again, and where it cannot?",
+        _wrapped(lead),
+        _wrapped(f"Made by `{command} --output runs/reproduction --docs docs/reproduction.md` ({_escaped(made)})."),
+        _wrapped(
+            "That command writes this page, its figures and `reproduction.json`; nothing is written by hand. `ethbrake"
+            " reproduce` makes them again without training. [All that was measured](results/reproduction.md) has every"
+            " comparison, table, figure and parameter of each item; [the paper, line by line](paper.md) has every"
+            " equation."
+        ),
+        *map(_wrapped, few),
+    ]
+    for result in results:
+        labels = f" ({', '.join(map(_escaped, result.labels))})" if result.labels else ""
+        blocks += [
+            f"## {_escaped(result.title)}: {result.verdict.outcome}",
+            _wrapped(f"{_escaped(result.what)}{labels}"),
+            _wrapped(_escaped(result.verdict.because[:1].upper() + result.verdict.because[1:])),
+        ]
+    return "\n\n".join(blocks) + "\n"
+
+
+def _wrapped(text: str) -> str:
+    """Return a paragraph wrapped to lines of 99 characters, of which none starts a list or a heading."""
+    lines = textwrap.wrap(text, 99, break_long_words=False, break_on_hyphens=False)
+    return "\n".join(re.sub(r"^(?=[-+#>] )", r"\\", line) for line in lines)
+
+
+def _escaped(text: str) -> str:
+    """Return ``text`` with the special characters of Markdown escaped."""
+    plain = plain_text(text, keep="\u00a0").replace("<", "&lt;")
+    return re.sub(r"([\\|*_`])", r"\\\1", plain).replace("](", "]\\(")

@@ -1,0 +1,130 @@
+"""The paper's strategies on its worlds, with the stated latencies and with Vehicle 2 acting at 0.2 s."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.lineup import make_agents
+from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.extensions.reproduction.folder import Reproduction
+from ethbrake_marl.extensions.reproduction.trainings import EARLY, STOPPED
+from ethbrake_marl.extensions.reproduction.verdicts import LIST_SEED, PREDICTED, PROVEN
+from ethbrake_marl.extensions.search.limits import Unproven
+from ethbrake_marl.extensions.search.regret import limits_of
+from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.policies.shipped import load_shipped
+from ethbrake_marl.progress import Progress
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.paper_hybrid import HybridAgent
+from ethbrake_marl.training.run_folder import RunDirectory
+
+FULL_BRAKE, PAIRWISE, COUPLED = "full_brake", "e_v2x_bm:pairwise", "e_v2x_bm"
+
+SAC, PPO, UNIVERSAL = "sac@shipped/sac", "ppo@shipped/ppo", "universal@shipped"
+
+NAMES = {  # names of the strategies in tables and figures
+    FULL_BRAKE: "Non-ethical (full braking)",
+    PAIRWISE: "E-V2X-BM, realised",
+    COUPLED: "E-V2X-BM, coupled",
+    SAC: "SAC",
+    PPO: "PPO",
+    UNIVERSAL: "universal policy",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """An assumption on the time at which Vehicle 2 may act; the paper allows two."""
+
+    name: str  # name of the assumption
+    acts_s: float | None = None  # time at which Vehicle 2 may act; None: the scenario's latency
+
+    def scenario(self, name: str, **changes: object) -> Scenario:
+        """Return the shipped scenario ``name`` under this assumption; ``changes`` replace further keys of the
+        scenario.
+        """
+        found = load_scenario(name).replace(**changes) if changes else load_scenario(name)
+        if self.acts_s is None:
+            return found
+        first, _, *others = found.model_dump()["latency_s"]
+        return found.replace(latency_s=[first, self.acts_s, *others])
+
+
+READINGS = (Reading("as stated"), Reading("Vehicle 2 acts at 0.2 s", 0.2))
+
+
+def lineup(scenario: Scenario, *specs: str) -> dict[str, Agent]:
+    """Return the agents of ``specs`` (texts such as ``"full_brake"``), by their names in ``NAMES``, or else by spec."""
+    return {NAMES.get(spec, spec): agent for spec, agent in make_agents(specs, scenario).items()}
+
+
+def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, settings: Reproduction) -> Evaluation:
+    """Evaluate every agent on the first ``episodes`` worlds of the scenario's list. ``settings`` receives the
+    progress.
+    """
+    return evaluate(
+        scenario.sample(episodes, LIST_SEED),
+        agents,
+        scenario=scenario,
+        seed=LIST_SEED,
+        aftermath=False,
+        on_progress=lambda name, done: settings.tell(Progress(scenario.name, done, episodes)),
+    )
+
+
+def harms(evaluation: Evaluation) -> dict[str, Floats]:
+    """Return the first-impact harm of each strategy, by its name, [n] m2/s2.
+
+    The mapping also has the harm that E-V2X-BM predicts (``PREDICTED``) and the proven lower bound (``PROVEN``), if
+    known.
+    """
+    found = {name: outcome.first_impact_harm for name, outcome in evaluation.outcomes.items()}
+    pairwise = evaluation.outcomes.get(NAMES[PAIRWISE])
+    if pairwise is not None and pairwise.predicted_harm is not None:
+        found[PREDICTED] = pairwise.predicted_harm
+    limits = limits_of(evaluation)
+    if not isinstance(limits, Unproven) and limits.proof.harm is not None:
+        found[PROVEN] = limits.proof.harm
+    return found
+
+
+_STAND_IN = "ppo-paper-random-obstacle"  # shipped policy that replaces an unconverged one without trainings
+
+
+def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:
+    """Return a policy in place of the paper's "PPO model obtained from training before convergence occurred".
+
+    It is the policy that ``--full`` stopped early, or else a shipped policy. Also returns its description.
+    """
+    for (path,) in settings.trained([STOPPED]).values():
+        about = f"PPO stopped early: the last policy of {EARLY.decisions:,} decisions on paper-random"
+        return load_policy(RunDirectory(path).last_policy), about
+    about = f"the shipped policy {_STAND_IN!r}, trained for other worlds, stands in for one that has not converged"
+    return load_shipped(_STAND_IN), about
+
+
+def hybrid(policy: Policy, scenario: Scenario, bound: Literal["coupled", "pairwise"]) -> Agent:
+    """Return the paper's hybrid (Algorithm 1): at the alert it chooses ``policy`` or E-V2X-BM, whichever expects less
+    harm.
+
+    ``bound`` is the harm expected of E-V2X-BM: ``coupled`` simulates it, ``pairwise`` predicts it by a closed form.
+    """
+    return HybridAgent(LearnedAgent(policy, "policy"), scenario, bound=bound)
+
+
+FOUR = (FULL_BRAKE, PAIRWISE, COUPLED, SAC, PPO)  # the paper's four strategies, with two versions of E-V2X-BM
+
+BASELINES = (NAMES[PAIRWISE], NAMES[COUPLED], PREDICTED)
+
+ABOUT_BASELINE = (
+    "E-V2X-BM, predicted: what the closed form expects, pair by pair. Realised: what that deceleration does once speeds"
+    " are exchanged. Coupled: the constant deceleration of least harm in the same physics."
+)

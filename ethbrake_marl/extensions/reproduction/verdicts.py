@@ -1,0 +1,206 @@
+"""Verdicts on the paper's numbers and statements, computed from our results.
+
+A printed number *agrees* with ours if they differ by no more than chance between two lists of worlds, or by no more
+than ``TOLERANCE`` of the printed number. It is *undecided* if chance alone is more than ``WIDE`` of it. It *cannot
+agree* if a bound for all strategies lies beyond it by more than chance. A statement agrees if all its comparisons come
+out as it says; it is undecided if one does not, but its interval contains 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass as model
+
+from ethbrake_marl.evaluation.statistics import mean, paired_difference, unpaired_difference
+from ethbrake_marl.files.sheet import Column, Estimate
+from ethbrake_marl.physics.state import Floats
+
+Judgement = Literal["cannot agree", "differs", "undecided", "not run", "agrees"]  # the worst first
+
+TOLERANCE = 0.02  # allowed difference, as a share of the printed number
+
+WIDE = 0.15  # largest chance, as a share of the printed number, with which a comparison is decided
+
+HOW_JUDGED = (
+    "Every verdict is computed: a number agrees where it is within the chance between two lists of worlds or"
+    f" {100.0 * TOLERANCE:g} % of what is printed, is undecided where that chance alone makes more than"
+    f" {100.0 * WIDE:g} %, and cannot agree where a bound that holds for every strategy excludes it. Statements are"
+    " those of the paper's text; its figures hold no printed numbers."
+)
+
+WRITTEN = ConfigDict(strict=True, extra="forbid")  # for types that are read from files
+
+
+@model(frozen=True, config=WRITTEN)
+class Verdict:
+    """Outcome of one comparison with the paper, and the numbers behind it."""
+
+    what: str  # what was compared
+    outcome: Judgement  # ``agrees``, ``differs``, ``undecided``, ``cannot agree`` or ``not run``
+    because: str  # the numbers behind the outcome, as text
+
+
+# Formats of quantities.
+HARM = Column("Harm")
+
+PERCENT = Column("Collision rate", digits=1, scale=100.0, unit=" %")
+
+
+def compare_number(
+    what: str,
+    printed: float,
+    ours: Estimate,
+    *,
+    show: Column = HARM,
+    least: tuple[str, Estimate] | None = None,
+    others: Mapping[str, Estimate] | None = None,
+) -> Verdict:
+    """Return a verdict on whether a number that the paper prints agrees with ours.
+
+    Args:
+        what: name of the number.
+        printed: the paper's number.
+        ours: the same quantity in our results, with its interval over worlds.
+        show: format of both numbers.
+        least: description and value of a proven lower bound over our list for all strategies; None: no bound.
+        others: the same quantity under other assumptions, by description; if ours differs, the nearest one is named.
+
+    """
+    told = f"ours {show.show(ours).in_words}, printed {show.scale * printed:.{show.digits + 1}f}{show.unit}"
+    if least is not None and least[1].value - printed > _chance(least[1]):
+        undercut = f"{least[0]}: at least {show.show(least[1]).in_words}, whoever drives"
+        return Verdict(what, "cannot agree", f"{undercut}; {told}")
+    off = _off(printed, ours)
+    if not off:
+        return Verdict(what, "agrees", told)
+    if abs(ours.value - printed) <= _chance(ours):
+        return Verdict(what, "undecided", f"{told}: too few worlds to tell")
+    told += f" ({off})"
+    if others:
+        name, found = min(others.items(), key=lambda each: abs(each[1].value - printed))
+        if abs(found.value - printed) < abs(ours.value - printed):
+            met = _off(printed, found) or "which agrees"
+            told += f"; nearest: {name}, {show.show(found).in_words}, {met}"
+        else:
+            told += "; no other reading here comes nearer"
+    return Verdict(what, "differs", told)
+
+
+def _off(printed: float, ours: Estimate) -> str:
+    """Return a text on how far ``ours`` is from the printed number, such as "+3.1 %"; empty if the two agree.
+
+    They agree if they differ by at most 2 % of the printed number (``TOLERANCE``), or by no more than chance (see
+    ``_chance``). Chance does not count if it is above 15 % of the larger number (``WIDE``).
+    """
+    chance = _chance(ours)
+    told = chance if chance <= WIDE * max(abs(printed), abs(ours.value)) else 0.0
+    if abs(ours.value - printed) <= max(told, TOLERANCE * abs(printed)):
+        return ""
+    return f"{ours.value:+.3g} off" if printed == 0.0 else f"{100.0 * (ours.value / printed - 1.0):+.1f} %"
+
+
+def _chance(estimate: Estimate) -> float:
+    """Return by how much this estimate and that of another list of as many worlds may differ by chance.
+
+    It is sqrt(2) times the half-width of the interval.
+    """
+    low, high = estimate.ends
+    return math.sqrt(2.0) * 0.5 * (high - low)
+
+
+@dataclass(frozen=True, slots=True)
+class Less:
+    """Difference of two quantities, as evidence for or against a statement that the first is smaller than the second.
+
+    A statement can need several of them, for example one for each group of worlds.
+    """
+
+    where: str  # worlds or strategies that are compared, in words
+    difference: Estimate  # smaller quantity minus larger one; below 0 if the statement is right
+    neither: bool = False  # True if both are 0 in every world, so that nothing is left to compare
+    # proven lower bound minus the larger quantity; above 0, no strategy can make the statement right. None: no bound
+    least: Estimate | None = None
+
+    @classmethod
+    def of_lists(cls, where: str, smaller: Floats, larger: Floats) -> Less:
+        """Compare two samples from different worlds: is ``smaller`` [n] below ``larger`` [m] on average?
+
+        ``where`` says in words what is compared.
+        """
+        return cls(where, unpaired_difference(mean(smaller), len(smaller), mean(larger), len(larger)))
+
+    @classmethod
+    def of_harms(cls, where: str, harm: Mapping[str, Floats], smaller: str, larger: str) -> Less:
+        """Compare the harm of two strategies in the same worlds, with the proven lower bound.
+
+        ``harm`` maps strategies to their harm [n]; ``smaller`` and ``larger`` are names of strategies; ``where``
+        describes the comparison.
+        """
+        low, high = harm[smaller], harm[larger]
+        least = paired_difference(harm[PROVEN], high) if PROVEN in harm else None
+        return cls(where, paired_difference(low, high), not low.any() and not high.any(), least)
+
+
+def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False, show: Column = HARM) -> Verdict:
+    """Return a verdict on a statement of the paper: it agrees if the interval of every comparison lies below 0.
+
+    Args:
+        what: the statement.
+        parts: its comparisons.
+        or_equal: True: a difference of 0 also agrees.
+        show: format of the differences.
+
+    """
+    compared, ties = [part for part in parts if not part.neither], [part.where for part in parts if part.neither]
+    places = ", ".join(ties) if len(ties) <= 2 else f"{len(ties)} more"
+    if not compared:
+        return Verdict(what, "agrees", f"nothing to undercut: both are 0 in {places}")
+    highest = [part.difference.ends[1] for part in compared]
+    failing = [
+        part for part, high in zip(compared, highest, strict=True) if not (high < 0.0 or (or_equal and high <= 0.0))
+    ]
+    impossible = [
+        f"{part.where} by {show.show(part.least).in_words}"
+        for part in failing
+        if part.least is not None and part.least.ends[0] > 0.0
+    ]
+    counts = f"holds in {len(compared) - len(failing)} of {len(compared)}{f' (both are 0 in {places})' if ties else ''}"
+    if impossible:
+        told = f"the harm proven to be the least is above it in: {', '.join(impossible)}"
+        return Verdict(what, "cannot agree", f"{counts}; {told}")
+    if failing:
+        ends = [part.difference.ends for part in failing]
+        is_open = all(low < 0.0 <= high for low, high in ends)  # another list may decide either way
+        told = ", ".join(f"{part.where}, {show.show(part.difference).in_words}" for part in failing)
+        lead = f"{counts}; not " if len(parts) > 1 else "not "
+        shown = f"{lead}{'shown' if is_open else 'so'}: {told}"
+        return Verdict(what, "undecided" if is_open else "differs", shown)
+    worst = max(compared, key=lambda part: part.difference.value)
+    lead = f"{counts}; the nearest is " if len(parts) > 1 else ""
+    return Verdict(what, "agrees", f"{lead}{worst.where}, {show.show(worst.difference).in_words}")
+
+
+def summarise_verdicts(verdicts: Sequence[Verdict]) -> Verdict:
+    """Return one verdict on an item from all its verdicts: the number of each outcome, and the first of the worst."""
+    if not verdicts:
+        return Verdict("all", "not run", "nothing was compared")
+    counted = {outcome: sum(each.outcome == outcome for each in verdicts) for outcome in get_args(Judgement)}
+    plural = {"agrees": "agree", "differs": "differ"}
+    told = [f"{n} {plural.get(outcome, outcome) if n > 1 else outcome}" for outcome, n in counted.items() if n]
+    first = next(each for outcome in counted for each in verdicts if each.outcome == outcome)
+    lead = "" if len(verdicts) == 1 else f"of {len(verdicts)} comparisons {', '.join(told)}; "
+    return Verdict("all", first.outcome, f"{lead}{first.what}: {first.because}")
+
+
+Mode = Literal["quick", "full"]
+
+LIST_SEED = 7
+
+MOST_EPISODES = 10_000
+
+PREDICTED, PROVEN = "E-V2X-BM, predicted", "least harm, proven"

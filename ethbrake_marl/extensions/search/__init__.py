@@ -1,0 +1,1 @@
+"""Search over whole command profiles: best known harm, its tables, the planner, ``+search``."""

@@ -1,0 +1,401 @@
+"""Best known harm of each world, from a search over whole command profiles.
+
+A *profile* holds the commands of the controlled vehicles over a whole episode, as phases of constant command.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.agents.driving import record_commands, script_agents
+from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.agents.protocol import Agent, Driver, fixed_commands
+from ethbrake_marl.engine.profiles import MOST_PHASES, ProfileProblem, Profiles, profile_problem
+from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError, check_one_learner
+from ethbrake_marl.extensions.proofs.ramped_meetings import onset_states
+from ethbrake_marl.extensions.search.extreme_profiles import extreme_profiles
+from ethbrake_marl.extensions.search.problem import Found, search_profiles
+from ethbrake_marl.extensions.search.tables import COUNTS, LEFT_OUT, LOWERED, BestHarmTable, BestKnown
+from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.episode import CLOCK
+from ethbrake_marl.physics.left_out import leaving_out_failed
+from ethbrake_marl.physics.state import Floats, Ints, UInt64s, Worlds
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.task import Task
+
+SEARCH_BUDGET = 100_000  # candidates per world and count
+
+CHUNK = 200  # worlds between two reports of progress
+
+CONSTANTS = 29  # number of evenly spaced constant commands with which every search starts
+
+Progress = Callable[[int, int], None]  # called with the number of worlds done and their total
+
+
+def best_harm(
+    scenario: Scenario,
+    worlds: Worlds,
+    *,
+    counts: Sequence[HarmCount] = HARM_COUNTS,
+    vehicles: Sequence[int] | None = None,
+    budget: int = SEARCH_BUDGET,
+    seed: int = 0,
+    threads: int | None = None,
+    known: BestHarmTable | None = None,
+) -> BestHarmTable:
+    """Search every world for the command profiles of least harm, once per harm count; return them as a table.
+
+    With both counts, the profile found for one also replaces the other's if it does less harm there. The result is
+    never worse than the best constant deceleration of one controlled vehicle while the others brake fully, than the
+    same search for one controlled vehicle alone, or than ``known``. It does not depend on ``threads`` or on the other
+    worlds. Raises ``InvalidInput`` for no vehicle, a script whose command is not fixed at the alert, no count, or a
+    budget below 1.
+
+    Args:
+        scenario: the scenario of the worlds.
+        worlds: the worlds at t = 0, [n].
+        counts: harm counts to minimise: ``first``, ``total``, or both.
+        vehicles: indices of the controlled vehicles; None: the scenario's learners. All others follow their scripts.
+        budget: candidates per world and count.
+        seed: seed of the random search.
+        threads: number of threads; None: one for each core.
+        known: a table for these vehicles, whose profiles the search starts with; None: no table.
+
+    """
+    if not counts or not set(counts) <= set(HARM_COUNTS) or len(set(counts)) != len(counts):
+        raise InvalidInput(f"counts {tuple(counts)}: must be first, total, or both")
+    task = Task(scenario, scenario.learners if vehicles is None else tuple(vehicles))
+    others, problem = scripted_commands(worlds, task), task_problem(worlds, task)
+    identity = problem.identity
+    if known is not None:
+        known.check_fits(problem)
+    effort = {"budget": budget, "seed": seed, "threads": (os.cpu_count() or 1) if threads is None else threads}
+    found: list[Found] = []
+    for count in counts:
+        given = [profiles for profiles, _ in found]
+        if known is not None:
+            given.append(_startable(known.profiles(identity, count, problem.last_step)[0]))
+        found.append(_searched(worlds, replace(task, harm_count=count), others, given, task.vehicles, effort))
+    rows = np.arange(worlds.n)
+    best: dict[HarmCount, BestKnown] = {}
+    for count in counts:
+        harms = np.stack([harm[count] for _, harm in found])
+        pick = np.argmin(harms, axis=0)
+        ends = np.stack([profiles.ends for profiles, _ in found])[pick, rows]
+        commands = np.stack([profiles.commands_mps2 for profiles, _ in found])[pick, rows]
+        best[count] = BestKnown(harms[pick, rows], Profiles(ends, commands))
+    names = [scenario.vehicle_names[i] for i in task.vehicles]
+    header = {"scenario": scenario.name, "vehicles": names, "budget": budget, "search_seed": seed}
+    table = BestHarmTable(identity, best, header)
+    if known is None:
+        return table
+    for count in [count for count in counts if count in known.best]:
+        kept, has_profile = known.profiles(identity, count, np.ones(worlds.n, np.int64))
+        kept.ends[~has_profile] = 0
+        table, _ = table.improved(identity, count, known.harm(identity, count), kept)
+    return replace(table, header={**table.header, "after": dict(known.header)})
+
+
+def search_list(
+    scenario: Scenario,
+    sample: Sample,
+    *,
+    counts: Sequence[HarmCount] = HARM_COUNTS,
+    vehicles: Sequence[int] | None = None,
+    budget: int = SEARCH_BUDGET,
+    seed: int = 0,
+    threads: int | None = None,
+    known: BestHarmTable | None = None,
+    chunks: Path | None = None,
+    on_progress: Progress | None = None,
+) -> BestHarmTable:
+    """Run ``best_harm`` on a long list, ``CHUNK`` worlds at a time; it can be interrupted and continued.
+
+    A world that the physics cannot advance (a defect) is left out: no table holds it, and the header lists it under
+    ``LEFT_OUT``. Raises ``InvalidInput`` as ``best_harm`` does, and if ``known`` holds no world of the list;
+    ``PhysicsError`` if no world is left.
+
+    Args:
+        scenario: the scenario of the list.
+        sample: the worlds of the list, with their numbers.
+        counts: harm counts to minimise: ``first``, ``total``, or both.
+        vehicles: indices of the controlled vehicles; None: the scenario's learners.
+        budget: candidates per world and count.
+        seed: seed of the random search.
+        threads: number of threads; None: one for each core.
+        known: a table whose profiles the search starts with; None: no table.
+        chunks: folder in which each finished chunk is stored as a file. A later call with the same arguments reads it;
+            a file of other arguments is computed again and replaced. None: nothing is stored.
+        on_progress: called with the number of worlds done and their total.
+
+    """
+    parts: list[BestHarmTable] = []
+    left_out: dict[int, str] = {}
+    n, task = sample.worlds.n, Task(scenario, scenario.learners if vehicles is None else tuple(vehicles))
+    if known is not None:
+        every, _, _ = leaving_out_failed(lambda at: task_problem(sample.worlds.take(at), task).identity, np.arange(n))
+        if every is not None:
+            known.check_holds_any(every)
+    options = {"counts": counts, "budget": budget, "seed": seed, "threads": threads, "known": known}
+    for first in range(0, n, CHUNK):
+        rows = np.arange(first, min(first + CHUNK, n))
+        file = None if chunks is None else chunk_file(chunks, first)
+        work = partial(_kept_or_searched, task, sample.worlds, file, options)
+        part, _, failed = leaving_out_failed(work, rows)
+        parts += [] if part is None else [part]
+        left_out |= {int(sample.index[row]): reason for row, reason in failed.items()}
+        if on_progress is not None:
+            on_progress(int(rows[-1]) + 1, n)
+    if not parts:
+        raise PhysicsError(left_out)
+    both = [harm_count for harm_count in COUNTS if all(harm_count in each.best for each in parts)]
+    least: dict[HarmCount, BestKnown] = {}
+    for harm_count in both:
+        padded = Profiles.padded([each.best[harm_count].profiles for each in parts], 1)
+        profiles = Profiles(*(np.concatenate(arrays) for arrays in zip(*padded, strict=True)))
+        least[harm_count] = BestKnown(np.concatenate([each.best[harm_count].harm for each in parts]), profiles)
+    table = BestHarmTable(np.concatenate([each.identity for each in parts]), least, parts[0].header)
+    named = {LEFT_OUT: {str(world): reason for world, reason in left_out.items()}} if left_out else {}
+    return replace(table, header={**table.header, **named})
+
+
+def _kept_or_searched(
+    task: Task, every: Worlds, file: Path | None, options: dict[str, Any], rows: Ints
+) -> BestHarmTable:
+    """Return the table of a chunk: from its file if that was made with the same options, else by a new search.
+
+    A new table is stored in the file.
+
+    Args:
+        task: scenario and controlled vehicles.
+        every: all worlds of the list.
+        file: file of the chunk; None: nothing is read or stored.
+        options: keywords of ``best_harm``.
+        rows: indices of the chunk's worlds in the list.
+
+    """
+    worlds = every.take(rows)
+    known = options["known"]
+    question = {"counts": list(options["counts"]), "budget": options["budget"], "search_seed": options["seed"]}
+    question |= {} if known is None else {"after": dict(known.header)}
+    if file is not None:
+        with suppress(CorruptBundle):
+            part = kept_chunk(file, task_problem(worlds, task).identity, question)
+            if part is not None:
+                return part
+    part = best_harm(task.scenario, worlds, vehicles=task.vehicles, **options)
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        part.save(file)
+    return part
+
+
+def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path) -> tuple[int, list[Path]]:
+    """Return how many worlds ``search_list`` would still search with both counts, and the damaged chunk files.
+
+    Args:
+        scenario: the scenario of the list.
+        sample: the worlds of the list.
+        budget: candidates per world and count.
+        chunks: folder of the chunk files.
+
+    """
+    left, damaged = 0, []
+    identity = task_problem(sample.worlds, Task(scenario, scenario.learners)).identity
+    question = {"counts": list(HARM_COUNTS), "budget": budget, "search_seed": 0}
+    for first in range(0, len(identity), CHUNK):
+        file, wanted = chunk_file(chunks, first), identity[first : first + CHUNK]
+        try:
+            kept = kept_chunk(file, wanted, question)
+        except CorruptBundle:
+            kept = None
+            damaged.append(file)
+        left += 0 if kept is not None else len(wanted)
+    return left, damaged
+
+
+def chunk_file(chunks: Path, first: int) -> Path:
+    """Return the path of the chunk file in folder ``chunks`` that begins with world number ``first`` of the list."""
+    return chunks / f"{first:07d}.npz"
+
+
+def kept_chunk(file: Path, identity: UInt64s, question: Mapping[str, object]) -> BestHarmTable | None:
+    """Return the stored table of a chunk, or None if there is no file or it was made for other worlds or options.
+
+    Raises ``CorruptBundle`` for a damaged file.
+
+    Args:
+        file: the chunk file.
+        identity: hash of each world of the chunk.
+        question: options of the search (counts, budget, seed), which must equal those in the header of the file.
+
+    """
+    if not file.is_file():
+        return None
+    table = BestHarmTable.load(file)
+    asked = {"counts": list(table.best), **{key: table.header[key] for key in question if key in table.header}}
+    return table if asked == question and np.array_equal(table.identity, identity) else None
+
+
+def scripted_commands(worlds: Worlds, task: Task) -> Floats:
+    """Return the commands [n, N] (m/s2) of all vehicles that follow scripts; controlled vehicles have full braking
+    instead.
+
+    Raises ``InvalidInput`` for a script whose command is not fixed at the alert. ``task`` names the controlled
+    vehicles.
+    """
+    others = {i: script for i, script in script_agents(task.scenario).items() if i not in task.vehicles}
+    return fixed_commands(others, worlds, f"scenario {task.scenario.name!r}, search for the best profiles")
+
+
+def task_problem(worlds: Worlds, task: Task) -> ProfileProblem:
+    """Return the search problem for a task: choose the command profiles of its controlled vehicles in worlds at t = 0.
+
+    Its ``identity`` [n] is a hash of everything that affects a world's harm; it does not depend on the harm count.
+    """
+    return _problem(worlds, task, scripted_commands(worlds, task), task.vehicles)
+
+
+def _problem(worlds: Worlds, task: Task, others: Floats, deciders: Sequence[int]) -> ProfileProblem:
+    scenario = task.scenario
+    return profile_problem(
+        worlds, task.vehicles, harm_count=task.harm_count, horizon_s=scenario.horizon_s,
+        time_step_s=scenario.time_step_s, others_mps2=others, deciders=deciders,
+    )  # fmt: skip
+
+
+def _searched(
+    worlds: Worlds, task: Task, others: Floats, given: Sequence[Profiles], deciders: Sequence[int],
+    effort: dict[str, int],
+) -> Found:  # fmt: skip
+    """Return the best profiles of a search in each world, and their harm under each count.
+
+    Args:
+        worlds: the worlds at t = 0, [n].
+        task: scenario, controlled vehicles and harm to minimise.
+        others: [n, N] commands of the vehicles that follow scripts, m/s2.
+        given: profiles to start with, besides constants and each vehicle's own best.
+        deciders: indices of the vehicles whose latency decides when decisions fall.
+        effort: keywords ``budget``, ``seed`` and ``threads`` of ``search_profiles``.
+
+    """
+    problem = _problem(worlds, task, others, deciders)
+    starts = [problem.constant(problem.even_grid(CONSTANTS)), *given]
+    if len(task.vehicles) == 1:
+        coupled = optimise_coupled(
+            worlds, task.vehicle, harm_count=task.harm_count, horizon_s=task.scenario.horizon_s, others_mps2=others
+        )
+        starts.insert(0, problem.constant(-coupled.deceleration_mps2[:, np.newaxis, np.newaxis]))
+        at, _ = advance(worlds, others, until_s=problem.clock[:, CLOCK.START])
+        forward = np.all(at.speeds_mps >= 0.0, axis=1)
+        neighbours = (forward & there for there in (task.vehicle > 0, task.vehicle < at.N - 1))
+        starts.append(extreme_profiles(problem, onset_states(at, task.vehicle, None), *neighbours))
+    else:
+        for c, vehicle in enumerate(task.vehicles):
+            alone, _ = _searched(worlds, replace(task, vehicles=(vehicle,)), others, (), deciders, effort)
+            least = problem.bounds[:, np.newaxis, :, 0]
+            commands = np.broadcast_to(least, (*alone.ends.shape, len(task.vehicles))).copy()
+            commands[..., c] = alone.commands_mps2[..., 0]
+            starts.append(Profiles(alone.ends, commands))
+    return search_profiles(problem, _joined(starts, problem.n), **effort)
+
+
+def _startable(profiles: Profiles) -> Profiles:
+    """Return profiles that a search can start with.
+
+    A profile with too many phases (times of constant command) is replaced by its first command, held to the end.
+    """
+    ends, commands = Profiles.padded([profiles], MOST_PHASES)[0]
+    last = ends[:, -1:]
+    short = ends[:, MOST_PHASES - 1 : MOST_PHASES] == last
+    return Profiles(
+        np.where(short, ends[:, :MOST_PHASES], last),
+        np.where(short[..., np.newaxis], commands[:, :MOST_PHASES], commands[:, :1]),
+    )
+
+
+def _joined(parts: list[Profiles], n: int) -> Profiles:
+    """Join several sets of profiles, [n * Q_j] each, into one set [n * Q]: all profiles of world 0 first, and so on."""
+    parts = Profiles.padded(parts, MOST_PHASES)
+    ends = np.concatenate([part.ends.reshape(n, -1, MOST_PHASES) for part in parts], axis=1)
+    shape = (n, -1, MOST_PHASES, parts[0].commands_mps2.shape[2])
+    commands = np.concatenate([part.commands_mps2.reshape(shape) for part in parts], axis=1)
+    return Profiles(ends.reshape(-1, MOST_PHASES), commands.reshape(-1, *shape[2:]))
+
+
+def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) -> Profiles:
+    """Return the commands that ``agent`` gives in its episodes as profiles [n]; neighbouring steps with equal commands
+    become one phase (time of constant command).
+
+    Args:
+        agent: agent of the task's vehicle.
+        worlds: the worlds at t = 0, [n].
+        task: scenario and controlled vehicle.
+        last_step: [n] number of steps of each episode.
+
+    """
+    commands = record_commands(agent, worlds, task.scenario, task.vehicle, int(last_step.max()))
+    # one phase for each change of command
+    steps = commands.shape[1]
+    ends = [np.append(np.flatnonzero(row[1:] != row[:-1]) + 1, steps) for row in commands]
+    width = max(len(each) for each in ends)
+    padded = np.array([np.append(each, np.full(width - len(each), steps)) for each in ends])
+    chosen = np.take_along_axis(commands, padded - 1, axis=1)
+    return Profiles(np.minimum(padded, last_step[:, np.newaxis]), chosen[:, :, np.newaxis])
+
+
+def fold_episodes(
+    table: BestHarmTable, scenario: Scenario, worlds: Worlds, name: str, agents: Mapping[HarmCount, Agent]
+) -> BestHarmTable:
+    """Return the table, lowered to the harm of agents' episodes in all worlds where an agent does less harm than the
+    table says.
+
+    The header counts these worlds. The harm is that of the recorded commands when played again. Where an agent cannot
+    control a world to its end, the table stays unchanged. Raises ``InvalidInput`` unless the scenario has exactly one
+    learner.
+
+    Args:
+        table: the table to improve.
+        scenario: the scenario of the worlds.
+        worlds: the worlds at t = 0; worlds with known harm 0 are skipped.
+        name: name of the agent, for the header.
+        agents: for each harm count, the agent made to minimise it. Every episode is compared with the table under both
+            counts.
+
+    """
+    learners = [scenario.vehicle_names[i] for i in scenario.learners]
+    check_one_learner(scenario.name, learners, "agents whose episodes are kept drive exactly one")
+    task = Task(scenario, scenario.learners)
+    identity = task_problem(worlds, task).identity
+    known = np.max([table.harm(identity, harm_count) for harm_count in table.best], axis=0)
+    hard = np.flatnonzero(known > 0.0)
+    before = table.header.get(LOWERED, {})
+    lowered = {harm_count: before.get(name, {}).get(harm_count, 0) for harm_count in table.best}
+    if hard.size:
+        worlds, identity = worlds.take(hard), identity[hard]
+        problem = task_problem(worlds, task)
+        for agent in agents.values():
+
+            def work(at: Ints, agent: Agent = agent) -> Profiles:
+                return driven_profiles(agent, worlds.take(at), task, problem.last_step[at])
+
+            profiles, rows, _ = leaving_out_failed(work, np.arange(worlds.n))
+            if profiles is None:
+                continue
+            first, total = problem.take(rows).follow(profiles)
+            for harm_count in table.best:
+                table, better = table.improved(
+                    identity[rows], harm_count, first if harm_count == "first" else total, profiles
+                )
+                lowered[harm_count] += int(better.sum())
+    return replace(table, header={**table.header, LOWERED: {**before, name: lowered}})

@@ -1,0 +1,190 @@
+"""Limits of each world for any agent: whether contact is avoidable, the proven bound, and the best known harm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.extensions.proofs.avoidability import avoidability
+from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
+from ethbrake_marl.extensions.proofs.team_bound import team_bound
+from ethbrake_marl.extensions.search.shipped import best_known
+from ethbrake_marl.game.harm import HARM_COUNTS
+from ethbrake_marl.physics.motion import stopping_distances
+from ethbrake_marl.physics.state import Bools, Floats, Worlds
+from ethbrake_marl.scenario.task import Task
+
+_VEHICLES, _DRIVEN = 3, 1
+
+_DECIDED = ({1}, {1, 2})  # controlled vehicles, of three, for which avoidability is decided
+
+
+class IncompleteTable(UserWarning):
+    """Warning that a table of best known harm covers only some of the worlds of an evaluation."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unproven:
+    """Result in place of a proof if nothing is proven for a task in these worlds."""
+
+    because: str  # the reason, as a clause such as "brakes build up; nothing is proven then"
+
+
+@dataclass(frozen=True, slots=True)
+class Proof:
+    """Proven facts about each world, [n] each."""
+
+    avoidable: Bools | None  # True if some command avoids all contact; None if not decided
+    reason: NDArray[np.str_] | None  # reason if unavoidable: "early", "front" or "rear"; "" if avoidable
+    harm: Floats  # lower bound on the harm of any command, under either count (m2/s2)
+
+    @property
+    def impact(self) -> Bools:
+        """True where no sequence of commands avoids an impact (contact with a closing speed above 0), [n]."""
+        return np.asarray(self.harm > 0.0, np.bool_)
+
+    @property
+    def contact(self) -> Bools | None:
+        """True for worlds in which every command leads to contact, [n]; None if not decided."""
+        return None if self.avoidable is None else ~self.avoidable
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Proofs and best known harm of each world before any agent drives, [n] each."""
+
+    proof: Proof  # the proven facts
+    # best known first-impact harm (m2/s2): 0 if contact is avoidable, else from a table; NaN if in no table
+    first_impact_harm: Floats
+    total_harm: Floats  # best known total harm (m2/s2), likewise
+
+    @property
+    def known(self) -> Bools:
+        """True for worlds whose best harm is known for both counts without any agent, [n]."""
+        return np.isfinite(self.first_impact_harm) & np.isfinite(self.total_harm)
+
+    @property
+    def warning(self) -> str:
+        """Warning text if a table covers only some of the worlds; empty if it covers all or none of them."""
+        known, avoidable = self.known, self.proof.avoidable
+        listed = known if avoidable is None else known & ~avoidable
+        missing = int((~known).sum())
+        if not (missing and listed.any()):
+            return ""
+        return (
+            f"the table of best known harm holds {listed.sum():,} of these {len(known):,} worlds, and not"
+            f" the other {missing:,} ({100.0 * missing / len(known):.1f} %), whose best is not proven either. There the"
+            " best agent of this evaluation stands in: regrets are lower bounds, and no share of the possible"
+            " reduction is stated. A"
+            " table is made for one list; a longer list, or one of another version, has other worlds"
+            " (search_list makes one)"
+        )
+
+
+def known_limits(worlds: Worlds, task: Task) -> Limits | Unproven:
+    """Return the proven facts and the best known harm of worlds at the alert; ``Unproven`` if the proofs do not cover
+    the task.
+
+    ``task`` names the scenario and the controlled vehicles.
+    """
+    proof = prove(worlds, task)
+    if isinstance(proof, Unproven):
+        return proof
+    found = best_known(worlds, task)
+    avoidable = np.zeros(worlds.n, np.bool_) if proof.avoidable is None else proof.avoidable
+    first, total = (np.where(avoidable, 0.0, found[harm_count]) for harm_count in HARM_COUNTS)
+    return Limits(proof, first, total)
+
+
+def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
+    """Return the proofs for worlds at the alert; ``Unproven`` if they do not cover the task.
+
+    ``task`` names the scenario and the controlled vehicles.
+    """
+    because = unproven_because(worlds, task)
+    if because is not None:
+        return Unproven(because)
+    horizon_s, time_step_s = task.scenario.horizon_s, task.scenario.time_step_s
+    if _is_team(task):
+        harm = team_bound(worlds, task.vehicles, horizon_s=horizon_s, time_step_s=time_step_s).harm
+        if undecided_because(worlds, task) is not None:
+            return Proof(None, None, harm)
+        contact = avoidability(worlds, _DRIVEN)
+        return Proof(contact.avoidable, contact.reason_name, harm)
+    bound = lower_bound(worlds, task.vehicle, horizon_s=horizon_s, time_step_s=time_step_s)
+    if bound.contact is None:
+        return Proof(None, None, bound.harm)
+    return Proof(bound.contact.avoidable, bound.contact.reason_name, bound.harm)
+
+
+def unproven_because(worlds: Worlds, task: Task) -> str | None:
+    """Return the reason why nothing is proven for the task in these worlds, as a clause; None if something is proven.
+
+    ``task`` names the scenario and the controlled vehicles.
+    """
+    if worlds.vehicles.in_pieces.any() or (_is_team(task) and worlds.vehicles.build_up.any()):
+        return _uneven_because(worlds)
+    if not _is_team(task):
+        return _uncovered_because(worlds, task)
+    return _script_because(task, "harm is bounded")
+
+
+def undecided_because(worlds: Worlds, task: Task) -> str | None:
+    """Return the reason why it is not decided whether contact can be avoided, as a clause; None if it is decided.
+
+    ``worlds`` are at the alert; ``task`` names the scenario and the controlled vehicles.
+    """
+    return _uneven_because(worlds) if worlds.vehicles.build_up.any() else _uncovered_because(worlds, task)
+
+
+def _uncovered_because(worlds: Worlds, task: Task) -> str | None:
+    """Return the reason why ``avoidability`` does not cover the task, as a clause; None if it does. Ignores brake
+    build-up.
+    """
+    scenario, names = task.scenario, task.scenario.vehicle_names
+    if not task.vehicles or (len(task.vehicles) > 1 and set(task.vehicles) not in _DECIDED):
+        return f"driven are: {task.names}; avoidability is proven for one vehicle"
+    if scenario.vehicles != _VEHICLES:
+        return f"{scenario.vehicles} vehicles; avoidability is proven for {_VEHICLES}"
+    if set(task.vehicles) not in _DECIDED:
+        return f"{task.names} is driven; avoidability is proven for {names[_DRIVEN]}"
+    because = _script_because(task, "avoidability is proven")
+    if because is not None:
+        return because
+    latency_s = worlds.vehicles.latency_s
+    first = (each[:, 0] for each in (worlds.vehicles.braking_capacity_mps2, worlds.vehicles.brake_rate_mps3))
+    way_m = stopping_distances(worlds.speeds_mps[:, 0], latency_s[:, 0], *first)
+    if not (way_m < worlds.obstacle_gap_m).all():
+        return "vehicle_1 reaches the obstacle ahead by itself; nothing is proven then"
+    if (latency_s[:, 0] > latency_s[:, _DRIVEN]).any():
+        return f"{names[0]} may brake later than {names[_DRIVEN]}; nothing is proven then"
+    return None
+
+
+def _uneven_because(worlds: Worlds) -> str:
+    why = "a vehicle brakes in pieces (profile)" if worlds.vehicles.in_pieces.any() else "brakes build up"
+    return f"{why}; nothing is proven then"
+
+
+def _is_team(task: Task) -> bool:
+    """Return whether the task needs the bound for teams, ``team_bound``.
+
+    That is so for several controlled vehicles, and for more vehicles than ``lower_bound`` covers.
+    """
+    return len(task.vehicles) > 1 or (len(task.vehicles) == 1 and task.scenario.vehicles > _VEHICLES)
+
+
+def _script_because(task: Task, proven: str) -> str | None:
+    """Return a clause that names a vehicle which follows another script than full_brake; None if there is none.
+
+    ``task`` names the scenario and the controlled vehicles; ``proven`` is the subject of the clause, for instance
+    "avoidability is proven".
+    """
+    scenario = task.scenario
+    for i in range(scenario.vehicles):
+        script = scenario.scripts.get(i, "full_brake")
+        if i not in task.vehicles and script != "full_brake":
+            return f"{scenario.vehicle_names[i]} follows {script}; {proven} where it follows full_brake"
+    return None

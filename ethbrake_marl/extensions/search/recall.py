@@ -1,0 +1,155 @@
+"""``best_harm``: an agent that drives the best known profile, from a table if there is one, else from a search."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from ethbrake_marl.agents.driving import record_commands
+from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.agents.protocol import Source, fixed_commands
+from ethbrake_marl.agents.settings import AgentSettings
+from ethbrake_marl.engine.memory import Memory
+from ethbrake_marl.engine.profiles import TIME_STEP_S, ProfileProblem, Profiles
+from ethbrake_marl.engine.scripts import Script
+from ethbrake_marl.errors import InvalidInput, renumbered
+from ethbrake_marl.extensions.search.planner import MOST_CANDIDATES, Outlook, budget_of
+from ethbrake_marl.extensions.search.problem import search_profiles
+from ethbrake_marl.extensions.search.refine import refine
+from ethbrake_marl.game.harm import HarmCount, check_harm_count
+from ethbrake_marl.physics.episode import CLOCK
+from ethbrake_marl.physics.state import Bools, Floats, Worlds
+from ethbrake_marl.scenario.schema import Scenario
+
+PROFILE_BUDGET = 20_000  # candidates in a world that is in no table
+
+START = "universal@shipped"  # policy whose episode a search also starts from
+
+Recall = Callable[[ProfileProblem, HarmCount], tuple[Profiles, Bools]]
+"""Kept profiles [n] of a problem, and where there is one [n]; the others are ignored."""
+
+
+class BestHarm:
+    """Agent that plays the command profile of least known harm.
+
+    A world without a stored profile is searched at the alert. If the ``scenario`` has no other learner, a second search
+    with as many candidates starts from the better of that result and the episode of ``universal`` (a trained policy in
+    the package), so the harm is never above that policy's. ``predicted_harm`` [n] (m2/s2) equals the engine's harm
+    exactly if the engine has the same time step. Raises ``InvalidInput`` for a budget below 1 or an unknown count and,
+    when an episode begins, for another vehicle's script whose command is not fixed at the alert.
+
+    Args:
+        recall: returns the stored profile of each world of a problem, and a mask of the worlds that have one.
+        scenario: scenario of the worlds; None: unknown, without the second search.
+        harm_count: harm to minimise, ``first`` or ``total``.
+        horizon_s: end of the episode, s.
+        budget: candidates in a world without a stored profile.
+        time_step_s: time between two decisions, s.
+
+    """
+
+    name = "best_harm"
+    knows = Source.MODEL
+
+    def __init__(
+        self,
+        recall: Recall,
+        *,
+        scenario: Scenario | None = None,
+        harm_count: HarmCount = "first",
+        horizon_s: float = 8.0,
+        budget: int = PROFILE_BUDGET,
+        time_step_s: float = TIME_STEP_S,
+    ) -> None:
+        if not budget >= 1:
+            raise InvalidInput(f"best_harm: budget = {budget}; at least 1 candidate is needed")
+        check_harm_count(harm_count)
+        self._recall, self._budget, self._scenario = recall, budget, scenario
+        self._outlook = Outlook(harm_count, horizon_s, time_step_s)
+
+    @classmethod
+    def make(cls, argument: str | None, settings: AgentSettings, recall: Recall) -> BestHarm:
+        """Make the agent ``best_harm`` or ``best_harm:CANDIDATES``.
+
+        Args:
+            argument: number of candidates, or None for the default; ``InvalidInput`` if it is not such a number.
+            settings: scenario, harm to minimise and other settings of agents.
+            recall: returns the stored profile of each world of a problem, and a mask of the worlds that have one.
+
+        """
+        budget = PROFILE_BUDGET if argument is None else budget_of(argument)
+        if budget is None:
+            raise InvalidInput(
+                f"agent 'best_harm:{argument}': the argument must be a number of candidates, for instance"
+                f" {PROFILE_BUDGET}, at most {MOST_CANDIDATES:,}"
+            )
+        return cls(
+            recall, scenario=settings.scenario, harm_count=settings.harm_count, horizon_s=settings.horizon_s,
+            time_step_s=settings.time_step_s,
+            budget=budget if settings.most_candidates is None else min(budget, settings.most_candidates),
+        )  # fmt: skip
+
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        """Look up the stored profiles of these worlds, search worlds without one, and return the commands as memory.
+
+        Args:
+            alert: the worlds at the alert, [n].
+            vehicle: index of the controlled vehicle.
+            scripts: scripts of the other vehicles, by index.
+
+        """
+        others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
+        problem, outlook = self._outlook.problem(alert, vehicle, others), self._outlook
+        profiles, known = self._recall(problem, outlook.harm_count)
+        first, total = problem.follow(profiles)
+        harm, commands = (first if outlook.harm_count == "first" else total), self._stepwise(profiles)
+        unknown = np.flatnonzero(~known)
+        if unknown.size:
+            with renumbered(unknown):
+                commands[unknown], harm[unknown] = self._search(alert.take(unknown), vehicle, others[unknown])
+        return {
+            "predicted_harm": harm,
+            "searched": ~known,
+            "start_s": problem.clock[:, CLOCK.START].copy(),
+            "commands_mps2": commands,
+        }
+
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        """Return the command of the present step, [n] m/s2, and the unchanged memory.
+
+        Args:
+            worlds: the worlds now, [n]; only their time is read.
+            memory: result of ``begin``.
+            vehicle: not used.
+
+        """
+        return self._outlook.command(worlds, memory), memory
+
+    def _search(self, worlds: Worlds, vehicle: int, others: Floats) -> tuple[Floats, Floats]:
+        """Return the best commands from a search in these worlds, [n, decisions] m/s2, and their harm [n] m2/s2.
+
+        ``others`` [n, N] are the commands of the other vehicles, m/s2.
+        """
+        problem, outlook = self._outlook.problem(worlds, vehicle, others), self._outlook
+        coupled = optimise_coupled(
+            worlds, vehicle, harm_count=outlook.harm_count, horizon_s=outlook.horizon_s, others_mps2=others
+        )
+        given = problem.constant(-coupled.deceleration_mps2[:, np.newaxis, np.newaxis])
+        found, harms = search_profiles(problem, given, budget=self._budget)
+        best = self._stepwise(found)
+        if self._scenario is None or set(self._scenario.learners) - {vehicle}:
+            return best, harms[outlook.harm_count]
+        policy, steps = make_agent(START, scenario=self._scenario), int(problem.last_step.max())
+        driven = record_commands(policy, worlds, self._scenario, vehicle, steps)
+        of_policy = refine(problem, driven, budget=1)[1]
+        better = (of_policy < harms[outlook.harm_count])[:, np.newaxis]
+        best[:, :steps], harm = refine(problem, np.where(better, driven, best[:, :steps]), budget=self._budget)
+        return best, harm
+
+    def _stepwise(self, profiles: Profiles) -> Floats:
+        """Return the command of each profile at each decision, [n, decisions] m/s2."""
+        n = len(profiles.ends)
+        steps = [profiles.at(np.full(n, step))[:, 0] for step in range(self._outlook.decisions)]
+        return np.stack(steps, axis=1)

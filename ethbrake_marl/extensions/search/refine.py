@@ -1,0 +1,285 @@
+"""Refine an episode: a compiled random search around the commands of its steps.
+
+It climbs twice, by random changes of a few neighbouring steps: from the given commands, and from the best of some
+random templates, because the best may lie in a valley of its own. A *template* is one command, another one for a short
+while, then full braking. Everything advances decision by decision as in the engine, so the result is exact.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.engine.profiles import ProfileProblem, SearchWorld, copy_rows, make_search_world
+from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
+from ethbrake_marl.extensions.search.problem import seeded
+from ethbrake_marl.extensions.search.profiles import allowed, draw, draw_below, draw_command
+from ethbrake_marl.physics.elementary import exp
+from ethbrake_marl.physics.episode import (
+    CLOCK,
+    GOES_ON,
+    Episode,
+    grid_of,
+    harm_so_far,
+    restore,
+    save,
+    step_again,
+    value_of,
+)
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.rows import ROW
+from ethbrake_marl.physics.state import Bools, Floats, UInt64s
+
+TEMPLATE_SHARE, THEIR_CLIMB_SHARE = 0.3, 0.3  # shares of the budget; the rest is for the climb from the given commands
+
+ATTENTION_S = 3.0  # changes start within this time from the first decision
+
+LONGEST_CHANGE_S = 0.6  # longest change
+
+LONGEST_WHILE_S = 0.8  # longest second command of a template
+
+SET_SHARE = 0.1  # share of changes that replace commands; the others add to them
+
+FULL_BRAKE_SHARE = 0.8  # share of templates that begin with full braking
+
+LN_SMALLEST_CHANGE = (
+    -6.907755278982138
+)  # ln of the smallest added amount, relative to the whole range of commands: three decades
+
+WORSE = 5.0  # m2/s2; a climb starts from a template only if it is worse by at most this
+
+NO_HARM = 1e-9  # m2/s2; less harm than this counts as none
+
+
+class Plan(NamedTuple):
+    """Commands of one world in every step, and the states that they lead to."""
+
+    commands: Floats  # [T] command of the controlled vehicle in each step, m/s2
+    states: Floats  # [T + 1, S] state of the simulation at the start of each step
+
+
+def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
+    """Search around given commands of the one controlled vehicle. Return the best commands [n, T] (m/s2) and their harm
+    [n].
+
+    The result is never worse than the given commands. Harm (m2/s2) is counted as the engine counts it. Worlds are
+    independent of each other. Raises ``InvalidInput`` for several vehicles, commands of another shape or beyond a
+    capacity, or a budget below 1, and ``PhysicsError`` with the worlds in which the given commands cannot be played.
+
+    Args:
+        problem: n worlds, with the commands of the other vehicles and the harm to minimise.
+        commands_mps2: [n, T] command of each step to start from.
+        budget: candidates per world.
+        seed: seed of the random search.
+
+    """
+    check_whole_number("budget", budget, 1)
+    n, steps = problem.n, int(problem.last_step.max(initial=0))
+    low, high = problem.bounds[:, :1, 0], problem.bounds[:, :1, 1]
+    if len(problem.vehicles) != 1 or commands_mps2.shape != (n, steps):
+        raise InvalidInput(f"refine: commands of shape {commands_mps2.shape}; ({n}, {steps}) of one vehicle are needed")
+    if not ((commands_mps2 >= low) & (commands_mps2 <= high)).all():
+        raise InvalidInput("refine: a command is beyond the vehicle's capacity")
+    best, first, total = commands_mps2.copy(), np.zeros(n), np.zeros(n)
+    failed = np.zeros(n, np.bool_)
+    _refine_worlds(problem, seeded(problem.identity, seed), budget, best, first, total, failed)
+    if failed.any():
+        raise PhysicsError({k: "its commands could not be played" for k in np.flatnonzero(failed).tolist()})
+    return best, np.where(problem.clock[:, CLOCK.HARM_IS_TOTAL] == 1.0, total, first)
+
+
+@compiled
+def _refine_worlds(
+    problem: ProfileProblem, random: UInt64s, budget: int, commands: Floats, first: Floats, total: Floats,
+    failed: Bools,
+) -> None:  # fmt: skip
+    """Improve the commands of each world, in place.
+
+    Args:
+        problem: n worlds, with the commands of the other vehicles and the harm to minimise.
+        random: [n] initial state of each world's random stream.
+        budget: candidates per world.
+        commands: [n, T] commands of each step, m/s2; changed in place.
+        first: [n] receives the first-impact harm, m2/s2.
+        total: [n] receives the total harm, m2/s2.
+        failed: [n] receives True for worlds in which the commands cannot be played.
+
+    """
+    start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
+    mine, other = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))
+    room = Plan(np.zeros(T), np.zeros((T + 1, S)))
+    for k in range(start.shape[0]):
+        world = make_search_world(problem, k, random)
+        for plan in (mine, other, room):
+            copy_rows(start[k : k + 1], plan.states, 1)
+        copy_steps(commands[k], mine.commands, 0)
+        if not _refine_world(world, mine, other, room, budget):
+            failed[k] = True
+            continue
+        copy_steps(mine.commands, commands[k], 0)
+        follow_steps(world.episode, mine, 0, math.inf)
+        first[k], total[k] = harm_so_far(world.episode.table, 0.0), harm_so_far(world.episode.table, 1.0)
+
+
+@compiled(apart=True)
+def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budget: int) -> bool:
+    """Improve the commands ``mine`` of one world in place. Return False if they cannot be played.
+
+    Args:
+        world: the world, with its commands, bounds and random stream.
+        mine: commands to improve.
+        other: working memory.
+        room: working memory.
+        budget: number of candidates.
+
+    """
+    templates, theirs = int(TEMPLATE_SHARE * budget), int(THEIR_CLIMB_SHARE * budget)
+    value, reached = follow_steps(world.episode, mine, 0, math.inf)
+    if reached < 0:
+        return False
+    value, reached = climb(world, mine, room, value, reached, budget - templates - theirs)
+    if value <= NO_HARM:
+        return True
+    least, played = draw_templates(world, other, room, value + WORSE, templates)
+    if played > 0:
+        least, played = climb(world, other, room, least, played, theirs)
+        if least < value:
+            copy_steps(other.commands, mine.commands, 0)
+    return True
+
+
+@compiled(apart=True)
+def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[float, int]:
+    """Play the commands of ``plan`` from a step on, and write its states. Return the harm (m2/s2) and the number of
+    steps.
+
+    The number of steps is -1 if the physics failed.
+
+    Args:
+        world: the world, with the commands of the other vehicles.
+        plan: commands to play, with the state at step ``begin``; the later states are written.
+        begin: first step to play.
+        bound: harm at which to stop, m2/s2, because harm never falls.
+
+    """
+    table, clock = world.table, world.clock
+    grid, restitution, total, last = (
+        grid_of(clock),
+        clock[CLOCK.RESTITUTION],
+        clock[CLOCK.HARM_IS_TOTAL],
+        int(clock[CLOCK.LAST_STEP]),
+    )
+    no_rows = table[:0]
+    restore(table, plan.states[begin])
+    value = value_of(table, total)
+    for step in range(begin, last):
+        table[ROW.COMMAND, world.controlled[0]] = plan.commands[step]
+        outcome = step_again(table, restitution, grid, step, step + 1, no_rows)
+        if outcome < GOES_ON:
+            return value, -1
+        value = value_of(table, total)
+        save(table, plan.states[step + 1])
+        if value >= bound or outcome != GOES_ON:
+            return value, step + 1
+    return value, last
+
+
+@compiled(apart=True)
+def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int, budget: int) -> tuple[float, int]:
+    """Improve ``plan`` in place by random changes; return its harm (m2/s2) and its number of steps.
+
+    If adding an amount to the commands of some steps lowers the harm, twice the amount is tried next.
+
+    Args:
+        world: the world, with its commands, bounds and random stream.
+        plan: commands and states, already simulated.
+        room: working memory.
+        value: harm of the plan, m2/s2.
+        reached: number of its steps until the end of the episode.
+        budget: number of candidates.
+
+    """
+    low, high = world.bounds[0, 0], world.bounds[0, 1]
+    longest = steps_in(world.episode, LONGEST_CHANGE_S)
+    first, length, amount, adds, again = 0, 0, 0.0, True, False
+    for _ in range(budget):
+        if value <= NO_HARM:
+            break
+        if not again:
+            adds = draw(world.random) >= SET_SHARE
+            first = draw_below(world.random, min(reached, steps_in(world.episode, ATTENTION_S)))
+            u = draw(world.random)
+            length = 1 + int(u * u * longest)
+            if adds:  # an amount of either sign, log-uniform
+                sign = 1.0 if draw(world.random) < 0.5 else -1.0
+                amount = sign * (high - low) * exp(LN_SMALLEST_CHANGE * draw(world.random))
+            else:
+                amount = draw_command(world.random, low, high)
+        again = False
+        any_change = False
+        for t in range(first, plan.commands.shape[0]):
+            room.commands[t] = plan.commands[t]
+            if t < first + length:
+                room.commands[t] = allowed(plan.commands[t] + amount, low, high) if adds else amount
+                any_change = any_change or room.commands[t] != plan.commands[t]
+        if not any_change:
+            continue
+        copy_rows(plan.states[first:], room.states[first:], 1)
+        new, played = follow_steps(world.episode, room, first, value)
+        if played < 0 or not new < value:
+            continue
+        value, reached = new, played
+        copy_steps(room.commands, plan.commands, first)
+        copy_rows(room.states[first:], plan.states[first:], played - first + 1)
+        amount *= 2.0
+        again = adds
+    return value, reached
+
+
+@compiled(apart=True)
+def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, number: int) -> tuple[float, int]:
+    """Simulate random templates and write the best one to ``best``; return its harm (m2/s2) and its number of steps.
+
+    A *template* is one command, another one for a short while, then full braking. The number of steps is 0 if no
+    template is below ``bound``.
+
+    Args:
+        world: the world, with its commands, bounds and random stream.
+        best: receives the best template.
+        room: working memory.
+        bound: harm that a template must be below, m2/s2.
+        number: number of templates.
+
+    """
+    low, high, T = world.bounds[0, 0], world.bounds[0, 1], room.commands.shape[0]
+    attention, longest = steps_in(world.episode, ATTENTION_S), steps_in(world.episode, LONGEST_WHILE_S)
+    reached = 0
+    for _ in range(number):
+        first, length = draw_below(world.random, attention), 1 + draw_below(world.random, longest)
+        between = draw_command(world.random, low, high)
+        before = low if draw(world.random) < FULL_BRAKE_SHARE else draw_command(world.random, low, high)
+        for t in range(T):
+            room.commands[t] = before if t < first else (between if t < first + length else low)
+        value, played = follow_steps(world.episode, room, 0, bound)
+        if played > 0 and value < bound:
+            bound, reached = value, played
+            copy_steps(room.commands, best.commands, 0)
+            copy_rows(room.states, best.states, played + 1)
+    return bound, reached
+
+
+@compiled
+def steps_in(world: Episode, duration_s: float) -> int:
+    """Return the number of decision steps in ``duration_s``, rounded to a whole number of at least 1. ``world`` holds
+    the length of a step.
+    """
+    return max(int(duration_s / world.clock[CLOCK.TIME_STEP] + 0.5), 1)
+
+
+@compiled
+def copy_steps(commands: Floats, to: Floats, first: int) -> None:
+    """Copy the commands of one array to another, ``to``, from step ``first`` on."""
+    for t in range(first, commands.shape[0]):
+        to[t] = commands[t]

@@ -1,0 +1,75 @@
+"""The shipped tables of best known harm, and the agent that drives their profiles."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from ethbrake_marl.agents.protocol import Agent, Source
+from ethbrake_marl.agents.settings import AgentSettings
+from ethbrake_marl.engine.profiles import ProfileProblem, Profiles
+from ethbrake_marl.extensions.search.best_harm import task_problem
+from ethbrake_marl.extensions.search.recall import BestHarm
+from ethbrake_marl.extensions.search.tables import BestHarmTable
+from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.physics.state import Bools, Floats, Worlds
+from ethbrake_marl.registry import Part
+from ethbrake_marl.scenario.task import Task
+
+TABLES = Path(__file__).with_name("_tables")
+
+
+@cache
+def shipped_tables() -> tuple[BestHarmTable, ...]:
+    """Return every shipped table, sorted by file name."""
+    return tuple(BestHarmTable.load(path) for path in sorted(TABLES.glob("*.npz")))
+
+
+def best_known(worlds: Worlds, task: Task) -> dict[HarmCount, Floats]:
+    """Return the best known harm of each world (at t = 0) from the shipped tables, by harm count, [n] m2/s2.
+
+    NaN if no shipped table has it. Worlds are recognised by everything that affects their harm: state, parameters,
+    scripts of the others, time step, horizon and the controlled vehicles (in ``task``). Raises ``InvalidInput`` for a
+    script whose command is not fixed at the alert, because no search covers it.
+    """
+    identity = task_problem(worlds, task).identity
+    known = {harm_count: np.full(worlds.n, np.nan) for harm_count in HARM_COUNTS}
+    for table in shipped_tables():
+        known = {harm_count: np.fmin(harm, table.harm(identity, harm_count)) for harm_count, harm in known.items()}
+    return known
+
+
+def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Profiles, Bools]:
+    """Return the stored profiles of a problem with one controlled vehicle, [n], and a mask [n] of worlds that have one.
+
+    ``harm_count`` is the harm that the profiles minimise, ``first`` or ``total``.
+    """
+    last_step = problem.last_step
+    profiles, known = Profiles(last_step[:, np.newaxis].copy(), np.zeros((problem.n, 1, 1))), np.zeros(problem.n, bool)
+    for table in shipped_tables():
+        kept, here = table.profiles(problem.identity, harm_count, last_step)
+        profiles, kept = Profiles.padded([profiles, kept], 1)
+        profiles.ends[here] = kept.ends[here]
+        profiles.commands_mps2[here] = kept.commands_mps2[here]
+        known |= here
+    return profiles, known
+
+
+def make_best_harm(argument: str | None, settings: AgentSettings) -> Agent:
+    """Make the agent ``best_harm`` or ``best_harm:CANDIDATES``, which plays the shipped profile of each world.
+
+    A world without a shipped profile is searched. ``argument`` is the number of candidates of that search, or None.
+    """
+    return BestHarm.make(argument, settings, shipped_profiles)
+
+
+BEST_HARM = Part(  # target of the entry point in pyproject.toml
+    make_best_harm,
+    form="best_harm[:CANDIDATES]",
+    about="the best profile known; a search at the alert where none is known",
+    knows=Source.MODEL,
+)
+
+RUNGS = ("planner", "best_harm")  # agents that ``--agents ladder`` adds above the core's

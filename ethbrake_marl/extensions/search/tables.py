@@ -1,0 +1,276 @@
+"""Tables of best known harm: small files in which worlds are looked up by their content, not by their list number."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from ethbrake_marl.engine.profiles import ProfileProblem, Profiles
+from ethbrake_marl.errors import CorruptBundle, InvalidInput
+from ethbrake_marl.files.arrays import ArrayArchive, ArrayRow
+from ethbrake_marl.files.model import first_mistake
+from ethbrake_marl.files.plain import parse_strict_json, read_plain
+from ethbrake_marl.files.store import write_file
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.physics.state import Bools, Floats, Ints, UInt64s
+
+TABLE_FORMAT = 1
+
+SIZE_LIMIT_BYTES = 64 << 20  # largest file
+
+UNPACKED_LIMIT_BYTES = 256 << 20  # largest size of all arrays
+
+DECODED_LIMIT = 1 << 26  # most numbers in the decoded profiles of one count
+
+TOLERANCE = 1e-6  # an agent must be this much (m2/s2) below the table to replace its value
+
+_ABOUT = ("scenario", "list_seed", "episodes", "vehicles")  # entries of the header that error messages show
+
+LEFT_OUT = "left_out"  # key of a table's header: number in the list -> why the world is not in the table
+
+LOWERED = "lowered_by"  # key of a table's header: agent -> count -> number of worlds in which it did less harm
+
+COUNTS: tuple[HarmCount, ...] = ("first", "total")
+
+
+class BestKnown(NamedTuple):
+    """Best known harm of n worlds under one harm count."""
+
+    harm: Floats  # [n] best known harm, m2/s2
+    profiles: Profiles  # [n] command profiles with that harm; all ends are 0 where only the harm is known
+
+
+@dataclass(frozen=True, slots=True)
+class BestHarmTable:
+    """Best known harm of n worlds, for one or both harm counts."""
+
+    identity: UInt64s  # [n] hash of each world, by which it is found
+    best: Mapping[HarmCount, BestKnown]  # harm and profiles, by harm count
+    header: Mapping[str, Any]  # entries that describe how the table was computed: scenario, vehicles, budget, ...
+
+    @classmethod
+    def load(cls, path: Path) -> BestHarmTable:
+        """Return the table that is stored in the file ``path``.
+
+        Raises ``InvalidInput`` if there is no file, and ``CorruptBundle`` if it is not a table. Names, types, shapes
+        and sizes are checked from the headers before anything is unpacked. The harm of a world is not verified;
+        ``check_fits`` checks that the profiles fit a problem.
+        """
+        if not os.path.exists(path):
+            raise InvalidInput(f"{path}: there is no such table of best known harm")
+        data = read_plain(path, SIZE_LIMIT_BYTES, refusal=CorruptBundle)
+        try:
+            archive = ArrayArchive(data, UNPACKED_LIMIT_BYTES)
+            counts = [harm_count for harm_count in COUNTS if f"{harm_count}_harm" in archive.headers]
+            arrays = archive.unpack([row for harm_count in counts or COUNTS for row in _rows(harm_count)])
+            header = parse_strict_json(arrays["header"].tobytes())
+            _Header.model_validate(header)
+            best = {harm_count: _read_best(arrays, harm_count) for harm_count in counts}
+        except ValidationError as error:
+            raise CorruptBundle(f"{path}: is not a table of best known harm: header: {first_mistake(error)}") from None
+        except ValueError as error:
+            raise CorruptBundle(f"{path}: is not a table of best known harm: {error}") from None
+        del header["format"]
+        return cls(arrays["identity"].astype(np.uint64), best, header)
+
+    def save(self, path: Path) -> None:
+        """Write the table to the file ``path``, whole or not at all."""
+        write_file(path, table_bytes(self))
+
+    @property
+    def left_out(self) -> Mapping[str, str]:
+        """Worlds that are not in the table because of a failure: number in the list -> reason."""
+        return dict(self.header.get(LEFT_OUT, {}))
+
+    def rows(self, identity: UInt64s) -> NDArray[np.int64]:
+        """Return the row of each world, given by its hash ``identity`` [m]; -1 if it is not in the table."""
+        order = np.argsort(self.identity, kind="stable")
+        place = np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)
+        rows = order[place]
+        return np.where(self.identity[rows] == identity, rows, -1)
+
+    def check_holds_any(self, identity: UInt64s) -> None:
+        """Raise ``InvalidInput`` if the table holds none of the worlds with hashes ``identity``: it then belongs to
+        another list.
+        """
+        if not (self.rows(identity) >= 0).any():
+            made = ", ".join(f"{key} {self.header[key]}" for key in _ABOUT if key in self.header)
+            raise InvalidInput(
+                f"table of best known harm ({made}): holds none of these {len(identity)} worlds; give the scenario,"
+                " seed and vehicles that it was made for"
+            )
+
+    def check_fits(self, problem: ProfileProblem) -> None:
+        """Raise ``InvalidInput`` if a stored profile of a world of ``problem`` cannot be played there."""
+        for harm_count in self.best:
+            try:
+                problem.check(self.profiles(problem.identity, harm_count, problem.last_step)[0])
+            except InvalidInput as error:
+                raise InvalidInput(f"table of best known harm, {harm_count}: {error}") from None
+
+    def harm(self, identity: UInt64s, harm_count: HarmCount) -> Floats:
+        """Return the best known harm of each world, given by its hash ``identity`` [m]: [m] m2/s2, NaN if it is not in
+        the table.
+        """
+        rows = self.rows(identity)
+        if harm_count not in self.best:
+            return np.full(rows.shape, np.nan)
+        return np.where(rows >= 0, self.best[harm_count].harm[rows], np.nan)
+
+    def profiles(self, identity: UInt64s, harm_count: HarmCount, last_step: Ints) -> tuple[Profiles, Bools]:
+        """Return the stored profile of each world, [m], and a mask [m] of the worlds that have one.
+
+        A world without a profile gets coasting.
+
+        Args:
+            identity: [m] hash of each world.
+            harm_count: harm that the profiles minimise, ``first`` or ``total``.
+            last_step: [m] number of steps of each episode, at which a profile ends.
+
+        """
+        rows = self.rows(identity)
+        if harm_count not in self.best:
+            controlled = next(iter(self.best.values())).profiles.commands_mps2.shape[2]
+            coasting = Profiles(last_step[:, np.newaxis].copy(), np.zeros((len(rows), 1, controlled)))
+            return coasting, np.zeros(len(rows), np.bool_)
+        kept = self.best[harm_count].profiles.take(rows)
+        known = (rows >= 0) & (kept.ends[:, -1] > 0)
+        ends = np.where(known[:, np.newaxis], kept.ends, last_step[:, np.newaxis])
+        return Profiles(ends, np.where(known[:, np.newaxis, np.newaxis], kept.commands_mps2, 0.0)), known
+
+    def improved(
+        self, identity: UInt64s, harm_count: HarmCount, harm: Floats, profiles: Profiles | None = None
+    ) -> tuple[BestHarmTable, Bools]:
+        """Return the table with smaller values replaced, and a mask [m] of the worlds that were replaced.
+
+        A value is replaced if ``harm`` is smaller by more than ``TOLERANCE``. Worlds that are not in the table are
+        ignored. Raises ``InvalidInput`` for a count that the table does not hold, or for shapes that do not match.
+
+        Args:
+            identity: [m] hash of each world.
+            harm_count: ``first`` or ``total``.
+            harm: [m] harm of each world, m2/s2.
+            profiles: [m] command profiles that cause this harm; None: store the harm only.
+
+        """
+        if harm_count not in self.best:
+            raise InvalidInput(f"table of {', '.join(self.best)}: holds no {harm_count!r} harm")
+        if harm.shape != identity.shape:
+            raise InvalidInput(f"improve: {harm.shape} harms for {identity.shape} worlds")
+        rows = self.rows(identity)
+        old = self.best[harm_count]
+        better = (rows >= 0) & (harm < old.harm[rows] - TOLERANCE)
+        at = rows[better]
+        new_harm = old.harm.copy()
+        new_harm[at] = harm[better]
+        if profiles is None:
+            profiles = Profiles(
+                np.zeros((len(harm), 1), np.int64), np.zeros((len(harm), 1, old.profiles.commands_mps2.shape[2]))
+            )
+        kept, new = Profiles.padded([old.profiles, profiles], 1)
+        kept.ends[at] = new.ends[better]
+        kept.commands_mps2[at] = new.commands_mps2[better]
+        return replace(self, best={**self.best, harm_count: BestKnown(new_harm, kept)}), better
+
+
+def table_bytes(table: BestHarmTable) -> bytes:
+    """Return the bytes of a table file: a compressed .npz without pickles.
+
+    Only phases in use are stored, and the bytes of commands are grouped by significance to compress well.
+    """
+    arrays: dict[str, NDArray[Any]] = {
+        "header": np.frombuffer(json.dumps({"format": TABLE_FORMAT, **table.header}).encode(), np.uint8),
+        "identity": table.identity.astype("<u8"),
+    }
+    for harm_count, best in table.best.items():
+        ends, commands = best.profiles
+        used = _used(ends)
+        inside = np.arange(ends.shape[1]) < used[:, np.newaxis]
+        arrays[f"{harm_count}_harm"] = best.harm.astype("<f8")
+        arrays[f"{harm_count}_phases"] = used.astype("<u2")
+        arrays[f"{harm_count}_ends"] = ends[inside].astype("<u2")
+        flat = np.ascontiguousarray(commands[inside], "<f8")
+        arrays[f"{harm_count}_commands"] = flat.view(np.uint8).reshape(*flat.shape, 8).transpose(2, 0, 1).copy()
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    return buffer.getvalue()
+
+
+def _rows(harm_count: HarmCount) -> list[ArrayRow]:
+    """Return name, type and shape of each array that a table file holds for one harm count.
+
+    n worlds, m phases in all, C controlled vehicles.
+    """
+    return [
+        ArrayRow("header", "|u1", ("bytes",)),
+        ArrayRow("identity", "<u8", ("n",)),
+        ArrayRow(f"{harm_count}_harm", "<f8", ("n",)),
+        ArrayRow(f"{harm_count}_phases", "<u2", ("n",)),
+        ArrayRow(f"{harm_count}_ends", "<u2", (f"m of {harm_count}",)),
+        ArrayRow(f"{harm_count}_commands", "|u1", (8, f"m of {harm_count}", "C")),
+    ]
+
+
+class _Header(BaseModel):
+    """Entries of a table's header that other code relies on. A header may have more entries."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+
+    format: Annotated[int, Field(ge=TABLE_FORMAT, le=TABLE_FORMAT)]  # version of the file format; refuses true and 1.0
+    scenario: str = ""  # name of the scenario
+    vehicles: list[str] = []  # names of the controlled vehicles
+    budget: int = 0  # candidates per world and count of the search
+    search_seed: int = 0  # seed of the search
+    episodes: int = 0  # number of worlds of the list
+    list_seed: int = 0  # seed of the list
+    after: dict[str, Any] = {}  # header of the table with which the search started
+    lowered_by: dict[str, dict[str, int]] = {}  # agent -> count -> number of worlds in which the agent did less harm
+
+
+def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> BestKnown:
+    """Return harm and profiles of one count from the arrays of a table file, which have the right shapes.
+
+    Raises ``ValueError`` for impossible numbers.
+    """
+    harm = arrays[f"{harm_count}_harm"].astype(np.float64)
+    used = arrays[f"{harm_count}_phases"].astype(np.int64)
+    planes = arrays[f"{harm_count}_commands"]
+    flat = np.ascontiguousarray(planes.transpose(1, 2, 0)).view("<f8")[..., 0].astype(np.float64)
+    if not len(harm):
+        raise ValueError("it holds no world")
+    if not (np.isfinite(harm).all() and (harm >= 0.0).all()):
+        raise ValueError(f"{harm_count}_harm: a harm must be a finite number of at least 0 m2/s2")
+    if not np.isfinite(flat).all():
+        raise ValueError(f"{harm_count}_commands: a command must be a finite number")
+    if used.sum() != len(flat):
+        raise ValueError(f"{harm_count}_phases: {used.sum()} phases in all, but there are {len(flat)} commands")
+    width, controlled = max(int(used.max()), 1), flat.shape[1]
+    if not 1 <= controlled <= 64 or len(used) * width * (controlled + 1) > DECODED_LIMIT:
+        raise ValueError(f"{len(used)} worlds of {width} phases of {controlled} vehicles are beyond what is kept")
+    inside = np.arange(width) < used[:, np.newaxis]
+    ends, commands = np.zeros(inside.shape, np.int64), np.zeros((*inside.shape, controlled))
+    ends[inside] = arrays[f"{harm_count}_ends"]
+    commands[inside] = flat
+    last = np.maximum(used - 1, 0)
+    rows = np.arange(len(used))
+    ends = np.where(inside, ends, ends[rows, last][:, np.newaxis])
+    commands = np.where(inside[..., np.newaxis], commands, commands[rows, last][:, np.newaxis])
+    if not ((np.diff(ends, axis=1) >= 0).all() and ((ends[:, -1] > 0) == (used > 0)).all()):
+        raise ValueError(f"{harm_count}_ends: the phases of a world must end in order, the last one after step 0")
+    return BestKnown(harm, Profiles(ends, commands))
+
+
+def _used(ends: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the number of phases that each profile uses, [n]; 0 if there is no profile. ``ends`` [n, K] are their
+    ends.
+    """
+    return np.where(ends[:, -1] > 0, np.argmax(ends == ends[:, -1:], axis=1) + 1, 0)

@@ -1,0 +1,59 @@
+"""Random templates of a whole episode: brake fully, give way, brake again. The best one in each world is returned.
+
+Templates show how a world could be driven differently from a policy (``refine`` climbs from the same templates). They
+are not improved: a random template with little harm is robust, so a policy can imitate it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ethbrake_marl.engine.profiles import ProfileProblem, copy_rows, make_search_world
+from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.extensions.search.problem import seeded
+from ethbrake_marl.extensions.search.refine import Plan, copy_steps, draw_templates
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.state import Floats, Ints, UInt64s
+
+
+def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed: int = 0) -> tuple[Floats, Ints]:
+    """Return the best of some random templates in each world: its commands [n, T] (m/s2), and its number of steps [n].
+
+    A *template* is a whole episode: brake fully, give way, brake again. The number of steps is 0 if no template is
+    below the bound. Each world draws its own templates and is independent of the others. Raises ``InvalidInput`` for
+    several controlled vehicles, or no template.
+
+    Args:
+        problem: n worlds, with the commands of the other vehicles and the harm to minimise.
+        bound: [n] harm that a template must be below, m2/s2.
+        number: number of templates per world.
+        seed: seed of the random draws.
+
+    """
+    check_whole_number("templates", number, 1)
+    if len(problem.vehicles) != 1:
+        raise InvalidInput(f"templates: {len(problem.vehicles)} vehicles; they are of one")
+    commands = np.zeros((problem.n, int(problem.last_step.max(initial=0))))
+    steps = np.zeros(problem.n, np.int64)
+    _best_templates(problem, seeded(problem.identity, seed), bound, number, commands, steps)
+    return commands, steps
+
+
+@compiled
+def _best_templates(
+    problem: ProfileProblem, random: UInt64s, bound: Floats, number: int, commands: Floats, steps: Ints
+) -> None:
+    """Write the best random template of each world to ``commands`` [n, T] and its number of steps to ``steps`` [n].
+
+    ``random`` [n] is the initial state of each world's random stream, ``bound`` [n] the harm to be below, ``number``
+    the number of templates per world.
+    """
+    start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
+    best, room = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))
+    for k in range(start.shape[0]):
+        world = make_search_world(problem, k, random)
+        copy_rows(start[k : k + 1], best.states, 1)
+        copy_rows(start[k : k + 1], room.states, 1)
+        steps[k] = draw_templates(world, best, room, bound[k], number)[1]
+        if steps[k] > 0:
+            copy_steps(best.commands, commands[k], 0)

@@ -1,0 +1,1 @@
+"""Many trainings or worlds: ``ethbrake study sweep``, ``tune`` and ``falsify``."""

@@ -1,0 +1,356 @@
+"""The commands ``study``: sweep or tune many trainings, or search many worlds for weaknesses."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ethbrake_marl import evaluation, training
+from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, SettingsOption, example, schema_option
+from ethbrake_marl.cli.evaluate import read_task
+from ethbrake_marl.errors import InvalidInput, count_of, need
+from ethbrake_marl.files.sheet import Sheet
+
+KEPT = "the same command goes on with what is in the folder"
+
+ROUNDING = 1e-6  # m2/s2
+
+MOST_WORKERS = 4096
+
+FolderOption = Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")]
+
+RetriesOption = Annotated[int, typer.Option(help="How often to try again when a process is lost.", min=0, max=100)]
+
+DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print what would be trained; do nothing.")]
+
+ClusterOption = Annotated[
+    str, typer.Option(metavar="local|ADDRESS", help="Ray on this machine, or on a running cluster.")
+]
+
+study_group = typer.Typer(
+    rich_markup_mode=None,
+    add_completion=False,
+    help="Train and compare many policies; search for the worst worlds.",
+    epilog=example("study sweep sweep.yaml --output runs/sweep", "study ablate --quick --output runs/ablation-quick"),
+)
+
+
+@study_group.command("sweep", epilog=example("study sweep sweep.yaml --output runs/sweep"))
+def sweep_command(
+    file: Annotated[Path, typer.Argument(metavar="SWEEP.yaml", help="A grid or a list of jobs.")],
+    output: FolderOption,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            help="Jobs at once, one process and thread each.", show_default="one for each core", min=1, max=MOST_WORKERS
+        ),
+    ] = None,
+    ray: ClusterOption = "local",
+    retries: RetriesOption = 2,
+    dry_run: DryRunOption = False,
+    schema: schema_option("ethbrake_marl.extensions.studies.sweep", "SweepPlan", "sweep") = False,  # type: ignore[valid-type]  # made here
+    as_json: JsonOption = False,
+) -> None:
+    """Train every job of a file, and write one table.
+
+    The same command goes on after an interruption: finished jobs are kept, begun ones go
+    on. Exit status 1 where jobs failed: failures.csv says why.
+    """
+    with Out(as_json=as_json, kept=KEPT) as out:
+        from ethbrake_marl.extensions.studies.sweep import SweepPlan
+
+        plan = SweepPlan.read(file)
+        plan.folder(output).check()
+        if dry_run:
+            states = plan.states(output)
+            lines = ([f"{job['state']:8}", job["job"], *map("=".join, job["set"].items())] for job in states)
+            out.result(states, *map("  ".join, lines))
+            return
+        need("ray")
+        result = plan.run(output, jobs=jobs, ray=ray, retries=retries, tell=out.show_progress)
+        counts = {"jobs": result.jobs, "finished": result.finished, "failed": result.failed}
+        out.result({**counts, "interrupted": result.interrupted, "table": str(result.table)})
+        told = f"{result.finished:,} of {result.jobs:,} jobs finished; table: {result.table}"
+        if result.failed:
+            told += f"; {result.failed:,} failed: {output / 'failures.csv'}"
+        _end_study(out, told, interrupted=result.interrupted, failed=result.failed > 0)
+
+
+@study_group.command(
+    "tune", epilog=example("study tune tuning.yaml --output runs/tuning --trials 30 --export best.yaml")
+)
+def tune_command(
+    file: Annotated[Path, typer.Argument(metavar="TUNING.yaml", help="A training and the ranges of its settings.")],
+    output: FolderOption,
+    trials: Annotated[
+        int, typer.Option(help="Trials that the folder has at the end, earlier ones included.", min=1, max=10_000)
+    ] = 30,
+    jobs: Annotated[
+        int,
+        typer.Option(
+            help="Trials at once, one process each; more than 1 changes which values are tried.",
+            min=1,
+            max=MOST_WORKERS,
+        ),
+    ] = 1,
+    ray: ClusterOption = "local",
+    retries: RetriesOption = 2,
+    export: Annotated[
+        Path | None, typer.Option(metavar="NAME.yaml", help="Write the best trial as a recipe of this name.")
+    ] = None,
+    dry_run: DryRunOption = False,
+    schema: schema_option("ethbrake_marl.extensions.studies.tuning", "TuningPlan", "tuning") = False,  # type: ignore[valid-type]  # made here
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Search the settings of a recipe for the least harm.
+
+    Harm is measured on a list of worlds of its own. The same command goes on after an interruption: trials that ended
+    are kept, those that were begun go on. Exit status 1 where no trial came to its end.
+    """
+    with Out(as_json=as_json, force=force, kept=KEPT) as out:
+        need("optuna")
+        from ethbrake_marl.extensions.studies.tuning import TuningPlan
+
+        plan = TuningPlan.read(file)
+        plan.folder(output).check()
+        if export is not None:  # raise now what would be raised at the end
+            if export.suffix != ".yaml":
+                raise InvalidInput(f"export {export}: must end in .yaml, as recipes do")
+            plan.best_recipe({}, export, "")
+            out.force = out.force or plan.has_exported(output, export)  # the same command goes on
+            out.check(export)
+        if dry_run:
+            own = plan.own_values()
+            space = {key: dimension.model_dump(mode="json") for key, dimension in plan.file.search.items()}
+            now = {key: "not in the space" if own is None else f"the recipe has {own[key]}" for key in space}
+            begun, steps, example = len(plan.proposals(output)), plan.recipe.total_steps, plan.example()
+            out.result(
+                {
+                    **{"search": space, "own_values": own, "trials": trials, "begun": begun, "total_steps": steps},
+                    **{"scenario": plan.file.scenario, "recipe": plan.file.recipe, "example": example},
+                },
+                f"{count_of(trials, 'trial')} ({begun:,} begun before): recipe {plan.file.recipe} in scenario"
+                f" {plan.file.scenario}, {steps:,} decisions each unless it is pruned",
+                *(f"{key}  {dimension}  ({now[key]})" for key, dimension in plan.file.search.items()),
+                f"{'the first' if own else 'for example'}: {example}",
+            )
+            return
+        need("ray")
+        result = plan.run(output, trials, jobs=jobs, ray=ray, retries=retries, tell=out.show_progress)
+        counted = ", ".join(f"{number:,} {state}" for state, number in sorted(result.counts.items()))
+        told, best, shown, lines = f"trials: {counted or 'none'}; table: {result.table}", result.best, None, []
+        export = None if best is None or result.interrupted else export  # what goes on exports at its end
+        if best is not None:
+            measure = training.RunDirectory.chosen_by([best.figures], plan.recipe.reward.harm_count)
+            shown = {"trial": best.number, "measure": measure, "harm": best.harm, "values": best.values}
+            unit = "" if measure == training.RunDirectory.OBJECTIVE else " m²/s²"  # injuries have another one
+            lines = [f"best: trial {best.number}, {measure} {best.harm:.4f}{unit}"]
+            lines += [f"  {key} = {value}" for key, value in best.values.items()]
+            if export is not None:
+                source = f"trial {best.number}, {best.harm!r} on the list of seed {plan.file.measure.seed}"
+                out.write(export, plan.best_recipe(best.values, export, f"ethbrake study tune: {source}"))
+                told += f"; recipe: {export}"
+        found = {
+            "best": shown,
+            "trials": result.counts,
+            "interrupted": result.interrupted,
+            "table": str(result.table),
+            "exported": None if export is None else str(export),
+        }
+        out.result(found, *lines)
+        _end_study(out, told, interrupted=result.interrupted, failed=best is None)
+
+
+def _end_study(out: Out, told: str, *, interrupted: bool, failed: bool) -> None:
+    """Print ``told``, the result of a sweep or tuning, and end the command: status 130 if interrupted, 1 if failed."""
+    if interrupted:
+        out.interrupted(f"interrupted; {told}; {KEPT}")
+    out.note(told)
+    if failed:
+        raise typer.Exit(1)
+
+
+@study_group.command(
+    "falsify", epilog=example("study falsify --agent ppo@shipped --against e_v2x_bm --output worst.yaml")
+)
+def falsify_command(
+    agent: Annotated[
+        str | None, typer.Option(help="Who drives; any agent of `ethbrake evaluate`.", show_default="policy@shipped")
+    ] = None,
+    measure: Annotated[
+        str | None,
+        typer.Option(metavar="harm|regret|difference|bound", help="What to search for.", show_default="regret"),
+    ] = None,
+    against: Annotated[
+        str | None,
+        typer.Option(metavar="AGENT", help="Agent with which regret or difference compares.", show_default="best_harm"),
+    ] = None,
+    scenario: Annotated[
+        str | None,
+        typer.Option(metavar="NAME|PATH", help="Scenario whose ranges are searched.", show_default="paper-random"),
+    ] = None,
+    budget: Annotated[int | None, typer.Option(help="Worlds to try.", min=1, show_default="4000")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the search.", min=0, show_default="0")] = None,
+    keep: Annotated[
+        int | None, typer.Option(help="Worlds to keep, at most.", min=1, max=1000, show_default="20")
+    ] = None,
+    settings: SettingsOption = None,
+    output: Annotated[
+        Path | None, typer.Option(metavar="FILE.yaml", help="Write the worlds to a file for --again.")
+    ] = None,
+    again: Annotated[
+        Path | None, typer.Option(metavar="FILE.yaml", help="Drive the worlds of a file again instead of searching.")
+    ] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Search for the worlds in which an agent is worst.
+
+    It searches the ranges of a scenario. regret: harm beyond that of --against, by default the best profile found with
+    hindsight. bound: how near a shield comes to the bound that it gave; above zero the bound is broken. difference:
+    where the harm of two agents differs most. --again FILE drives the kept worlds again, by --agent or the agent of the
+    file; exit status 1 where one of them is worse.
+    """
+    with Out(as_json=as_json, force=force) as out:
+        import numpy as np
+
+        from ethbrake_marl.extensions.studies.machine import this_machine
+        from ethbrake_marl.extensions.studies.named_worlds import NamedWorlds
+        from ethbrake_marl.extensions.studies.weakness import Measure
+
+        if again is not None:
+            asked = {
+                "--measure": measure, "--against": against, "--scenario": scenario, "--budget": budget, "--seed": seed,
+                "--keep": keep, "--set": settings, "--output": output, "--force": force or None,
+            }  # fmt: skip
+            for option in (name for name, value in asked.items() if value is not None):
+                raise InvalidInput(
+                    f"--again: the file says what is measured; {option} has no place beside it, --agent has"
+                )
+            _drive_again(out, again, agent)
+            return
+        agent, measure, scenario = agent or "policy@shipped", measure or "regret", scenario or "paper-random"
+        budget, seed, keep = 4000 if budget is None else budget, seed or 0, keep or 20
+        out.check(output, ".yaml", ".yml", what="a file of worlds")
+        task = read_task(scenario, settings)
+        chosen = task.scenario
+        measured_by = Measure.of(measure, agent, against, chosen, task.harm_count)
+        evaluation.check_agents(measured_by.agents, chosen.replace(early_impacts="keep").sample(1, seed).worlds, chosen)
+        found = measured_by.falsify(
+            budget, seed, most=keep, on_round=lambda done, total: out.progress(agent, done, total)
+        )
+        worlds, good = found.worlds, found.scores[np.isfinite(found.scores)]
+        told: dict[str, Any] = {
+            "tried": budget,
+            "counted": len(good),
+            "share_above_zero": found.share_above,
+            "first_above_zero": found.first_above,
+            "median": float(np.median(good)),
+            "worst": float(good.max()),
+            "machine": asdict(this_machine()),
+            "worlds": [world.model_dump(exclude_none=True) for world in worlds],
+        }
+        first, shown = found.first_above, []
+        left_out = f" ({budget - len(good):,} of them are none of the scenario's)" if len(good) < budget else ""
+        summary = (
+            f"{chosen.name}: {budget:,} worlds tried{left_out}; {measure} in m2/s2, {task.harm_count} count: worst"
+            f" {told['worst']:.4g}, median {told['median']:.4g}; above zero in {100 * found.share_above:.1f} % of those"
+            f" tried, {f'the first after {first:,}' if first else 'none'}."
+            " The search looks for bad worlds: shares of it say nothing about a list."
+        )
+        if worlds:
+            kept = NamedWorlds.of(
+                measured_by.scenario,
+                scenario=scenario,
+                settings=[each.text for each in training.read_settings(settings, of_agents=("harm_count",)).scenario],
+                agent=agent,
+                measure=measure,
+                against=against,
+                harm_count=task.harm_count,
+                found_by=_spelled(
+                    agent=agent, measure=measure, against=against, scenario=scenario, budget=budget, seed=seed,
+                    keep=keep, set=tuple(settings or ()),
+                ),
+                worlds=worlds,
+            )  # fmt: skip
+            told |= kept.model_dump(exclude_none=True)
+            beside = {"harm": [], "bound": ["Bound"]}.get(measure, ["Reference's harm"])
+            columns = ("World", measure.capitalize(), "Harm", *beside, "State")
+            rows = []
+            for world in worlds:
+                reference = [] if world.reference is None else [f"{world.reference:.2f}"]
+                state = ", ".join(f"{name} {value:.4g}" for name, value in world.state.items())
+                rows.append((world.name, f"{world.score:.4g}", f"{world.harm:.2f}", *reference, state))
+            shown.append(Sheet("", columns, rows, gap=2))
+            if output is not None:
+                out.write(output, kept.text, what="the worlds")
+        elif output is not None:
+            out.note(f"nothing was found, and {output} not written")
+        out.result({**told, "versions": evaluation.result_versions()}, *shown, summary)
+
+
+def _spelled(**options: Any) -> str:
+    """Return the command line ``ethbrake study falsify`` with these options, by name.
+
+    Options that are None are left out; a tuple repeats its option.
+    """
+    words = ["ethbrake", "study", "falsify"]
+    for option, value in options.items():
+        if value is not None:
+            for each in value if isinstance(value, tuple) else (value,):
+                words += [f"--{option}", str(each)]
+    return shlex.join(words)
+
+
+def _drive_again(out: Out, file: Path, agent: str | None) -> None:
+    """Measure the worlds of a file of ``study falsify`` once more, and print a comparison.
+
+    ``agent`` drives; None: the agent that the file names. Ends the command with status 1 if a world is worse than
+    before or could not be driven.
+    """
+    import numpy as np
+
+    from ethbrake_marl.agents.spec import parse_spec
+    from ethbrake_marl.extensions.studies.named_worlds import NamedWorlds
+    from ethbrake_marl.extensions.studies.weakness import Measure
+    from ethbrake_marl.scenario.sample import Sample
+
+    kept = NamedWorlds.read(file)
+    for spec in (*([kept.agent] if agent is None else []), *([kept.against] if kept.against else [])):
+        if (code := parse_spec(spec).file) is not None:
+            raise InvalidInput(
+                f"{file}: names an agent that is code ({code[0]}), which is not run because a file names it; --agent"
+                " names another one, and who is compared with is edited in the file"
+            )
+    chosen = evaluation.load_runnable(kept.scenario, training.read_settings(kept.settings).scenario, drives="some")
+    measured_by = Measure.of(kept.measure, agent or kept.agent, kept.against, chosen, kept.harm_count)
+    worlds = kept.worlds_of(chosen, str(file))
+    measured = measured_by(Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0))
+    rows = [
+        {
+            "name": world.name,
+            "before": world.score,
+            "now": float(now) if np.isfinite(now) else None,
+            "worse": not np.isfinite(now) or bool(now > world.score + ROUNDING),
+        }
+        for world, now in zip(kept.worlds, measured.score, strict=True)
+    ]
+    shown = [
+        (
+            *(row["name"], f"{row['before']:.4f}"),
+            "could not be driven" if row["now"] is None else f"{row['now']:.4f}",
+            "worse" if row["worse"] else "",
+        )
+        for row in rows
+    ]
+    sheet = Sheet("", ("World", f"{kept.measure} before", "now", ""), shown, gap=2)
+    out.result({"agent": agent or kept.agent, "measure": kept.measure, "worlds": rows}, sheet)
+    worse = sum(bool(row["worse"]) for row in rows)
+    out.note(f"{file}: {agent or kept.agent} is worse in {worse} of {count_of(len(rows), 'world')}")
+    if worse:
+        raise typer.Exit(1)

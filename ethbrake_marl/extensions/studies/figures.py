@@ -1,0 +1,116 @@
+"""One training of a sweep or a tuning: bring it to its end in its folder, and return its figures for a table."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.extensions.studies.trainings import TrainingJob
+from ethbrake_marl.files.store import remove_folder
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.policies.teams import read_trained
+from ethbrake_marl.training.callback import StopAt
+from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.training import check_same_training
+
+_MEASURED = ("first_impact_harm", "total_harm", "collision_rate")
+
+FIGURES = (
+    "steps",  # decisions of learners in whole updates
+    "policy_steps",  # decisions after which the kept policy, the best one on the recipe's list, was saved
+    *_MEASURED,  # measures of the kept policy on that list
+    RunDirectory.OBJECTIVE,  # likewise, if a learner has another objective than total harm
+    *(f"last_{name}" for name in _MEASURED),  # measures of the last policy
+    "policy_sha256",  # hash of the kept policy's manifest; vehicle_i=... for each of several policies
+)
+
+HARM = "harm"  # key beside FIGURES: the quantity by which the kept policy is the best
+
+REASON = "reason"  # key instead of FIGURES: why a training cannot succeed
+
+Evaluation = Mapping[str, float]  # one evaluation during a training: steps, and the measures at that time, by name
+
+
+def is_done(job: TrainingJob) -> bool:
+    """Return whether the folder of ``job`` holds the finished training with its policies.
+
+    Raises ``InvalidInput`` for another training.
+    """
+    run = RunDirectory(job.folder)
+    if not run.is_finished:
+        return False
+    check_same_training(run, job.training)
+    return all(Policy.stands_in(job.folder / place) for place in job.training.drivers.values())
+
+
+def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
+    """Bring the training of ``job`` to its end, from where it stopped. Return False if it was stopped early.
+
+    ``stop_at`` takes each evaluation and returns a reason to stop, or None. Raises the exceptions of a training,
+    ``InvalidInput`` if the folder holds another training, and ``BlockingIOError`` if another worker has just begun it.
+    """
+    run = RunDirectory(job.folder)
+    if run.status.is_file():
+        run.wait_for_others(60.0)  # a worker without driver may still hold the folder
+        check_same_training(run, job.training)
+        if run.is_finished and not is_done(job):
+            remove_folder(job.folder)  # without policies it is trained again; there is no checkpoint
+    try:
+        return bool(job.finish(stop_at=stop_at))
+    except AlreadyExists as error:
+        raise BlockingIOError(str(error)) from None
+
+
+def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
+    """Return the evaluations so far in the folder of ``job``, each with steps and measures by name.
+
+    Raises ``InvalidInput`` if its table ``progress.csv`` is damaged.
+    """
+    run, names = RunDirectory(job.folder), (*_MEASURED, RunDirectory.OBJECTIVE)
+    try:
+        rows = [row for row in (run.rows() if run.progress.is_file() else []) if row.get(f"eval/{_MEASURED[0]}")]
+        found = [
+            {"steps": int(row["steps"])} | {n: float(row[f"eval/{n}"]) for n in names if row.get(f"eval/{n}")}
+            for row in rows
+        ]
+        if any(not {*_MEASURED} <= each.keys() or not all(map(math.isfinite, each.values())) for each in found):
+            raise ValueError("a measure is missing or not finite")
+    except (ValueError, LookupError, csv.Error) as error:
+        raise InvalidInput(f"{run.progress}: is damaged ({error}); delete its folder to train anew") from None
+    return found
+
+
+def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, Any]:
+    """Return the figures of the training ``job`` for a table, given its evaluations so far, by name.
+
+    The names are ``harm`` (the quantity by which the best policy is chosen) and those in ``FIGURES``, without
+    ``policy_sha256``; for example ``{"harm": 7.1, "steps": 400000, "total_harm": 9.8, ...}``.
+    """
+    harm = RunDirectory.chosen_by(evaluations, job.training.recipe.reward.harm_count)
+    kept, last = min(evaluations, key=lambda each: each[harm]), evaluations[-1]
+    return {
+        HARM: kept[harm],
+        "steps": last["steps"],
+        "policy_steps": kept["steps"],
+        **{name: kept[name] for name in (*_MEASURED, RunDirectory.OBJECTIVE) if name in kept},
+        **{f"last_{name}": last[name] for name in _MEASURED},
+    }
+
+
+def final_figures(job: TrainingJob) -> dict[str, Any]:
+    """Return the figures of the finished training ``job`` for a table, by name: ``harm`` and all in ``FIGURES``.
+
+    Raises ``InvalidInput`` for a damaged file.
+    """
+    run, evaluations = RunDirectory(job.folder), evaluations_of(job)
+    if not evaluations:
+        raise InvalidInput(f"{run.progress}: holds no evaluation; delete its folder to train anew")
+    trained = read_trained(run.policy)
+    if isinstance(trained, Policy):
+        sha256 = trained.manifest.manifest_sha256
+    else:
+        sha256 = " ".join(f"{name}={policy.manifest.manifest_sha256}" for name, policy in trained.drivers.items())
+    return {**figures(job, evaluations), "policy_sha256": sha256}

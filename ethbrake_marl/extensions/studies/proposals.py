@@ -1,0 +1,92 @@
+"""Optuna's proposals (values to try) for a tuning, through Ray Tune, stored in a file and reused after a restart.
+
+Each trial has a new sampler, seeded by a seed and the trial's number. So a proposal depends on the trials that have
+ended, and not on interruptions of the command.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import optuna
+from optuna.samplers import BaseSampler
+from ray.tune.search.optuna import OptunaSearch
+
+from ethbrake_marl.extensions.studies.figures import HARM
+from ethbrake_marl.files.store import write_file
+
+if TYPE_CHECKING:
+    from optuna import Study
+    from optuna.distributions import BaseDistribution
+    from optuna.trial import FrozenTrial
+
+Proposal = Mapping[str, Any]  # key -> value in Optuna's form
+
+
+class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
+    """Optuna's search as Ray Tune uses it, which stores each proposal in a file.
+
+    A *proposal* is the values to try in one trial, by key, in Optuna's form. The configuration of a trial is its
+    number, ``trial``, and its proposal, ``values``.
+
+    Args:
+        file: JSON file of the proposals; created with the first one.
+        known: proposals that the file holds already; they are proposed again, before new ones.
+        space: key -> Optuna's distribution of its values.
+        sampler: function from the number of a trial to its Optuna sampler.
+        first: proposal of the very first trial, used if ``known`` is empty; None: it is sampled like the others.
+
+    """
+
+    def __init__(
+        self,
+        file: Path,
+        known: Sequence[Proposal],
+        space: Mapping[str, BaseDistribution],
+        sampler: Callable[[int], BaseSampler],
+        first: Proposal | None,
+    ) -> None:
+        optuna.logging.set_verbosity(optuna.logging.ERROR)
+        self._file, self.known, self._asked = file, [*known], 0
+        points = self.known or ([] if first is None else [first])
+        super().__init__(
+            dict(space),
+            metric=HARM,
+            mode="min",
+            points_to_evaluate=[dict(each) for each in points],
+            sampler=_SamplerOfTrial(sampler),
+        )
+
+    def suggest(self, trial_id: str) -> dict[str, Any] | None:
+        """Return the configuration of the next trial: ``{"trial": number, "values": proposal}``.
+
+        A proposal that is not in the file yet is stored there. ``trial_id`` is Ray's name of the trial.
+        """
+        values, number = super().suggest(trial_id), self._asked
+        if number == len(self.known):
+            self.known.append(values)
+            write_file(self._file, (json.dumps({"trials": self.known}, indent=1) + "\n").encode())
+        self._asked += 1
+        return {"trial": number, "values": values}
+
+
+class _SamplerOfTrial(BaseSampler):
+    """Optuna sampler that makes a new sampler for each trial; ``of`` returns it for the number of the trial."""
+
+    def __init__(self, of: Callable[[int], BaseSampler]) -> None:
+        self._of = of
+
+    def before_trial(self, study: Study, trial: FrozenTrial) -> None:
+        self._sampler = self._of(trial.number)
+
+    def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
+        return {}
+
+    def sample_relative(self, study: Study, trial: FrozenTrial, search_space: Mapping[str, Any]) -> dict[str, Any]:
+        return {}
+
+    def sample_independent(self, study: Study, trial: FrozenTrial, name: str, distribution: BaseDistribution) -> Any:
+        return self._sampler.sample_independent(study, trial, name, distribution)

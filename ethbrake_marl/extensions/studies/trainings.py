@@ -1,0 +1,175 @@
+"""Trainings of a study: finished ones are kept, unfinished ones continue, several at a time; and their cost."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.parallel import run_each
+from ethbrake_marl.physics.state import Worlds
+from ethbrake_marl.progress import OnProgress, Progress
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.team import load_team
+from ethbrake_marl.training.training import Training, check_same_training
+
+if TYPE_CHECKING:
+    from ethbrake_marl.training.callback import StopAt
+
+
+def train_all(trainings: Sequence[TrainingJob], jobs: int = 1, tell: OnProgress | None = None) -> bool:
+    """Bring every training to its end, from where it stopped. Return False if Ctrl-C stopped one.
+
+    The policies do not depend on ``jobs`` or on interruptions.
+
+    Args:
+        trainings: trainings with their folders.
+        jobs: number of trainings at once, one process each.
+        tell: called with the progress; None: silent.
+
+    Raises the exceptions of ``steps_left`` before any training begins, and the exception of the first training that
+    fails.
+
+    """
+    left = [training for training in trainings if training.steps_left()]
+    if jobs == 1 or len(left) < 2:
+        return all(training.finish(tell) for training in left)
+    say = tell or (lambda progress: None)
+    say(Progress("trainings", 0, len(left)))
+    for done, finished in enumerate(run_each(((training.finish,) for training in left), jobs), 1):
+        if not finished:
+            return False
+        say(Progress("trainings", done, len(left)))
+    return True
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingJob:
+    """A training of a study, and the folder in which it runs."""
+
+    training: Training  # recipe and scenario
+    folder: Path  # folder of the run; it need not exist yet
+    noted: tuple[str, ...] = ()  # how scenario and recipe differ from their files, ``KEY=VALUE``, for ``config.json``
+
+    @property
+    def per_update(self) -> int:
+        """Number of decisions of all learners together between two updates."""
+        return self.training.recipe.n_envs * len(self.training.scenario.learners) * self.training.recipe.rounds
+
+    def steps_left(self) -> int:
+        """Return the number of decisions until the end of the training; 0 if it has finished.
+
+        Raises ``InvalidInput`` if the folder holds another training.
+        """
+        run, total = RunDirectory(self.folder), self.training.recipe.total_steps
+        if not run.status.exists():
+            if self.folder.exists():
+                raise InvalidInput(f"{self.folder}: is no training; move it away, or give another --output")
+            return total
+        try:
+            status = read_object(run.status)
+        except InvalidInput as error:
+            raise InvalidInput(f"{error}; delete its folder to train anew") from None
+        check_same_training(run, self.training)
+        if status.get("status") == "finished":
+            return 0
+        steps = status.get("steps", 0)
+        return max(total - (steps if isinstance(steps, int) else 0), 1)
+
+    def finish(self, tell: OnProgress | None = None, *, stop_at: StopAt | None = None) -> bool | None:
+        """Bring the training to its end, from where it stopped. Return True, or None if it was stopped early.
+
+        Args:
+            tell: called with the progress; None: silent.
+            stop_at: takes each evaluation, and returns a reason to stop, or None.
+
+        Raises the exceptions of ``train`` and ``resume``.
+
+        """
+        from ethbrake_marl.training.session import resume, train  # torch takes seconds to load
+
+        def say(progress: Progress) -> None:
+            if tell is not None:
+                tell(replace(progress, name=self.folder.name))
+
+        run, asked = RunDirectory(self.folder), self.training
+        if run.is_finished:
+            return True
+        if run.status.is_file():
+            ended = resume(self.folder, stop_at=stop_at, on_progress=say)
+        else:
+            self.folder.parent.mkdir(parents=True, exist_ok=True)
+            ended = train(
+                asked.recipe, asked.scenario, self.folder, settings=self.noted, stop_at=stop_at, on_progress=say
+            )
+        return True if ended.status == "finished" else None
+
+    def time(self, sample: Sample | None = None) -> Timed:
+        """Measure the speed of this training: of a few updates, and of its policy on 50 worlds.
+
+        ``sample``: worlds for the policy; None: the first ones of the list on which the recipe evaluates.
+        """
+        from ethbrake_marl.training.session import train
+
+        told: list[Progress] = []
+        recipe, scenario = self.training.recipe, self.training.scenario
+        short = recipe.replace(evaluation={**recipe.evaluation.model_dump(), "worlds": 10, "every_updates": 1000})
+        with tempfile.TemporaryDirectory(prefix="ethbrake-") as folder:
+            path = Path(folder) / "timed"
+            train(short, scenario, path, steps=1)  # to compile and warm up
+            train(short, scenario, path, steps=4 * self.per_update, force=True, on_progress=told.append)
+            updates = [one for one in told if one.updates >= 1]
+            last = updates[-1]
+            first = updates[0] if updates[0].done < last.done else Progress("begun", 0, 0)
+            decision_s = (last.wall_s - first.wall_s) / (last.done - first.done)
+            worlds = scenario.sample(50, recipe.evaluation.seed) if sample is None else sample
+            return Timed(self, decision_s, replace(self, folder=path).world_seconds(worlds))
+
+    def world_seconds(self, sample: Sample) -> float:
+        """Return the seconds that the trained policies need to drive one of the worlds of ``sample``."""
+        team = {"team": load_team(self.folder, self.training.scenario)}
+        drive = partial(evaluate, agents=team, scenario=self.training.scenario, aftermath=False)
+        return Timed.each_s(sample.worlds, drive)
+
+
+class Timed(NamedTuple):
+    """Measured speed of a training on one core, by the wall clock."""
+
+    job: TrainingJob  # the measured training
+    decision_s: float  # seconds per decision of a learner, including its share of the learning
+    world_s: float  # seconds per world when its policies are evaluated
+
+    def seconds(self, steps: int) -> float:
+        """Return the estimated seconds for ``steps`` decisions of such trainings, including their evaluations.
+
+        A training evaluates its policies on the recipe's fixed list at the start, every few updates, and at the end.
+        """
+        recipe = self.job.training.recipe
+        times = recipe.total_steps // self.job.per_update // recipe.evaluation.every_updates + 2
+        return steps * self.decision_s + steps / recipe.total_steps * times * recipe.evaluation.worlds * self.world_s
+
+    @staticmethod
+    def each_s(worlds: Worlds, work: Callable[[Worlds], object], most: int = 50) -> float:
+        """Measure and return the seconds per world of ``work(worlds)``, on at most ``most`` of these worlds.
+
+        One world runs first, so that compilation is not timed.
+        """
+        work(worlds.take([0]))
+        some, started = worlds.take(range(min(worlds.n, most))), time.monotonic()
+        work(some)
+        return (time.monotonic() - started) / some.n
+
+    @staticmethod
+    def in_words(seconds: float) -> str:
+        """Return a duration as text in seconds, minutes or hours: ``40 s``, ``12 min``."""
+        if seconds < 90.0:
+            return f"{seconds:.0f} s"
+        return f"{seconds / 60.0:.0f} min" if seconds < 36_000.0 else f"{seconds / 3600.0:.0f} h"

@@ -1,0 +1,291 @@
+"""Pydantic models of files, and one clear error message for the first mistake in a file.
+
+The message says where the mistake is, the value, and what would be right. All such messages are made here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn, TypeVar, get_args
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails, PydanticCustomError
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.plain import parse_strict_json
+from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, parse_numeral, read_yaml
+
+# Suffix of a key -> unit in words.
+UNITS = {
+    "s": "seconds",
+    "m": "metres",
+    "mps": "metres per second",
+    "mps2": "metres per second squared",
+    "mps3": "metres per second cubed",
+    "t": "tonnes",
+}
+
+_RIGHT = {
+    "finite_number": "must be a finite number",
+    "int_type": "must be a whole number, written without a decimal point or an exponent",
+    "string_type": "must be text",
+    "dict_type": "must be a mapping",
+    "model_type": "must be a mapping",
+    "model_attributes_type": "must be a mapping",
+    "tuple_type": "must be a list",
+}
+
+NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
+
+
+class FileModel(BaseModel):
+    """Base class of pydantic models of a file's content: immutable; unknown keys and wrong types are errors.
+
+    A subclass declares a field for each key.
+    """
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+UNSHOWN = object()  # marker: do not show the value in the message
+
+
+def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
+    """Raise the error for an invalid value in a pydantic validator.
+
+    Args:
+        at: path of the value (keys and indices) inside the checked field; ``()``: the field itself.
+        value: the value, shown in the message; ``UNSHOWN``: do not show it.
+        right: what would be valid, for example ``must be above 0``.
+
+    """
+    shown = "" if value is UNSHOWN else flow_text(value, 60)
+    raise PydanticCustomError("refused", "{right}", {"right": right, "value": shown, "at": at})
+
+
+def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
+    """Raise the error of ``refuse(at, value, right)`` unless ``holds`` is true."""
+    if not holds:
+        refuse(at, value, right)
+
+
+class Wording:
+    """Texts for error messages about one kind of file.
+
+    A subclass may override ``needed``, ``instead``, ``owner`` and ``right`` to say more about the keys of this file.
+
+    A *path* is the keys and indices that lead to a value, for example ``("mixture", 0, "weight")``.
+
+    Args:
+        model: the pydantic model of the file.
+        needed: text that says what a missing key needs.
+
+    """
+
+    def __init__(self, model: type[BaseModel], needed: str = "") -> None:
+        self.model, self._needed = model, needed
+
+    def known(self, path: YamlPath) -> list[str]:
+        """Return the names of the keys that are allowed at the end of ``path`` (keys and indices inside the file)."""
+        models = [self.model]
+        for key in path[:-1]:
+            inside = [model.model_fields[key].annotation for model in models if key in model.model_fields]
+            models = [found for annotation in inside for found in _models_in(annotation)] or models
+        return list(dict.fromkeys(f.alias or name for model in models for name, f in model.model_fields.items()))
+
+    def needed(self, path: YamlPath) -> str:
+        """Return a text that says what is needed at ``path`` (keys and indices inside the file), if it is missing."""
+        return self._needed
+
+    def instead(self, key: str) -> str:
+        """Return a text that says what replaces the unknown ``key``; empty if nothing is known about it."""
+        return ""
+
+    def owner(self, path: YamlPath) -> str:
+        """Return the vehicle or pair that the value at ``path`` belongs to, in words; empty if that is obvious.
+
+        ``path``: keys and indices inside the file.
+        """
+        return ""
+
+    def right(self, detail: ErrorDetails) -> str:
+        """Return what would be valid instead of the value in ``detail`` (a mistake, as pydantic reports it).
+
+        Empty if a general message says enough.
+        """
+        return ""
+
+
+def explain(document: Document, error: ValidationError, wording: Wording) -> InvalidInput:
+    """Return the ``InvalidInput`` for a document that does not fit its schema.
+
+    It shows the first mistake, unknown keys before all others, and counts the rest: "(and k more mistakes)". If an
+    unknown key is probably the misspelt name of a missing key, only the unknown key counts.
+
+    Args:
+        document: the parsed file, which knows the line of each value.
+        error: pydantic's error for its content.
+        wording: texts about this kind of file.
+
+    """
+    # A default that depends on a field with an error is no further mistake.
+    details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
+    unknown = [d for d in details if d["type"] == "extra_forbidden"]
+    meant = " ".join(suggestion(str(d["loc"][-1]), wording.known(path_of(d))) for d in unknown)
+    rest = [d for d in details if d not in unknown and not (d["type"] == "missing" and f" {path_of(d)[-1]}" in meant)]
+    shown = (unknown + rest)[0]
+    more = len(unknown) + len(rest) - 1
+    path = path_of(shown)
+    absent = shown["type"] == "missing" and len(path) == 1
+    where = document.file if absent else document.where(path)
+    told = f" (and {more} more mistake{'s' * (more > 1)})" if more else ""
+    return InvalidInput(f"{where}: {_describe(shown, path, wording)}{told}")
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from _models_in(inner)
+
+
+def read_model(source: str | Path | Document, model: type[Model], wording: Wording, advice: str) -> Model:
+    """Read a YAML file or document into ``model``; raise ``InvalidInput`` for the first mistake.
+
+    The message names file, line, key and value, and says what would be valid.
+
+    Args:
+        source: path of the file, or the parsed document.
+        model: pydantic model of the content.
+        wording: texts about this kind of file.
+        advice: what the file must contain, for the message if it is not a mapping.
+
+    """
+    document = source if isinstance(source, Document) else read_yaml(source)
+    if not isinstance(document.content, dict):
+        raise InvalidInput(f"{document.file}: must be a mapping {advice}")
+    try:
+        return model.model_validate(document.content)
+    except ValidationError as error:
+        raise explain(document, error, wording) from None
+
+
+def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
+    """Parse a JSON file that a program wrote; return its plain content, and the content as ``model``.
+
+    ``data``: the bytes of the file. Raises ``ValueError`` with a one-line reason for invalid content.
+    """
+    content = parse_strict_json(data)  # no key twice, no NaN
+    try:
+        return content, model.model_validate_json(data)
+    except ValidationError as error:
+        raise ValueError(str(first_mistake(error))) from None
+
+
+class Mistake(NamedTuple):
+    """The first error that pydantic found in data from a program; its text is ``place: right``."""
+
+    place: str  # keys joined by dots; empty for the whole
+    given: Any  # the invalid value
+    right: str  # what would be valid
+
+    def __str__(self) -> str:
+        return f"{self.place}: {self.right}" if self.place else self.right
+
+
+def first_mistake(error: ValidationError) -> Mistake:
+    """Return the first mistake that pydantic found, for files that programs write and for settings in code."""
+    detail = error.errors(include_url=False)[0]
+    right = {"missing": "is missing", "extra_forbidden": "unknown key"}.get(detail["type"])
+    return Mistake(".".join(str(key) for key in path_of(detail)), detail["input"], right or _right(detail))
+
+
+def path_of(detail: ErrorDetails) -> YamlPath:
+    """Return the path (keys and indices inside the file) of a mistake that pydantic reports.
+
+    Pydantic's tags are left out; the path that ``refuse`` reports is appended.
+    """
+    keys = tuple(key for key in detail["loc"] if not (isinstance(key, str) and key.startswith("#")))
+    return (*keys, *detail.get("ctx", {}).get("at", ()))
+
+
+def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
+    place = _place(path, wording)
+    if detail["type"] == "extra_forbidden":
+        inside = wording.known(path)
+        if path[-1] in inside:
+            return f"{place}: does not go with what stands beside it; a quantity has one distribution"
+        hint = wording.instead(str(path[-1])) or suggestion(str(path[-1]), inside) or f"known: {', '.join(inside)}"
+        return f"{place}: unknown key; {hint}"
+    if detail["type"] == "missing":
+        return f"{place}: missing; {wording.needed(path)}"
+    ctx = detail.get("ctx", {})
+    value = ctx["value"] if "value" in ctx else _show(detail)
+    right = _unquote(detail) or wording.right(detail) or _right(detail)
+    return f"{place}{f' = {value}' if value else ''}: {right}".removeprefix(": ")
+
+
+def _show(detail: ErrorDetails) -> str:
+    """Format the invalid value for the message; empty if the whole file is meant.
+
+    A float instead of a whole number keeps its decimal point.
+    """
+    given = detail["input"]
+    if isinstance(given, BaseModel) or not detail["loc"]:
+        return ""
+    return repr(given) if detail["type"] == "int_type" and isinstance(given, float) else flow_text(given, 60)
+
+
+def _place(path: YamlPath, wording: Wording) -> str:
+    text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path).removeprefix(".")
+    owner = wording.owner(path)
+    return f"{text} ({owner})" if owner else text
+
+
+def _unquote(detail: ErrorDetails) -> str:
+    """Return advice for a number that stands in quotes and so is a text; empty for any other mistake."""
+    given = detail["input"]
+    quoted = detail["type"] == "float_type" and isinstance(given, str) and parse_numeral(given) is not None
+    return "must be a number, not text; write it without quotes" if quoted else ""
+
+
+def _right(detail: ErrorDetails) -> str:
+    kind = detail["type"]
+    if detail["input"] != detail["input"]:  # NaN
+        return "must be a finite number"
+    if kind == "float_type":
+        return "must be a number"
+    if kind == "too_long":
+        most = detail["ctx"]["max_length"]
+        return f"must have {most if most == 2 else f'at most {most}'} entries"  # 2: a pair
+    if kind == "too_short":
+        least = detail["ctx"]["min_length"]
+        return "must not be empty" if least == 1 else f"must have at least {least} entries"
+    if kind == "string_pattern_mismatch":
+        pattern = detail["ctx"]["pattern"]
+        name = "must be 1 to 64 lower case letters, digits, - and _, beginning with a letter or digit"
+        return name if pattern == NAME_PATTERN else f"must match {pattern}"
+    if kind == "literal_error":
+        return f"must be {detail['ctx']['expected'].replace(chr(39), '')}"
+    text = str(detail["msg"]).removeprefix("Value error, ")
+    return _RIGHT.get(kind, text.replace("Input should", "must").replace("must be a valid", "must be a"))
+
+
+def suggestion(key: str, known: Iterable[str]) -> str:
+    """Return "did you mean ...?" for an unknown ``key``; empty if no known key is close.
+
+    ``known``: the valid keys. A key that differs from one of these only in its unit is recognised: ``gaps_km``,
+    ``mass``.
+    """
+    names = sorted(known)
+    stems = {name.rsplit("_", 1)[0]: name for name in names if name.rsplit("_", 1)[-1] in UNITS}
+    same = stems.get(key.rsplit("_", 1)[0]) or stems.get(key)
+    close = [same] if same else get_close_matches(key, names, n=1)
+    if not close:
+        return ""
+    unit = UNITS.get(close[0].rsplit("_", 1)[-1], "")
+    return f"did you mean {close[0]}{f' ({unit})' if unit else ''}?"

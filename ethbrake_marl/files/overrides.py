@@ -1,0 +1,88 @@
+"""Command-line settings ``key.path=value``: parsed as YAML and inserted into plain data."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.yaml import flow_text, parse_yaml
+
+
+@dataclass(frozen=True, slots=True)
+class Override:
+    """One setting from the command line, such as ``reward.harm=0.5``: its path and its value."""
+
+    text: str  # the setting as written
+    path: tuple[str, ...]  # keys from the outermost on; for a list the index, from 0
+    value: Any  # value parsed as YAML
+
+    @property
+    def top(self) -> str:
+        """The outermost key: ``reward`` for ``reward.harm=0.5``."""
+        return self.path[0]
+
+    @property
+    def key(self) -> str:
+        """The path with dots, as written: ``reward.harm`` for ``reward.harm=0.5``."""
+        return ".".join(self.path)
+
+    def inside(self) -> Override:
+        """Return the setting without its outermost key: ``harm=0.5`` for ``reward.harm=0.5``."""
+        return Override(self.text, self.path[1:], self.value)
+
+    @staticmethod
+    def parse(texts: Sequence[str]) -> list[Override]:
+        """Parse settings ``key.path=value``; a value is YAML on one line: ``0.2`` or ``{uniform: [1, 2]}``.
+
+        Raises ``InvalidInput`` for a text without ``=``, an empty key, a repeated key, and a value that is not valid
+        YAML.
+        """
+        found: list[Override] = []
+        for text in texts:
+            key, equals, value = text.partition("=")
+            path = tuple(part.strip() for part in key.split("."))
+            if not equals or not all(path):
+                raise InvalidInput(f"--set {text!r}: must be KEY=VALUE or KEY.KEY=VALUE, for instance gamma=0.99")
+            if any(each.path == path for each in found):
+                raise InvalidInput(f"--set {'.'.join(path)}: is given twice")
+            found.append(Override(text, path, parse_yaml(value, f"--set {'.'.join(path)}").content))
+        return found
+
+    @staticmethod
+    def put(content: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
+        """Apply settings to plain data; return the changed top-level keys with their new values.
+
+        ``content`` itself is not changed. With ``content = {"reward": {"harm": 1}, "seed": 3}`` and the setting
+        ``reward.harm=2`` the result is ``{"reward": {"harm": 2}}``. Raises ``InvalidInput`` for a path into a value
+        that is neither a mapping nor a list.
+        """
+        changed: dict[str, Any] = {}
+        for override in overrides:
+            top = override.top
+            before = changed[top] if top in changed else copy.deepcopy(content.get(top))
+            changed[top] = _placed(before, override.path[1:], override)
+        return changed
+
+
+def _placed(part: Any, path: tuple[str, ...], override: Override) -> Any:
+    """Return a copy of ``part`` (a mapping, list or other value) with the value of ``override`` at ``path`` inside it.
+
+    ``path``: the last keys of ``override.path``; ``()``: the value replaces ``part``. A missing mapping is created.
+    """
+    if not path:
+        return override.value
+    key, rest = path[0], path[1:]
+    if part is None:
+        part = {}
+    if isinstance(part, Mapping):
+        return {**part, key: _placed(part.get(key), rest, override)}
+    if isinstance(part, list | tuple):
+        if not (key.isascii() and key.isdigit() and int(key) < len(part)):
+            raise InvalidInput(f"--set {override.key}: {key!r} must be an entry from 0 to {len(part) - 1}")
+        entries = list(part)
+        entries[int(key)] = _placed(entries[int(key)], rest, override)
+        return entries
+    raise InvalidInput(f"--set {override.key}: there is nothing inside {flow_text(part, 60)}; set the whole value")

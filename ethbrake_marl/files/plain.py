@@ -1,0 +1,153 @@
+"""Safe reading of untrusted files: plain files only, of limited size, and strict JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BufferedReader
+from pathlib import Path
+from typing import Any, NoReturn
+
+from ethbrake_marl.errors import EthBrakeError, InvalidInput
+from ethbrake_marl.files.store import LARGEST_OBJECT_BYTES
+
+_FLAGS = ("O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC", "O_BINARY")  # flags, if the system has them
+
+
+def read_plain(
+    path: str | os.PathLike[str],
+    limit_bytes: int,
+    *,
+    refusal: type[EthBrakeError] = InvalidInput,
+    follow_links: bool = True,
+) -> bytes:
+    """Return the content of a plain file of at most ``limit_bytes``; raise ``refusal`` if it cannot be read.
+
+    The limit also holds for a file that grows while it is read.
+
+    Args:
+        path: path of the file.
+        limit_bytes: largest accepted size.
+        refusal: class of the error to raise, with path and reason; see ``open_plain``.
+        follow_links: whether a symbolic link is accepted.
+
+    """
+    with open_plain(path, limit_bytes, refusal=refusal, follow_links=follow_links) as stream:
+        data = _read(stream.fileno(), limit_bytes + 1)
+    if len(data) > limit_bytes:
+        raise _too_large(Path(path), limit_bytes, refusal)
+    return data
+
+
+@contextmanager
+def open_plain(
+    path: str | os.PathLike[str],
+    limit_bytes: int,
+    *,
+    refusal: type[EthBrakeError] = InvalidInput,
+    follow_links: bool = True,
+) -> Iterator[BufferedReader]:
+    """Open a plain file of at most ``limit_bytes`` for reading, as a context manager.
+
+    Kind and size are checked before anything is opened, so a pipe or device is never opened. Nothing waits for a
+    writer, and no device is affected. If the file is replaced in between, the new one is opened without waiting and
+    checked again.
+
+    Args:
+        path: path of the file.
+        limit_bytes: largest accepted size.
+        refusal: class of the error to raise, with path and reason: the file does not exist, is a folder, device or
+            pipe, is too large, or cannot be read (also inside the block).
+        follow_links: whether a symbolic link is accepted.
+
+    """
+    file = Path(path)
+    try:
+        _check_kind(file, (os.stat if follow_links else os.lstat)(file), limit_bytes, refusal)
+        flags = os.O_RDONLY | (0 if follow_links else getattr(os, "O_NOFOLLOW", 0))
+        for name in _FLAGS:
+            flags |= getattr(os, name, 0)
+        with os.fdopen(os.open(file, flags), "rb") as stream:
+            _check_kind(file, os.fstat(stream.fileno()), limit_bytes, refusal)
+            yield stream
+    except FileNotFoundError:
+        raise refusal(f"{file}: no such file") from None
+    except OSError as error:
+        raise refusal(f"{file}: cannot be read ({error.strerror})") from None
+    except ValueError as error:
+        if isinstance(error, EthBrakeError):
+            raise
+        raise refusal(f"{file}: cannot be read ({error})") from None
+
+
+def _read(descriptor: int, most_bytes: int) -> bytes:
+    """Read up to ``most_bytes`` from a file descriptor; raise ``OSError`` if reading would have to wait."""
+    parts: list[bytes] = []
+    while most_bytes > 0 and (part := os.read(descriptor, min(most_bytes, 1 << 20))):
+        parts.append(part)
+        most_bytes -= len(part)
+    return b"".join(parts)
+
+
+def _check_kind(file: Path, found: os.stat_result, limit_bytes: int, refusal: type[EthBrakeError]) -> None:
+    if stat.S_ISLNK(found.st_mode):
+        raise refusal(f"{file}: is a symbolic link; give the file it points to")
+    if stat.S_ISDIR(found.st_mode):
+        raise refusal(f"{file}: is not a plain file but a folder")
+    if not stat.S_ISREG(found.st_mode):
+        raise refusal(f"{file}: is not a plain file but a device, a pipe or a socket")
+    if found.st_size > limit_bytes:
+        raise _too_large(file, limit_bytes, refusal)
+
+
+def _too_large(file: Path, limit_bytes: int, refusal: type[EthBrakeError]) -> EthBrakeError:
+    size = f"{limit_bytes >> 20} MiB" if limit_bytes >= 1 << 20 else f"{limit_bytes >> 10} KiB"
+    return refusal(f"{file}: larger than {size}, the limit for such a file")
+
+
+def parse_strict_json(data: bytes) -> Any:
+    """Parse UTF-8 JSON; raise ``ValueError`` with a one-line reason for repeated keys, NaN or invalid text."""
+    try:
+        return json.loads(
+            data.decode("utf-8"), object_pairs_hook=_object, parse_constant=_not_a_number, parse_float=_finite
+        )
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def read_object(file: Path) -> dict[str, Any]:
+    """Return the JSON object in a file of a training run; raise ``InvalidInput`` naming the file and what is wrong."""
+    if not os.path.lexists(file):
+        raise InvalidInput(f"{file}: is missing; nothing goes on without it")
+    data = read_plain(file, LARGEST_OBJECT_BYTES)
+    try:
+        content = parse_strict_json(data)
+    except ValueError as error:
+        raise InvalidInput(f"{file}: is damaged: {error}") from None
+    if not isinstance(content, dict):
+        raise InvalidInput(f"{file}: is damaged: holds no JSON object")
+    return content
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    parsed: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in parsed:
+            raise ValueError(f"key {key!r} stands twice")
+        parsed[key] = value
+    return parsed
+
+
+def _not_a_number(text: str) -> NoReturn:
+    raise ValueError(f"{text} is not a JSON number")
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text} is too large for a number")
+    return number

@@ -1,0 +1,1 @@
+"""The definition of the game: harm, objectives, actions, observations and rewards."""

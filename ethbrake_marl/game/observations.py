@@ -1,0 +1,393 @@
+"""Observations: which features a vehicle observes, and their values in a batch of worlds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from itertools import product
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.errors import InvalidInput, PhysicsError, unknown_name
+from ethbrake_marl.game.contact_features import FORECAST_S, Contacts, observe_contacts
+from ethbrake_marl.game.features import (
+    CONTACT_COMMANDS,
+    GROUPS,
+    MOST_NEIGHBOURS,
+    Feature,
+    RegisteredFeature,
+    feature_named,
+    listed_features,
+    registered_in,
+    side_of,
+)
+from ethbrake_marl.physics.columns import Packed, columns
+from ethbrake_marl.physics.estimates import estimate_rows
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.motion import stopping_distance
+from ethbrake_marl.physics.state import Floats, Ints, Worlds
+
+
+@dataclass(frozen=True, slots=True)
+class ObservationSpec:
+    """What a vehicle observes: a number of neighbours on each side, and whether place, obstacle and contacts are added.
+
+    With ``chosen`` the observation has exactly these features, in this order; use ``choose_observation`` to make it.
+
+    >>> import ethbrake_marl as eb
+    >>> spec = eb.ObservationSpec(front=2, rear=0)
+    >>> spec.size, spec.features[7].name
+    (27, 'front_1.known')
+    >>> eb.choose_observation(["own", "front_1.gap"]).size
+    8
+
+    """
+
+    front: int = 1  # number of observed neighbours ahead, 0 to 64
+    rear: int = 1  # number of observed neighbours behind, 0 to 64
+    role: bool = False  # whether to add the vehicle's place in the line (GROUPS.role)
+    obstacle: bool = False  # whether to add the obstacle ahead (GROUPS.obstacle)
+    chosen: tuple[str, ...] = ()  # full names of all features, in order; the other fields are then what these need
+    contact: bool = False  # whether to add forecast impacts (GROUPS.contact); contact_far only through ``chosen``
+    time_step_s: float | None = None  # time between two decisions (s); only contact features need it
+
+    def __post_init__(self) -> None:
+        """Raise ``InvalidInput`` for an invalid number of neighbours, or fields that contradict ``chosen``."""
+        for side, count in (("front", self.front), ("rear", self.rear)):
+            whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
+            if not whole or not 0 <= count <= MOST_NEIGHBOURS:
+                raise InvalidInput(f"observation: {side} = {count!r}; must be a whole number in 0..{MOST_NEIGHBOURS}")
+        for name, shown in (("role", self.role), ("obstacle", self.obstacle), ("contact", self.contact)):
+            if not isinstance(shown, bool):
+                raise InvalidInput(f"observation: {name} = {shown!r}; must be True or False")
+        if self.time_step_s is not None and not 0.0 < self.time_step_s < math.inf:
+            raise InvalidInput(f"observation: time_step_s = {self.time_step_s!r}; must be a positive number of seconds")
+        if self.chosen and _reach(self.chosen) != (self.front, self.rear, self.role, self.obstacle, self.contact):
+            raise InvalidInput("observation: chosen: the other fields do not fit; use eb.choose_observation([...])")
+
+    @property
+    def sides(self) -> tuple[tuple[str, int], ...]:
+        """Observed neighbours as (prefix, offset), nearest first: ``("front_1", -1)`` is the next vehicle ahead.
+
+        Neighbours in front come first; the offset is the difference of the places in the line.
+        """
+        fronts = tuple((f"front_{k}", -k) for k in range(1, self.front + 1))
+        return fronts + tuple((f"rear_{k}", k) for k in range(1, self.rear + 1))
+
+    @property
+    def features(self) -> tuple[Feature, ...]:
+        """Every feature of an observation in order; names are unique (``own.speed``, ``front_1.gap``)."""
+        return tuple(feature_named(name) for name in self.chosen) or self.whole
+
+    @property
+    def whole(self) -> tuple[Feature, ...]:
+        """All built-in features of every group of which the observation has at least one feature, in order."""
+        groups = [("own", GROUPS.own), *((prefix, GROUPS.neighbour) for prefix, _ in self.sides)]
+        groups += [("role", GROUPS.role)] if self.role else []
+        groups += [("obstacle", GROUPS.obstacle)] if self.obstacle else []
+        groups += [("contact", GROUPS.contact)] if self.contact else []
+        groups += [("contact_far", GROUPS.contact_far)] if self.far else []
+        return tuple(replace(f, name=f"{prefix}.{f.name}") for prefix, group in groups for f in group)
+
+    @property
+    def far(self) -> bool:
+        """Whether the observation has features of GROUPS.contact_far (late or hard forecast impacts)."""
+        return any(name.startswith("contact_far.") for name in self.chosen)
+
+    @property
+    def size(self) -> int:
+        """Length F of an observation."""
+        return len(self.features)
+
+    @property
+    def plan(self) -> Plan:
+        """The ``Plan`` that computes this observation from worlds.
+
+        It is cached per specification and must not be changed. Raises ``InvalidInput`` for contact features without a
+        time step.
+        """
+        return _plan(self, tuple(registered_in(self.chosen).items()) if self.chosen else ())
+
+    def at_steps_of(self, time_step_s: float) -> ObservationSpec:
+        """Return the specification with ``time_step_s`` (s) filled in, if it needs one and has none."""
+        return replace(self, time_step_s=time_step_s) if self.contact and self.time_step_s is None else self
+
+
+Observation = ObservationSpec | Sequence[str] | Mapping[str, Any]  # list: groups and features; mapping: fields
+
+
+def choose_observation(listed: Observation, time_step_s: float | None = None) -> ObservationSpec:
+    """Return the observation for a list of groups and single features: ``[own, front_1, rear_1.gap, my_feature]``.
+
+    A mapping gives the fields of an ``ObservationSpec``, as in JSON; an ``ObservationSpec`` is returned unchanged.
+    ``time_step_s`` (s) is the time between two decisions; only contact features outside an environment need it. Raises
+    ``UnknownName`` with a suggestion, ``InvalidInput`` for an invalid list.
+    """
+    if isinstance(listed, ObservationSpec):
+        spec = listed
+    elif isinstance(listed, Mapping):
+        known = [field.name for field in fields(ObservationSpec)]
+        for name in listed:
+            if name not in known:
+                raise unknown_name("observation", name, known)
+        chosen = listed.get("chosen", ())
+        if not isinstance(chosen, list | tuple):
+            raise InvalidInput(f"observation: chosen = {chosen!r}; must be a list of features")
+        spec = ObservationSpec(**{**listed, "chosen": listed_features(chosen) if chosen else ()})
+    else:
+        names = listed_features(listed)
+        front, rear, role, obstacle, contact = _reach(names)
+        spec = ObservationSpec(front, rear, role, obstacle, contact=contact)
+        if tuple(feature.name for feature in spec.features) != names:
+            spec = replace(spec, chosen=names)
+    return spec if time_step_s is None else spec.at_steps_of(time_step_s)
+
+
+def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool, bool]:
+    """Return what features with these full names need: neighbours in front and behind, own place, obstacle, contacts.
+
+    These are the fields ``front``, ``rear``, ``role``, ``obstacle`` and ``contact`` of ``ObservationSpec``.
+    """
+    sides = [side for name in names if (side := side_of(name)) is not None]
+    front, rear = (max((k for at, k in sides if at == wanted), default=0) for wanted in ("front", "rear"))
+    groups = {name.partition(".")[0] for name in names}
+    return front, rear, "role" in groups, "obstacle" in groups, bool(groups & {"contact", "contact_far"})
+
+
+Observations = NDArray[np.float32]
+
+_OWN, _NEIGHBOUR = len(GROUPS.own), len(GROUPS.neighbour)
+
+_ROLE, _OBSTACLE = len(GROUPS.role), len(GROUPS.obstacle)
+
+
+def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations:
+    """Return the observation of ``vehicle`` (0 = front) in every world, [n, F] float32 in new memory.
+
+    ``spec`` says which F features are observed. Raises ``InvalidInput`` for an index without a vehicle.
+    """
+    if not 0 <= vehicle < worlds.N:
+        raise InvalidInput(f"observe: vehicle index {vehicle}; must be in 0..{worlds.N - 1}")
+    packed = Packed.of(worlds)
+    return spec.plan.observe(packed.state, packed.params, np.array([vehicle]))[:, 0].copy()
+
+
+class Scaling(NamedTuple):
+    """Arguments of the kernel that computes all groups of features except the contact features."""
+
+    offsets: Ints  # place of each observed neighbour relative to the observer: -1 is the next vehicle ahead
+    role: bool  # whether the place in the line is observed
+    obstacle: bool  # whether the obstacle ahead is observed
+    features: Floats  # [3, F] rows 1 / scale, low and high; a column per feature
+
+
+class Extra(NamedTuple):
+    """A registered feature in an observation, computed by its own function."""
+
+    column: int  # its column in the observation
+    entry: RegisteredFeature  # the feature and its function
+    offset: int  # place of the neighbour relative to the vehicle, -1 is the next one ahead; 0: the vehicle itself
+    known: int  # column of the neighbour's feature ``known`` among the built-in features
+
+
+class Plan(NamedTuple):
+    """How to compute an observation from worlds: kernels fill whole groups, functions compute registered features."""
+
+    scaling: Scaling  # how to compute all built-in features but the contact features
+    contacts: Contacts | None  # contact features, after all other groups; None: no such features
+    picked: Ints | None  # [F] columns to take from the features of whole groups; None: all
+    extras: tuple[Extra, ...]  # registered features
+
+    def observe(self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None = None) -> Observations:
+        """Return the observations of several vehicles, [n, len(vehicles), F] float32.
+
+        With periodic messages a vehicle observes the worlds as it estimates them (``physics.estimates``). Contact
+        features of commands that are not needed are 0. Raises ``PhysicsError`` with the worlds in which a forecast of
+        contacts failed.
+
+        Args:
+            state: state rows of the worlds, [n, S], in the layout of ``physics.columns``.
+            params: their parameter rows.
+            vehicles: indices of the observing vehicles, from 0.
+            steps: number of steps so far, [n], for messages.
+
+        """
+        if not Packed(state, params).has_messages:
+            return self._observe_present(state, params, vehicles, steps)
+        estimate, seen = np.empty(state.shape), []
+        for vehicle in vehicles.tolist():
+            estimate_rows(state, params, vehicle, estimate)
+            seen.append(self._observe_present(estimate, params, np.array([vehicle]), steps))
+        return np.concatenate(seen, axis=1)
+
+    def _observe_present(self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None) -> Observations:
+        """Version of ``observe`` without estimation: a known vehicle is observed in its present state."""
+        shape = len(state), len(vehicles)
+        whole = np.empty((*shape, self.scaling.features.shape[1]), np.float32)
+        _observe_rows(state, params, vehicles, *self.scaling, whole)
+        if self.contacts is not None:
+            found = np.zeros((*shape, self.contacts.features.shape[1]), np.float32)
+            failed = np.zeros(len(state), np.bool_)
+            observe_contacts(state, params, vehicles, *self.contacts, found, failed)
+            if failed.any():
+                reason = f"a forecast of contacts could not look {FORECAST_S:g} s ahead"
+                raise PhysicsError({k: reason for k in np.flatnonzero(failed).tolist()})
+            whole = np.concatenate([whole, found], axis=2)
+        if self.picked is None:
+            return whole
+        out: Observations = whole.take(self.picked, axis=2)
+        if not self.extras:
+            return out
+        worlds = Packed(state, params).worlds().read_only()
+        for extra, (o, vehicle) in product(self.extras, enumerate(vehicles.tolist())):
+            neighbour = vehicle + extra.offset if extra.offset else None
+            counts = np.ones(worlds.n, np.bool_) if neighbour is None else whole[:, o, extra.known] == 1.0
+            if counts.any():  # a neighbour's feature counts where the neighbour is known
+                values = extra.entry.checked(worlds, vehicle, neighbour, counts, steps)
+            else:  # no such neighbour, or no news of it
+                values = extra.entry.scaled(np.full(worlds.n, extra.entry.unknown))
+            out[:, o, extra.column] = values
+        return out
+
+
+@cache
+def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature], ...]) -> Plan:
+    whole, entries = spec.whole, dict(registered)
+    usual = whole[: len(whole) - spec.contact * len(GROUPS.contact) - spec.far * len(GROUPS.contact_far)]
+    offsets = np.array([offset for _, offset in spec.sides], np.int64)
+    scaling, contacts = Scaling(offsets, spec.role, spec.obstacle, _scales(usual)), None
+    if spec.contact:
+        if spec.time_step_s is None:
+            raise InvalidInput(
+                "observation: contact features need the time between two decisions; give it as time_step_s, for"
+                " instance eb.choose_observation([...], time_step_s=scenario.time_step_s)"
+            )
+        inside = [name.partition(".") for name in spec.chosen or (feature.name for feature in spec.whole)]
+        names = [own for group, _, own in inside if group in ("contact", "contact_far")]
+        wanted = [c for c, each in enumerate(CONTACT_COMMANDS) if any(n.startswith(f"{each}_") for n in names)]
+        features = GROUPS.contact + GROUPS.contact_far if spec.far else GROUPS.contact
+        contacts = Contacts(spec.time_step_s, np.array(wanted, np.int64), _scales(features))
+    if not spec.chosen:
+        return Plan(scaling, contacts, None, ())
+    place, sides = {feature.name: c for c, feature in enumerate(whole)}, dict(spec.sides)
+    extras = []
+    for column, name in enumerate(spec.chosen):
+        if name not in place:
+            side, _, own = name.rpartition(".")
+            extras.append(Extra(column, entries[own], sides.get(side, 0), place.get(f"{side}.known", 0)))
+    picked = np.array([place.get(name, 0) for name in spec.chosen], np.int64)
+    return Plan(scaling, contacts, picked, tuple(extras))
+
+
+def _scales(features: Sequence[Feature]) -> Floats:
+    """Return the scaling of features, [3, F]: rows 1 / scale, low and high, a column per feature."""
+    return np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]])
+
+
+@compiled
+def _observe_rows(
+    state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, with_obstacle: bool, features: Floats,
+    out: Observations,
+) -> None:  # fmt: skip
+    """Fill ``out`` [n, observers, F] with the clipped features of each observer, in the order of ``GROUPS``.
+
+    This is one long loop on purpose: passing these arrays to functions made it four times slower.
+
+    Args:
+        state: state rows of the worlds, [n, S], in the layout of ``physics.columns``.
+        params: their parameter rows.
+        observers: indices of the observing vehicles.
+        offsets: place of each observed neighbour relative to the observer; -1 is the next vehicle ahead.
+        role: whether the vehicle's place in the line is observed.
+        with_obstacle: whether the obstacle ahead is observed.
+        features: scaling, [3, F]: rows 1 / scale, low and high, a column per feature.
+        out: result.
+
+    """
+    of = columns(state)
+    N, speed, command, gap_column, hit, obstacle = of.vehicles, of.speed, of.command, of.gap, of.hit, of.obstacle
+    braking, driving, latency, mass, news = of.braking, of.driving, of.latency, of.mass, of.news
+    by_link, some_obstacle = params.shape[1] > of.own_latency, state.shape[1] > obstacle
+    own_part = of.own_latency if by_link else latency  # column own_part + j has vehicle j's own latency
+    value = np.zeros(out.shape[2])
+    for k in range(out.shape[0]):
+        time = state[k, of.time]
+        for o in range(observers.shape[0]):
+            i = observers[o]
+            own_speed, own_latency = state[k, speed + i], max(params[k, own_part + i] - time, 0.0)
+            own_stop = stopping_distance(own_speed, own_latency, params[k, braking + i])
+            value[0] = own_speed
+            value[1] = state[k, command + i]
+            value[2] = params[k, braking + i]
+            value[3] = params[k, driving + i]
+            value[4] = params[k, mass + i]
+            value[5] = own_latency
+            value[6] = params[k, of.restitution]
+            c = _OWN
+            for offset in offsets:
+                j = i + offset
+                if not (0 <= j < N and time >= params[k, news + i * N + j if by_link else latency + i]):
+                    for absent in range(c, c + _NEIGHBOUR):
+                        value[absent] = 0.0
+                    c += _NEIGHBOUR
+                    continue
+                gap = 0.0
+                for p in range(min(i, j), max(i, j)):
+                    gap += state[k, gap_column + p]
+                in_front = j < i
+                other_speed = state[k, speed + j]
+                other_latency = max(params[k, own_part + j] - time, 0.0)
+                other_stop = stopping_distance(other_speed, other_latency, params[k, braking + j])
+                room = gap + other_stop if in_front else other_stop - gap
+                value[c] = 1.0
+                value[c + 1] = gap
+                value[c + 2] = own_speed - other_speed if in_front else other_speed - own_speed
+                value[c + 3] = state[k, command + j]
+                value[c + 4] = params[k, braking + j]
+                value[c + 5] = params[k, mass + j]
+                value[c + 6] = other_latency
+                value[c + 7] = state[k, hit + (i - 1 if in_front else i)]
+                value[c + 8] = gap + other_stop - own_stop if in_front else gap + own_stop - other_stop
+                value[c + 9] = _fitting_deceleration(own_speed, own_latency, room)
+                c += _NEIGHBOUR
+            if role:
+                value[c] = i
+                value[c + 1] = N - 1 - i
+                c += _ROLE
+            if with_obstacle:
+                told = i == 0 or time >= params[k, news + i * N if by_link else latency + i]
+                for absent in range(c, c + _OBSTACLE):
+                    value[absent] = 0.0
+                if told and some_obstacle and state[k, obstacle] < math.inf:
+                    gap = state[k, obstacle]
+                    for p in range(i):
+                        gap += state[k, gap_column + p]
+                    value[c] = 1.0
+                    value[c + 1] = gap
+                    value[c + 2] = state[k, obstacle + 1]
+                    value[c + 3] = gap - own_stop
+                    value[c + 4] = _fitting_deceleration(own_speed, own_latency, gap)
+            for c in range(out.shape[2]):
+                out[k, o, c] = min(max(value[c] * features[0, c], features[1, c]), features[2, c])
+
+
+@compiled
+def _fitting_deceleration(speed: float, latency_left: float, room: float) -> float:
+    """Return the constant deceleration (m/s2) that stops a vehicle within ``room``: ``v^2 / (2 (room - v tau))``.
+
+    Room below 1 mm counts as 1 mm. So without room the feature is at its upper bound (20 m/s2) from 0.2 m/s on, and
+    lower for a slower vehicle; at rest it is 0.
+
+    Args:
+        speed: present speed v, m/s.
+        latency_left: time tau until its brakes act, s.
+        room: distance in which it must stop, m.
+
+    """
+    speed = max(speed, 0.0)
+    left = max(room - speed * latency_left, 1e-3)
+    return speed * speed / (2.0 * left)

@@ -1,1 +1,0 @@
-"""Self-contained HTML pages: the frame, its parts, the episode player, and the report of an evaluation."""

@@ -1,0 +1,64 @@
+"""Forecast of contacts: when each pair of a line next has an impact under constant commands, and its closing speed.
+
+Uses the physics of ``advance`` on a table that the caller has filled. The resulting motion is not kept.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from ethbrake_marl.physics.impact import record_impacts
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.motion import BOUND
+from ethbrake_marl.physics.rows import FLAG, ROW, builds_up
+from ethbrake_marl.physics.segment import move_apart, start_events, to_next_impact
+from ethbrake_marl.physics.state import Floats
+
+
+class _Contact(NamedTuple):
+    """Row numbers of the forecast array ``found`` [WIDTH, N]; column p describes the next impact of pair p."""
+
+    TIME: int = 0  # time from now to the pair's next impact (s); infinite: none
+    CLOSING: int = 1  # closing speed of that impact (m/s); 0: none
+    WIDTH: int = 2  # number of rows
+
+
+CONTACT = _Contact()
+
+
+@compiled(apart=True)
+def forecast_contacts(table: Floats, restitution: float, duration: float, found: Floats) -> int:
+    """Simulate one world for ``duration`` (s) and write each pair's next impact into ``found``; return a status.
+
+    The status is ``FLAG.DONE``, or the check that failed. A pair that had an impact before the forecast can have
+    another one here, but that one adds no first-impact harm.
+
+    Args:
+        table: the world in the layout of ``physics.rows``: a row per quantity, a column per vehicle or pair. Its motion
+            and harm rows are overwritten.
+        restitution: coefficient of restitution of every impact, in [0, 1].
+        duration: length of the forecast, s.
+        found: result, [CONTACT.WIDTH, N]; column p is pair p, the last column is not used. Row ``CONTACT.TIME`` is the
+            time to the impact (s; infinite: none), row ``CONTACT.CLOSING`` its closing speed (m/s).
+
+    """
+    for p in range(table.shape[1] - 1):
+        found[CONTACT.TIME, p], found[CONTACT.CLOSING, p] = math.inf, 0.0
+        table[ROW.FIRST_HARM, p] = 0.0
+        table[ROW.TOTAL_HARM, p] = 0.0
+        table[ROW.COUNT, p] = 0.0
+    building = builds_up(table)
+    if move_apart(table, duration, building):
+        return FLAG.DONE
+    start_events(table, building)
+    no_rows, now = table[:0], 0.0
+    for _ in range(BOUND.MOST_EVENTS):
+        status, now = to_next_impact(table, restitution, now, duration, building)
+        if status != FLAG.IMPACT:
+            return status
+        for p in range(table.shape[1] - 1):
+            if table[ROW.STRUCK, p] == 1.0 and found[CONTACT.TIME, p] == math.inf:
+                found[CONTACT.TIME, p], found[CONTACT.CLOSING, p] = now, table[ROW.CLOSING, p]
+        record_impacts(table, now, 0, no_rows, 0)
+    return FLAG.STUCK

@@ -1,0 +1,104 @@
+"""A vehicle's estimate of the others' states, from the newest periodic messages, which may be old."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ethbrake_marl.physics.columns import columns
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.messages import CHANNEL, LINK, link_at, place_at
+from ethbrake_marl.physics.motion import solo_motion
+from ethbrake_marl.physics.state import Floats
+
+
+@compiled
+def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> None:
+    """Fill ``out`` with the worlds as vehicle ``observer`` estimates them from the messages it has received.
+
+    For a vehicle that the observer knows: the newest received place and speed, extrapolated alone under the command
+    received with them. A pair in which the observer sees both vehicles at present has its true gap. Hit flags are known
+    for the observer's own pairs only. A vehicle that the observer does not know is put at rest, at the place of the
+    next vehicle towards the observer, so that it gives no information.
+
+    Args:
+        state: true state rows of the worlds, [n, S], in the layout of ``physics.columns``.
+        params: their parameter rows, with the columns of messages.
+        observer: index of the observing vehicle, from 0.
+        out: result, [n, S], in the layout of ``state``. Worlds without periodic messages get their true state.
+
+    """
+    column = columns(state)
+    N, gap, speed, command, obstacle = column.vehicles, column.gap, column.speed, column.command, column.obstacle
+    head = column.messages
+    place, fresh = np.empty(N), np.empty(N, np.bool_)
+    out[:] = state
+    for k in range(state.shape[0]):
+        if params[k, head + CHANNEL.PERIOD] == 0.0:
+            continue
+        told, time = params[k, head:], state[k, column.time]
+        place[observer], fresh[observer] = told[place_at(N) + observer], True
+        for way in (-1, 1):
+            last = place[observer]
+            j = observer + way
+            while 0 <= j < N:
+                link = link_at(observer, j, N)
+                known = time >= params[k, column.news + observer * N + j] and told[link + LINK.TOLD_S] >= 0.0
+                fresh[j] = known and told[link + LINK.TOLD_S] >= time
+                out[k, speed + j], out[k, command + j], place[j] = 0.0, 0.0, last
+                if known:
+                    limit, age = params[k, column.limit + j], time - told[link + LINK.TOLD_S]
+                    after, passed = moved_on(told[link + LINK.TOLD_SPEED], told[link + LINK.TOLD_COMMAND], limit, age)
+                    out[k, speed + j], out[k, command + j] = after, told[link + LINK.TOLD_COMMAND]
+                    place[j] = told[link + LINK.TOLD_PLACE] + passed
+                    last = place[j]
+                j += way
+        for p in range(N - 1):
+            if not (fresh[p] and fresh[p + 1]):
+                out[k, gap + p] = max(place[p] - place[p + 1], 0.0)
+            if p != observer and p + 1 != observer:
+                out[k, gap + N - 1 + p] = 0.0
+        if observer > 0 and state.shape[1] > obstacle:
+            out[k, obstacle] = max(told[CHANNEL.OBSTACLE_PLACE] - place[0], 0.0)
+            out[k, obstacle + 1] = told[link_at(observer, 0, N) + LINK.TOLD_HIT]
+
+
+@compiled
+def moved_on(speed: float, command: float, limit: float, duration: float) -> tuple[float, float]:
+    """Return speed (m/s) and distance (m) of a vehicle alone after ``duration`` (s) under a command in force.
+
+    A vehicle that moves backward brakes, whatever the sign of its command.
+
+    Args:
+        speed: present speed, m/s; may be negative.
+        command: acceleration in force, m/s2; negative brakes.
+        limit: speed up to which the vehicle drives, m/s.
+        duration: length of the motion, s.
+
+    """
+    if speed >= 0.0:
+        after, way, _ = solo_motion(speed, command, 0.0, limit, duration)
+        return after, way
+    force = abs(command)
+    braking = min(duration, -speed / force) if force > 0.0 else duration
+    return min(speed + force * braking, 0.0), (speed + 0.5 * force * braking) * braking
+
+
+@compiled
+def move_on(speed: Floats, command: Floats, onset: Floats, limit: Floats, duration: Floats) -> tuple[Floats, Floats]:
+    """Return speeds (m/s) and distances (m) of vehicles alone after ``duration`` (s), [n, N] each.
+
+    Args:
+        speed: present speeds, [n, N] m/s, at least 0.
+        command: commands, [n, N] m/s2; negative brakes.
+        onset: time from now until the command takes effect, [n, N] s.
+        limit: speed up to which each vehicle drives, [n, N] m/s.
+        duration: length of the motion, [n, N] s.
+
+    """
+    after, way = np.empty(speed.shape), np.empty(speed.shape)
+    for k in range(speed.shape[0]):
+        for i in range(speed.shape[1]):
+            after[k, i], way[k, i], _ = solo_motion(
+                speed[k, i], command[k, i], onset[k, i], limit[k, i], duration[k, i]
+            )
+    return after, way

@@ -1,0 +1,114 @@
+"""Forecast of harm under constant commands, for many candidate commands of one vehicle.
+
+Uses the physics of ``advance``. Only harm is kept, not the motion, so a candidate costs little more than its events.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.physics.episode import onset_s
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.motion import BOUND
+from ethbrake_marl.physics.rows import FLAG, LISTED, ROW, place_forces, place_obstacle, rows_for
+from ethbrake_marl.physics.segment import advance_table
+from ethbrake_marl.physics.state import Bools, Floats, Worlds
+
+
+def forecast(
+    worlds: Worlds, command_mps2: Floats, vehicle: int, candidates_mps2: Floats, until_s: float
+) -> tuple[Floats, Floats]:
+    """Return first-impact and total harm until ``until_s`` if ``vehicle`` held each candidate command.
+
+    Both results are [n, K] in m2/s2. Harm is summed over all pairs and the obstacle ahead, if there is one. A world at
+    or after ``until_s`` has harm 0. A pair that was hit before adds no first-impact harm.
+
+    Args:
+        worlds: n worlds of N vehicles.
+        command_mps2: commands of all vehicles, [n, N] m/s2; the column of ``vehicle`` is ignored.
+        vehicle: index of the vehicle, from 0.
+        candidates_mps2: K candidate commands for it in each world, [n, K] m/s2.
+        until_s: absolute end of the forecast, s.
+
+    Raises ``InvalidInput`` for arrays of wrong shape or a candidate beyond capacity; ``PhysicsError`` with the worlds
+    in which a check of the kernel failed.
+
+    """
+    n, N = worlds.speeds_mps.shape
+    if command_mps2.shape != (n, N) or candidates_mps2.ndim != 2 or candidates_mps2.shape[0] != n:
+        raise InvalidInput(
+            f"forecast: commands {command_mps2.shape} and candidates {candidates_mps2.shape}; ({n}, {N}) and ({n}, K)"
+            " are needed"
+        )
+    if not 0 <= vehicle < N:
+        raise InvalidInput(f"forecast: vehicle index {vehicle}; must be in 0..{N - 1}")
+    v = worlds.vehicles
+    low, high = -v.braking_capacity_mps2[:, [vehicle]], v.driving_capacity_mps2[:, [vehicle]]
+    good = (candidates_mps2 >= low) & (candidates_mps2 <= high)
+    if not good.all():
+        raise InvalidInput(
+            f"forecast: candidate {candidates_mps2[~good][0]:g} m/s2 is beyond vehicle_{vehicle + 1}'s capacity"
+        )
+    first, total = np.zeros(candidates_mps2.shape), np.zeros(candidates_mps2.shape)
+    ahead = np.minimum(worlds.obstacle_gap_m, BOUND.FAR_AWAY_M) if worlds.obstacle_ahead.any() else np.empty(0)
+    failed = np.zeros(n, np.bool_)
+    forecast_worlds(
+        worlds.gaps_m, worlds.speeds_mps, worlds.time_s, worlds.pair_hit, ahead, worlds.obstacle_hit,
+        np.ascontiguousarray(command_mps2), vehicle, np.ascontiguousarray(candidates_mps2), until_s, v.latency_s,
+        v.mass_t, v.speed_limit_mps, v.restitution, worlds.command_mps2, v.brake_rate_mps3, v.release_rate_mps3,
+        v.pieces, first, total, failed,
+    )  # fmt: skip
+    if failed.any():
+        raise PhysicsError({k: f"a forecast could not reach {until_s:g} s" for k in np.flatnonzero(failed).tolist()})
+    return first, total
+
+
+@compiled
+def forecast_worlds(
+    gaps: Floats, speeds: Floats, time: Floats, hit: Bools, ahead: Floats, ahead_hit: Bools, command: Floats,
+    vehicle: int, candidates: Floats, until_s: float, latency: Floats, mass: Floats, limit: Floats, restitution: Floats,
+    in_force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats, first: Floats, total: Floats,
+    failed: Bools,
+) -> None:  # fmt: skip
+    """Simulate every world with each candidate command; fill ``first`` and ``total`` [n, K] with the harm (m2/s2).
+
+    ``first`` and ``total`` must be 0 on entry. Arguments that are not listed are fields of ``Worlds`` and ``Vehicles``
+    under short names, for example ``gaps`` for ``gaps_m``.
+
+    - ``ahead``: gap to an obstacle, [n] m, ``FAR_AWAY_M`` in a world without one; empty if no world has one.
+    - ``command``: commands of all vehicles, [n, N] m/s2; the column of ``vehicle`` is ignored.
+    - ``vehicle``: index of the vehicle that tries the candidates, from 0.
+    - ``candidates``: K candidate commands for it in each world, [n, K] m/s2.
+    - ``until_s``: absolute end of the forecast, s.
+    - ``in_force``: accelerations in force at the start, [n, N] m/s2.
+    - ``failed``: set to True where a check of the kernel failed, [n].
+    """
+    n, vehicles = speeds.shape
+    at = min(ahead.shape[0], 1)  # vehicle i is column at + i; an obstacle is column 0
+    table = np.zeros((rows_for(pieces.shape[2]), at + vehicles))
+    no_rows = np.empty((0, LISTED.WIDTH))
+    for k in range(n):
+        duration = until_s - time[k]
+        if not duration > 0.0:
+            continue
+        for c in range(candidates.shape[1]):
+            if at == 1:
+                place_obstacle(table, ahead[k], 1.0 if ahead_hit[k] else 0.0)
+                table[ROW.SPEED, 0] = 0.0
+            for i in range(vehicles):
+                table[ROW.SPEED, at + i] = speeds[k, i]
+                table[ROW.COMMAND, at + i] = candidates[k, c] if i == vehicle else command[k, i]
+                table[ROW.MASS, at + i] = mass[k, i]
+                table[ROW.LIMIT, at + i] = limit[k, i]
+                table[ROW.ONSET, at + i] = onset_s(latency[k, i], time[k])
+            for p in range(vehicles - 1):
+                table[ROW.GAP, at + p] = gaps[k, p]
+                table[ROW.HIT, at + p] = 1.0 if hit[k, p] else 0.0
+            place_forces(table, in_force[k], brake_rate[k], release_rate[k], pieces[k])
+            if advance_table(table, restitution[k], duration, 0.0, k, no_rows, 0)[1] != FLAG.DONE:
+                failed[k] = True
+                break
+            for p in range(at + vehicles - 1):
+                first[k, c] += table[ROW.FIRST_HARM, p]
+                total[k, c] += table[ROW.TOTAL_HARM, p]

@@ -1,0 +1,179 @@
+"""Impacts and resting contact of touching vehicles, resolved together by one law that does not depend on an order.
+
+Resolving pairs one after another gives results that depend on the order. Here a *cluster*, a run of touching vehicles,
+is resolved at once by a mass-weighted isotonic regression ``P`` (pool adjacent violators):
+
+* impact: ``v+ = (1 + e) P(v-) - e v-``; for two vehicles this is the paper's eq. (13);
+* resting contact: the accelerations are ``P`` of the vehicles' own accelerations; a pooled block accelerates with
+  ``sum(m u) / sum(m)``. Forces that hold (brakes at rest) enter as a range, so a block at rest moves only if the push
+  exceeds what its braked members can hold.
+
+Vehicles are ordered front to rear; a result is feasible if no vehicle is faster than the one in front of it.
+
+The kernels work on one table of floats per world, ``table[row, vehicle or pair]``, with the rows of ``physics.rows``.
+One array is cheap to pass from function to function; passing twenty small ones costs more than the physics.
+"""
+
+from __future__ import annotations
+
+import math
+
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.motion import BOUND, settle
+from ethbrake_marl.physics.rows import LISTED, ROW
+from ethbrake_marl.physics.state import Floats
+
+
+@compiled(bare=True)
+def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) -> int:
+    """Give touching vehicles values with which none is faster than the vehicle in front; return the number of blocks.
+
+    A vehicle that would be faster than the one in front is pooled with it into a *block*, whose vehicles all get the
+    same value: the mean weighted by mass (isotonic regression). The values are written to row ``out``, and rows BLOCK_*
+    describe the blocks. A vehicle of infinite mass (the obstacle) stands still, and so does its block.
+
+    Args:
+        table: one world in the layout of ``physics.rows``.
+        low: row with the lower bound of each vehicle's value (a speed or an acceleration).
+        high: row with the upper bound; the same row as ``low`` for an exactly known value.
+        first: column of the front vehicle of the touching run.
+        last: column of its rear vehicle.
+        out: row that receives the results.
+
+    """
+    count = 0
+    for i in range(first, last + 1):
+        mass = table[ROW.MASS, i]
+        table[ROW.BLOCK_MASS, count] = mass
+        table[ROW.BLOCK_LOW, count] = mass * table[low, i] if mass < math.inf else 0.0
+        table[ROW.BLOCK_HIGH, count] = mass * table[high, i] if mass < math.inf else 0.0
+        table[ROW.BLOCK_FIRST, count] = i
+        top = count + first
+        table[out, top] = settle(table[low, i], table[high, i])
+        while count > 0 and table[out, top] > table[out, top - 1]:
+            count -= 1
+            top -= 1
+            table[ROW.BLOCK_MASS, count] += table[ROW.BLOCK_MASS, count + 1]
+            table[ROW.BLOCK_LOW, count] += table[ROW.BLOCK_LOW, count + 1]
+            table[ROW.BLOCK_HIGH, count] += table[ROW.BLOCK_HIGH, count + 1]
+            mass = table[ROW.BLOCK_MASS, count]
+            table[out, top] = settle(table[ROW.BLOCK_LOW, count] / mass, table[ROW.BLOCK_HIGH, count] / mass)
+        count += 1
+    member = last
+    for k in range(count - 1, -1, -1):
+        value = table[out, k + first]
+        while member >= table[ROW.BLOCK_FIRST, k]:
+            table[out, member] = value
+            member -= 1
+    return count
+
+
+@compiled(bare=True)
+def resolve_cluster(table: Floats, restitution: float, first: int, last: int) -> None:
+    """Replace the speeds of touching vehicles ``first..last`` by their speeds after the impact.
+
+    Nothing bounces (restitution 0) if the largest closing speed is below ``PLASTIC_SPEED_MPS``. The vehicles fall into
+    blocks with one common speed before the bounce (``pool``). This speed is corrected by the mean of the remaining
+    error, so the momentum error stays within 4 eps of ``sum(m |v|)`` for any masses. A vehicle that is not struck keeps
+    its bits.
+
+    Corrected speeds are ordered only up to rounding. So if nothing bounces, each speed is finally limited to that of
+    the vehicle in front. Without this step two blocks could exchange a rounding error forever.
+
+    Args:
+        table: one world in the layout of ``physics.rows``.
+        restitution: coefficient of restitution of every impact.
+        first: column of the front vehicle.
+        last: column of the rear vehicle.
+
+    """
+    largest = 0.0
+    for p in range(first, last):
+        largest = max(largest, table[ROW.CLOSING, p])
+    bounce = restitution if largest >= BOUND.PLASTIC_SPEED_MPS else 0.0
+    end = last + 1
+    for block in range(pool(table, ROW.SPEED, ROW.SPEED, first, last, ROW.POOLED) - 1, -1, -1):
+        head = int(table[ROW.BLOCK_FIRST, block])
+        pooled = table[ROW.POOLED, head]
+        if table[ROW.BLOCK_MASS, block] < math.inf:
+            rest = 0.0
+            for i in range(head, end):
+                rest += table[ROW.MASS, i] * (table[ROW.SPEED, i] - pooled)
+            pooled += rest / table[ROW.BLOCK_MASS, block]
+        for i in range(head, end):
+            table[ROW.SPEED, i] = pooled + bounce * (pooled - table[ROW.SPEED, i])
+        end = head
+    if bounce == 0.0:
+        for i in range(first + 1, last + 1):
+            table[ROW.SPEED, i] = min(table[ROW.SPEED, i], table[ROW.SPEED, i - 1])
+
+
+@compiled(bare=True)
+def resolve_impacts(table: Floats, restitution: float) -> bool:
+    """Resolve, once, every run of touching vehicles in which some pair approaches; return False if no pair approaches.
+
+    ``table``: one world in the layout of ``physics.rows``; ``restitution``: coefficient of restitution in [0, 1].
+    Updates SPEED, writes the rows CLOSING, BEFORE and STRUCK of this round of impacts, and clears CONTACT_SPEED.
+    """
+    pairs = table.shape[1] - 1
+    approaching = False
+    for p in range(pairs):
+        closing = 0.0
+        if table[ROW.GAP, p] <= 0.0:
+            closing = table[ROW.CONTACT_SPEED, p]
+            if closing == 0.0:
+                closing = table[ROW.SPEED, p + 1] - table[ROW.SPEED, p]
+        table[ROW.CLOSING, p] = closing
+        approaching = approaching or closing > 0.0
+    if not approaching:
+        return False
+    for i in range(pairs + 1):
+        table[ROW.BEFORE, i] = table[ROW.SPEED, i]
+    first = 0
+    while first < pairs:
+        last = first
+        approaching = False
+        while last < pairs and table[ROW.GAP, last] <= 0.0:
+            approaching = approaching or table[ROW.CLOSING, last] > 0.0
+            last += 1
+        if approaching:
+            resolve_cluster(table, restitution, first, last)
+        first = last + 1
+    for p in range(pairs):
+        table[ROW.CONTACT_SPEED, p] = 0.0
+        table[ROW.STRUCK, p] = 1.0 if table[ROW.CLOSING, p] > BOUND.TOUCH_SPEED_MPS else 0.0
+    return True
+
+
+@compiled(bare=True)
+def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recorded: int) -> int:
+    """Add the last round of impacts to the harm rows and to the list ``rows``; return the new number of impacts.
+
+    Args:
+        table: one world in the layout of ``physics.rows``, after ``resolve_impacts``.
+        time_s: time of the impacts, s.
+        world: number to write into the list for this world.
+        rows: list of impacts, [capacity, LISTED.WIDTH]; impacts beyond its capacity are only counted.
+        recorded: number of impacts counted so far.
+
+    """
+    for p in range(table.shape[1] - 1):
+        if table[ROW.STRUCK, p] == 0.0:
+            continue
+        closing = table[ROW.CLOSING, p]
+        harm = closing * closing
+        if recorded < rows.shape[0]:
+            rows[recorded, LISTED.WORLD] = world
+            rows[recorded, LISTED.PAIR] = p
+            rows[recorded, LISTED.TIME] = time_s
+            rows[recorded, LISTED.CLOSING] = closing
+            rows[recorded, LISTED.FIRST] = 1.0 - table[ROW.HIT, p]
+            rows[recorded, LISTED.FRONT_CHANGE] = table[ROW.SPEED, p] - table[ROW.BEFORE, p]
+            rows[recorded, LISTED.REAR_CHANGE] = table[ROW.SPEED, p + 1] - table[ROW.BEFORE, p + 1]
+        recorded += 1
+        table[ROW.TOTAL_HARM, p] += harm
+        table[ROW.COUNT, p] += 1.0
+        if table[ROW.HIT, p] == 0.0:
+            table[ROW.HIT, p] = 1.0
+            table[ROW.FIRST_HARM, p] += harm
+    return recorded

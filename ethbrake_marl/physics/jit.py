@@ -1,0 +1,412 @@
+"""``compiled``, the decorator of all compiled kernels: strict floating point, and a cache that is safe to share.
+
+Numba's own cache has two problems. Its key is the function's own file, so an edit to a *callee* in another file would
+keep the old machine code in use. And its index file is read, changed and written back, which is not safe if processes
+share a folder.
+
+Here each kernel and signature has one file. Its name is a hash of everything that determines the code: sources,
+versions, signature and processor, but not the location of the package. An edit recompiles exactly the kernels that can
+reach it, and a second environment or a moved checkout reuses the kernels of the first. There is no index. A file is
+written under a temporary name and renamed when complete, so any number of processes may share a folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import re
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from functools import cache, partial
+from itertools import pairwise
+from pathlib import Path
+from types import CodeType
+from typing import Any, TypeVar, overload
+
+import llvmlite
+import numba
+from llvmlite.binding import parse_assembly, parse_bitcode
+from numba.core import config as numba_config
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import CompileResult, Flags, compile_extra
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.registry import CPUDispatcher
+from numba.core.serialize import dumps
+from numba.core.sigutils import normalize_signature
+from numba.core.types.misc import unliteral
+from numba.core.typing import make_concrete_template
+
+from ethbrake_marl.errors import check_whole_number
+from ethbrake_marl.kernel_store import cache_folder, tell_compilation
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+_OPTIONS = {"nopython": True, "boundscheck": None, "fastmath": False, "nogil": True, "error_model": "numpy"}
+
+_KNOWN = numba.__version__.startswith("0.68.")  # other versions are untested with numba's internals: use plain numba
+
+_SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DEBUGINFO_DEFAULT")  # change the code
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+_MARK = b"\n@compiled"  # the decorator at the start of a line
+
+_IMPORT = re.compile(rb"^ *from (ethbrake_marl[.\w]*) import (\([^)]*\)|.*)$", re.MULTILINE)
+
+_CONSTANT = re.compile(r"\b[A-Z][A-Z0-9_]*\b")
+
+_DIGEST_BYTES = 32
+
+_LONGEST_WAIT_S = 600.0  # for another process that compiles the same kernel
+
+_UNKEPT = "each process compiles for itself; set the clock, or their dates (find FOLDER -exec touch {} +)"
+
+_IMPORTED_S = time.time()
+
+_loaded: list[str] = []
+
+
+class _Linkable(JITCodeLibrary):  # type: ignore[misc]
+    """Code of a kernel that is only inlined into its callers: no machine code is generated for it."""
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+
+class Kernel(CPUDispatcher):  # type: ignore[misc]
+    """A compiled function like the result of numba's ``njit``, with its own cache and less to compile.
+
+    Numba generates machine code and two wrappers for each compiled function that another one calls, although the caller
+    already contains its code. And it compiles once per integer literal that is passed as an argument. This class does
+    neither.
+    """
+
+    def __init__(self, *given: Any, **options: Any) -> None:
+        super().__init__(*given, **options)
+        self._compiler._customize_flags = _without_c_wrapper
+        self._linked: dict[tuple[Any, ...], Any] = {}  # types of the arguments -> signature, library, environments
+
+    def compile(self, sig: Any) -> Any:
+        """Load or compile the machine code for one numba signature ``sig``, and return its entry point."""
+        with global_compiler_lock:
+            arguments, returned = normalize_signature(sig)
+            if tuple(arguments) not in self.overloads:
+                self._obtain("entry", (*arguments, returned), lambda: self._compile(sig), self._load)
+            return self.overloads[tuple(arguments)].entry_point
+
+    def _compile(self, sig: Any) -> Any:
+        tell_compilation(not _loaded)
+        super().compile(sig)
+        made = self.overloads[tuple(normalize_signature(sig)[0])]
+        if not _KNOWN:
+            return made.library.has_dynamic_globals, made._reduce()
+        library = made.library
+        for environment in made._find_referenced_environments():  # of the linked callees; its own is set already
+            library.codegen.set_env(environment.env_name, environment)
+        parts = list(made._replace(type_annotation="")._reduce())
+        stub = "".join(f'define void @"{name}"() {{ ret void }}\n' for name in _symbols(library))
+        parts[0] = (library.name, "object", (parts[0][2][0], parse_assembly(stub).as_bitcode()))
+        return library.has_dynamic_globals, parts
+
+    def _load(self, *parts: Any) -> None:
+        self.targetctx.refresh()
+        made = CompileResult._rebuild(self.targetctx, *parts)
+        self.targetctx.insert_user_function(made.entry_point, made.fndesc, [made.library])
+        self.add_overload(made)
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """Return what numba needs to type a call of this kernel from another kernel (numba's own protocol).
+
+        ``args`` and ``kws`` are the numba types of the call's arguments.
+        """
+        if not _KNOWN:
+            return super().get_call_template(args, kws)
+        pysig, folded = self._compiler.fold_argument_types(args, kws)
+        arguments = tuple(unliteral(kind) for kind in folded)
+        if arguments not in self._linked:
+            self._obtain("linked", arguments, lambda: self._compile_linked(arguments), self._load_linked)
+        signatures = [signature for signature, *_ in self._linked.values()]
+        return make_concrete_template(self.__name__, self.__name__, signatures), pysig, arguments, {}
+
+    def get_overload(self, sig: Any) -> Any:
+        """Return the key under which numba stores the code for the signature ``sig`` (numba's own protocol)."""
+        return self._linked[tuple(normalize_signature(sig)[0])][1] if _KNOWN else super().get_overload(sig)
+
+    def _compile_linked(self, arguments: tuple[Any, ...]) -> Any:
+        flags = Flags()
+        self.targetdescr.options.parse_as_flags(flags, self.targetoptions)
+        flags.no_compile = flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
+        library = _Linkable(self.targetctx.codegen(), self.__qualname__)
+        with self._compiling_counter:
+            made = compile_extra(
+                self.typingctx, self.targetctx, self.py_func, arguments, None, flags, self.locals, library=library
+            )
+        self._link(made.signature, made.fndesc, library, made.environment)
+        made.fndesc.typemap = made.fndesc.calltypes = None
+        library._ensure_finalized()
+        bitcode = library._final_module.as_bitcode()
+        environments = [made.environment, *made._find_referenced_environments()]
+        return library.has_dynamic_globals, (made.signature, made.fndesc, library.name, bitcode, environments)
+
+    def _load_linked(self, signature: Any, fndesc: Any, name: str, bitcode: bytes, environments: Any) -> None:
+        self.targetctx.refresh()
+        library = _Linkable(self.targetctx.codegen(), name)
+        library._final_module, library._finalized = parse_bitcode(bitcode), True
+        self._link(signature, fndesc, library, environments)
+
+    def _link(self, signature: Any, fndesc: Any, library: _Linkable, environments: Any) -> None:
+        self.targetctx.insert_user_function(library, fndesc, [library])
+        self._linked[signature.args] = signature, library, environments
+
+    def _obtain(self, way: str, kinds: tuple[Any, ...], make: Callable[[], Any], load: Callable[..., None]) -> None:
+        """Load a kernel from the cache, or make and cache it while no other process makes the same one.
+
+        Args:
+            way: ``"entry"`` for a kernel called from Python, ``"linked"`` for one called from other kernels.
+            kinds: numba types of the arguments, and for an entry also of the result.
+            make: compiles the kernel; returns whether it must not be cached, and its parts, which can be pickled.
+            load: takes these parts and makes the kernel usable in this process.
+
+        """
+        name = self._name(way, kinds)
+        kept = load_kernel(name)
+        if kept is None:
+            with _alone(name):
+                kept = load_kernel(name)  # another process may have made it meanwhile
+                if kept is None:
+                    unkept, made = make()
+                    if name and not unkept:
+                        keep_kernel(name, dumps(made))
+                    return
+        load(*pickle.loads(kept))
+
+    def _name(self, way: str, kinds: tuple[Any, ...]) -> str:
+        """Return the cache file name for argument types ``kinds``; empty if the code's sources are not fully known.
+
+        ``way`` is ``"entry"`` for a kernel called from Python, ``"linked"`` for one called from other kernels.
+        """
+        code, source = self.py_func.__code__, Path(self.py_func.__code__.co_filename)
+        digest, own = digest_of_sources(source), digest_of_sources(Path(__file__))
+        if not digest or not own or self.py_func.__closure__:
+            return ""
+        made_of = (
+            (way, sys.implementation.cache_tag, sys.flags.optimize, numba.__version__, llvmlite.__version__),
+            [str(getattr(numba_config, setting)) for setting in _SETTINGS],
+            self.targetctx.codegen().magic_tuple(),
+            (own, digest, _place_of(source), self.__module__, self.__qualname__, code.co_firstlineno, code.co_code),
+            [constant for constant in code.co_consts if not isinstance(constant, CodeType)],
+            sorted(self.targetoptions.items()),
+            [_described(kind) for kind in kinds],
+        )
+        return f"{self.__name__.strip('<>')}-{hashlib.sha256(repr(made_of).encode()).hexdigest()[:40]}.{way}"
+
+
+def _without_c_wrapper(flags: Any) -> Any:
+    """Set numba's compiler ``flags`` to make no C wrapper: kernels are called from Python and other kernels only."""
+    flags.no_cfunc_wrapper = _KNOWN
+    return flags
+
+
+def _symbols(library: Any) -> list[str]:
+    """Return the names under which other kernels call the functions of ``library``, numba's code of one kernel."""
+    return [function.name for function in library._final_module.functions if function.name.startswith("_ZN7cpython")]
+
+
+def _described(kind: Any) -> str:
+    """Return a text for a numba type ``kind``, with the field names of named tuples, which its own name omits."""
+    parts = [_described(part) for part in getattr(kind, "types", ())]
+    return f"{kind} {getattr(kind, 'fields', '')} {parts}"
+
+
+def load_kernel(name: str) -> bytes | None:
+    """Return the content of the cache file ``name`` (as ``keep_kernel`` wrote it); None if it cannot be used.
+
+    It cannot be used if it is missing or damaged, or if its owner is not this user or root: the owner matters because a
+    cached kernel is executed.
+    """
+    try:
+        with (cache_folder() / name).open("rb") as file:
+            about, content = os.fstat(file.fileno()), file.read()
+    except OSError:
+        return None
+    digest, kept = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+    trusted = not hasattr(os, "getuid") or about.st_uid in (0, os.getuid())
+    if not trusted or _digest_of(name, kept) != digest:
+        return None
+    _loaded.append(name)
+    return kept
+
+
+def keep_kernel(name: str, content: bytes) -> None:
+    """Write ``content`` to the cache file ``name`` for ``load_kernel``; warn if that fails (for example, full disk)."""
+    folder = cache_folder()
+    try:
+        handle, part = tempfile.mkstemp(dir=folder, prefix=".")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(_digest_of(name, content) + content)
+            os.replace(part, folder / name)
+        except OSError:
+            Path(part).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        warnings.warn(f"{folder}: a compiled kernel could not be kept: {error}", stacklevel=2)
+
+
+def _digest_of(name: str, content: bytes) -> bytes:
+    return hashlib.sha256(name.encode() + content).digest()
+
+
+@contextmanager
+def _alone(name: str) -> Iterator[None]:
+    """Context manager: hold a lock on the cache file ``name`` against other processes, if the file system can lock."""
+    if not name:
+        yield
+        return
+    from filelock import FileLock, Timeout  # imported here because only compiling needs it
+
+    lock = FileLock(cache_folder() / f".{name}.lock", timeout=_LONGEST_WAIT_S)
+    with suppress(Timeout, OSError, NotImplementedError):
+        lock.acquire()
+    try:
+        yield
+    finally:
+        if lock.is_locked:
+            Path(lock.lock_file).unlink(missing_ok=True)
+            lock.release()
+
+
+@cache
+def digest_of_sources(source: Path) -> str:
+    """Return a hash of all files that the kernels in the file ``source`` may be compiled from; empty if not known.
+
+    It is not known for code outside a file (a shell), and for a file that was edited after this process started,
+    because the process may have imported the older version. A file dated in the future counts as edited, with a
+    warning.
+    """
+    digest = hashlib.sha256()
+    for file in kernel_sources(source) if source.is_file() else ():
+        written_s = file.stat().st_mtime
+        if written_s > time.time():
+            warnings.warn(f"{_PACKAGE}: dates of files lie in the future: {_UNKEPT}", stacklevel=2)
+        if written_s > _IMPORTED_S:
+            return ""
+        digest.update(f"{_place_of(file)} {file.stat().st_size} ".encode() + file.read_bytes())
+    return digest.hexdigest() if source.is_file() else ""
+
+
+def _place_of(file: Path) -> str:
+    """Return the path of ``file`` relative to this package's folder, or its full path if it lies elsewhere."""
+    return file.relative_to(_PACKAGE).as_posix() if file.is_relative_to(_PACKAGE) else str(file)
+
+
+def kernel_sources(source: Path) -> list[Path]:
+    """Return the file ``source`` and all files of this package that its kernels may be compiled from, sorted by name.
+
+    These are the files with kernels that it imports, directly or through other such files, and the files from which any
+    of them imports a constant (a name in capitals).
+    """
+    found, follow = {source}, [source]
+    while follow:
+        for imported, has_kernels in _imports(follow.pop()):
+            if imported not in found:
+                found.add(imported)
+                follow += [imported] * has_kernels
+    return sorted(found)
+
+
+@cache
+def _imports(source: Path) -> list[tuple[Path, bool]]:
+    """Return (file, whether it has kernels) for the files with kernels or constants that ``source`` imports."""
+    found = []
+    for module, names in _IMPORT.findall(source.read_bytes()):
+        for imported, taken in _homes(module.decode(), set(re.findall(r"\w+", names.decode()))):
+            has_kernels = _MARK in imported.read_bytes()
+            if has_kernels or any(_CONSTANT.fullmatch(name) for name in taken):
+                found.append((imported, has_kernels))
+    return found
+
+
+def _homes(module: str, names: set[str]) -> list[tuple[Path, set[str]]]:
+    """Return (file, names defined there) for each file that the imported ``names`` come from.
+
+    ``module`` is the dotted name in the import: a module, or a folder whose ``__init__`` imports the names from
+    elsewhere.
+    """
+    place = _PACKAGE.joinpath(*module.split(".")[1:])
+    if place.with_suffix(".py").is_file():
+        return [(place.with_suffix(".py"), names)]
+    found = [(place / f"{name}.py", set[str]()) for name in names if (place / f"{name}.py").is_file()]
+    for home, offered in _IMPORT.findall((place / "__init__.py").read_bytes()):
+        if taken := names & set(re.findall(r"\w+", offered.decode())):
+            found += _homes(home.decode(), taken)
+    return found
+
+
+@overload
+def compiled(function: Function) -> Function: ...
+
+
+@overload
+def compiled(*, apart: bool = False, within: bool = False, bare: bool = False) -> Callable[[Function], Function]: ...
+
+
+def compiled(function: Any = None, *, apart: bool = False, within: bool = False, bare: bool = False) -> Any:
+    """Compile a function with numba: no fast-math, no bounds checks, no GIL, cached on disk.
+
+    By default a kernel is inlined into its callers (``forceinline``). A real call would count references to its arrays,
+    atomically, which costs more than half of the physics.
+
+    Args:
+        function: the function, if the decorator is used without arguments.
+        apart: keep calls of this kernel as calls. For large, shared, rarely called kernels: inlined, they would be
+            compiled once per caller, which takes minutes instead of seconds.
+        within: inline this kernel into its callers before they are compiled. ``forceinline`` still counts references at
+            each level that passes an array on; ``within`` does not.
+        bare: compile without any reference counting. For kernels that neither create nor return arrays; the caller
+            holds them. A callee with ``forceinline`` still counts references unless it is bare too.
+
+    """
+    if function is None:
+        return partial(compiled, apart=apart, within=within, bare=bare)
+    config: Any = numba_config  # its attributes are set at run time
+    if config.DISABLE_JIT:
+        return function
+    how: dict[str, Any] = {"inline": "always"} if within else {"forceinline": not apart}
+    if bare:
+        how["_nrt"] = False
+    return Kernel(function, targetoptions=_OPTIONS | how)
+
+
+Result = TypeVar("Result")
+
+
+def by_parts(work: Callable[[slice], Result], n: int, threads: int) -> list[Result]:
+    """Return the results of ``work`` on contiguous slices that divide the rows 0 to n - 1, in the order of the rows.
+
+    There is one slice per thread, so up to ``threads`` results. The calling thread does the first slice, so
+    ``threads=1`` starts no thread. If slices fail, all others still end, and then the error of the first failed slice
+    is raised. Raises ``InvalidInput`` unless ``threads`` is a whole number >= 1.
+
+    Args:
+        work: function of a slice of the rows, called once per slice.
+        n: number of rows.
+        threads: largest number of threads.
+
+    """
+    check_whole_number("threads", threads, 1)
+    parts = min(int(threads), n)
+    if parts <= 1:
+        return [work(slice(0, n))]
+    bounds = [n * p // parts for p in range(parts + 1)]
+    slices = [slice(low, high) for low, high in pairwise(bounds)]
+    with ThreadPoolExecutor(parts - 1) as pool:
+        others = [pool.submit(work, part) for part in slices[1:]]
+        return [work(slices[0]), *(other.result() for other in others)]

@@ -1,0 +1,312 @@
+"""The paper's fixed-step map (eq. dynamics2): impacts are detected, and take effect, at sample times only.
+
+With the sampling period h, one step of a vehicle with command u, from sample n to sample n + 1, is
+
+    x(n + 1) = x(n) + h f(n) + h^2 / 2 u(n)
+    v(n + 1) = f(n) + h u(n)
+
+where f(n) is the vehicle's speed after the impacts of sample n. A pair with a gap <= 0 at a sample that is closing
+exchanges velocity by the paper's eq. (13). For Vehicle 2 that is f = f1 after f3: first the rear impact, then the front
+impact with the changed speed. The other vehicle of the pair is updated with it.
+
+The paper leaves these points open; here they are read as follows:
+
+* f1 gets the state that f3 has changed, so the closing speed of the front impact is the changed one. Its harm is the
+  square of that same speed. The printed J_harm uses the speeds before both impacts, which differs only if both pairs
+  meet at one sample.
+* The printed f1 and f3 also act on overlapping vehicles that separate, which would pull them together again. The text
+  below eq. (13) asks for a positive relative velocity. This map requires it too, for the exchange and for its harm.
+* Samples are at ``tau_2 + n h``, where tau_2 is the latency of Vehicle 2. Before its first sample a world moves exactly
+  and no impact is detected: the paper assumes that there is none.
+* The command of a step is the one in force at the sample at its start (zero-order hold). A latency that ends between
+  two samples takes effect at the later one.
+* In the paper ``0 <= v <= v_max`` is a constraint on u and not part of the map. Here each command of every vehicle is
+  limited to the largest one that satisfies the constraint at the next sample. An impact can leave a negative speed.
+  Clamping it would violate conservation of momentum, so it stays, and brakes bring it to rest from below.
+
+The paper defines only N = 3. For any N, the pairs are treated once per sample, from the rear pair to the front pair.
+Gaps become negative between a contact and its sample and while vehicles overlap; nothing pushes the vehicles apart.
+Source: the paper, section "Optimization Problem".
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics.advance import refuse_bad, shaped
+from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.left_out import Impacts
+from ethbrake_marl.physics.motion import BOUND, has_acted, solo_motion
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+
+SHORTEST_STEP_S = 1e-6
+
+MOST_STEPS = 10**9  # largest number of steps in one call
+
+_ON_SAMPLE = 1e-6  # part of a step: times this close count as one sample, because times are rounded
+
+
+@compiled
+def exchange(
+    front_mps: float, rear_mps: float, front_t: float, rear_t: float, restitution: float
+) -> tuple[float, float]:
+    """Return the speeds of a pair (front, rear) after its impact, by the paper's eq. (13), in m/s.
+
+    With w = v_{i+1} - v_i: ``v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})`` and ``v_{i+1}+ = v_{i+1} - m_i (1 + e)
+    w / (m_i + m_{i+1})``.
+
+    Args:
+        front_mps: speed v_i of the front vehicle, m/s.
+        rear_mps: speed v_{i+1} of the rear vehicle, m/s.
+        front_t: mass m_i of the front vehicle, t.
+        rear_t: mass m_{i+1} of the rear vehicle, t.
+        restitution: coefficient of restitution e.
+
+    """
+    impulse = (1.0 + restitution) * (rear_mps - front_mps) / (front_t + rear_t)
+    return front_mps + rear_t * impulse, rear_mps - front_t * impulse
+
+
+@compiled
+def exchange_at_sample(
+    k: int, gaps: Floats, speeds: Floats, mass: Floats, restitution: float, hit: Bools, first_harm: Floats,
+    total_harm: Floats, count: Ints,
+) -> None:  # fmt: skip
+    """Apply the impacts of world ``k`` at a sample, from the rear pair to the front pair, and add their harm.
+
+    As in ``advance``, harm is the squared closing speed of the impact itself, and a closing speed of at most
+    ``TOUCH_SPEED_MPS`` is a touch without harm.
+
+    Args:
+        k: row of the world in all arrays.
+        gaps: [n, P] m.
+        speeds: [n, N] m/s; updated.
+        mass: [n, N] t.
+        restitution: coefficient of restitution of this world.
+        hit: whether a pair has had an impact, [n, P]; updated.
+        first_harm: first-impact harm, [n, P] m2/s2; updated.
+        total_harm: harm of all impacts, [n, P] m2/s2; updated.
+        count: number of impacts, [n, P]; updated.
+
+    """
+    for p in range(gaps.shape[1] - 1, -1, -1):
+        closing = speeds[k, p + 1] - speeds[k, p]
+        if gaps[k, p] > 0.0 or closing <= 0.0:
+            continue
+        front, rear = exchange(speeds[k, p], speeds[k, p + 1], mass[k, p], mass[k, p + 1], restitution)
+        speeds[k, p] = front
+        speeds[k, p + 1] = rear
+        if closing <= BOUND.TOUCH_SPEED_MPS:
+            continue
+        harm = closing * closing
+        total_harm[k, p] += harm
+        count[k, p] += 1
+        if not hit[k, p]:
+            hit[k, p] = True
+            first_harm[k, p] += harm
+
+
+@compiled
+def held_motion(speed: float, command: float, limit: float, step: float) -> tuple[float, float]:
+    """Return speed (m/s) and distance (m) after a step of constant command: ``v + h u`` and ``h v + h^2 u / 2``.
+
+    u is the command, limited so that the speed ends at standstill or at its limit instead of beyond it. The distance is
+    computed as h times the mean of both speeds, which is the same for constant u. Brakes act against the motion.
+
+    Args:
+        speed: speed v at the start, m/s; may be negative after an impact.
+        command: command, m/s2; negative brakes.
+        limit: speed up to which the vehicle drives, m/s.
+        step: length h of the step, s.
+
+    """
+    after = speed
+    if command < 0.0:
+        after = max(speed + command * step, 0.0) if speed >= 0.0 else min(speed - command * step, 0.0)
+    elif command > 0.0 and speed < limit:
+        after = min(speed + command * step, limit)
+    return after, 0.5 * (speed + after) * step
+
+
+@compiled
+def held_speeds(speeds: Floats, command: Floats, limit: Floats, step: float) -> Floats:
+    """Return the speeds after a step of constant command, [n, N] m/s; see ``held_motion``.
+
+    Speeds (m/s), commands (m/s2) and limits (m/s) are [n, N]; ``step`` is the length of the step in s.
+    """
+    after = np.empty(speeds.shape)
+    for k in range(speeds.shape[0]):
+        for i in range(speeds.shape[1]):
+            after[k, i] = held_motion(speeds[k, i], command[k, i], limit[k, i], step)[0]
+    return after
+
+
+@compiled
+def move_to_grid(
+    k: int, duration: float, time: float, gaps: Floats, speeds: Floats, command: Floats, latency: Floats, limit: Floats
+) -> None:
+    """Move world ``k`` exactly, before its first sample and without impacts. Updates ``gaps`` and ``speeds``.
+
+    Args:
+        k: row of the world in all arrays.
+        duration: length of the motion, s.
+        time: present time, s.
+        gaps: [n, P] m; updated.
+        speeds: [n, N] m/s; updated.
+        command: [n, N] m/s2.
+        latency: time before which commands have no effect, [n, N] s.
+        limit: speed up to which each vehicle drives, [n, N] m/s.
+
+    """
+    way_in_front = 0.0
+    for i in range(speeds.shape[1]):
+        after, way, _ = solo_motion(speeds[k, i], command[k, i], latency[k, i] - time, limit[k, i], duration)
+        speeds[k, i] = after
+        if i > 0:
+            gaps[k, i - 1] += way_in_front - way
+        way_in_front = way
+
+
+@compiled
+def sample_worlds(
+    gaps: Floats, speeds: Floats, time: Floats, hit: Bools, command: Floats, until: Floats, step: float, first: Ints,
+    last: Ints, latency: Floats, mass: Floats, limit: Floats, restitution: Floats, first_harm: Floats,
+    total_harm: Floats, count: Ints,
+) -> None:  # fmt: skip
+    """Advance every world by the paper's fixed-step map, from one sample to another, in place.
+
+    Sample 0 is at the latency of Vehicle 2. Arguments that are not listed are fields of ``Worlds`` and ``Vehicles``
+    under short names; ``gaps``, ``speeds``, ``time`` and ``hit`` are updated.
+
+    - ``command``: commands, [n, N] m/s2.
+    - ``until``: end times, [n] s; used only in a world that ends before sample 0.
+    - ``step``: sampling period, s.
+    - ``first``: number of the sample at which each world starts, [n]; -1: before sample 0.
+    - ``last``: number of the sample at which it ends, [n]; -1: before sample 0.
+    - ``first_harm``: first-impact harm, [n, P] m2/s2; updated.
+    - ``total_harm``: harm of all impacts, [n, P] m2/s2; updated.
+    - ``count``: number of impacts, [n, P]; updated.
+    """
+    for k in range(speeds.shape[0]):
+        start = latency[k, 1]
+        begin = first[k]
+        if begin < 0:
+            end = until[k] if last[k] < 0 else start
+            move_to_grid(k, end - time[k], time[k], gaps, speeds, command, latency, limit)
+            time[k] = end
+            begin = 0
+        for n in range(begin, last[k]):
+            exchange_at_sample(k, gaps, speeds, mass, restitution[k], hit, first_harm, total_harm, count)
+            now = start + n * step + _ON_SAMPLE * step
+            way_in_front = 0.0
+            for i in range(speeds.shape[1]):
+                wanted = command[k, i] if latency[k, i] <= now else 0.0
+                speeds[k, i], way = held_motion(speeds[k, i], wanted, limit[k, i], step)
+                if i > 0:
+                    gaps[k, i - 1] += way_in_front - way
+                way_in_front = way
+        if last[k] > begin:
+            time[k] = start + last[k] * step
+
+
+def advance_sampled(
+    worlds: Worlds, command_mps2: ArrayLike, *, until_s: ArrayLike, step_s: float = 0.1
+) -> tuple[Worlds, Impacts]:
+    """Advance ``worlds`` by the paper's fixed-step map under constant commands; return new worlds and impacts.
+
+    Samples are ``step_s`` apart, the first one at the latency of Vehicle 2. A world ends at its first sample at or
+    after ``until_s``, or at ``until_s`` itself if that is before its first sample. Impacts of the last sample belong to
+    the next call, so calls can be chained; the returned state is the paper's s(n), before these impacts.
+    ``Impacts.rows`` is None. The result of a world does not depend on its batch. Inputs are not changed.
+
+    Gaps of the result may be negative: it can be continued here, but not by ``advance``.
+
+    Args:
+        worlds: n worlds of N vehicles.
+        command_mps2: commanded acceleration, [n, N] m/s2, ignored before a vehicle's latency.
+        until_s: absolute end time, one number or [n], s.
+        step_s: sampling period h, s.
+
+    Raises ``InvalidInput`` for a command beyond a vehicle's capacity, an end before a world's time, a step below 1e-6
+    s, a world whose time is between two samples, negative speeds before the first sample, brakes that build up or come
+    in pieces, or an obstacle ahead.
+
+    """
+    if worlds.obstacle_ahead.any():
+        k = int(np.argmax(worlds.obstacle_ahead))
+        raise InvalidInput(
+            f"advance_sampled: world {k} has an obstacle ahead (obstacle_gap_m = {worlds.obstacle_gap_m[k]:g}); the"
+            " paper's fixed-step map knows none, use advance"
+        )
+    worlds.refuse_build_up("advance_sampled")
+    command = shaped("command_mps2", command_mps2, worlds.speeds_mps.shape)
+    until = shaped("until_s", until_s, (worlds.n,))
+    refuse_bad(worlds, command, until, np.ones(worlds.n, np.bool_))
+    _refuse_unsampled(worlds, until, step_s)
+    after = worlds.copy()
+    impacts = sample_on(after, command, until, step_s)
+    after.command_mps2[...] = np.where(has_acted(worlds.vehicles.latency_s, after.time_s[:, np.newaxis]), command, 0.0)
+    return after, impacts
+
+
+def sample_on(worlds: Worlds, command: Floats, until: Floats, step_s: float) -> Impacts:
+    """Advance ``worlds`` in place by the paper's fixed-step map, without checks, and return the impacts.
+
+    Like ``advance_sampled``; ``command_mps2`` of the worlds is not updated.
+
+    Args:
+        worlds: n worlds of N vehicles; updated.
+        command: commanded accelerations, [n, N] m/s2.
+        until: absolute end times, [n] s.
+        step_s: sampling period, s.
+
+    """
+    vehicles = worlds.vehicles
+    start = vehicles.latency_s[:, 1]
+    position, end = (worlds.time_s - start) / step_s, (until - start) / step_s  # times of samples may be rounded
+    first = np.where(position < -_ON_SAMPLE, -1.0, np.rint(position)).astype(np.int64)
+    last = np.where(end < -_ON_SAMPLE, -1.0, np.ceil(end - _ON_SAMPLE)).astype(np.int64)
+    gaps, time = worlds.gaps_m, worlds.time_s
+    first_harm, total_harm, count = np.zeros(gaps.shape), np.zeros(gaps.shape), np.zeros(gaps.shape, np.int64)
+    sample_worlds(
+        gaps, worlds.speeds_mps, time, worlds.pair_hit, command, until, float(step_s), first, last, vehicles.latency_s,
+        vehicles.mass_t, vehicles.speed_limit_mps, vehicles.restitution, first_harm, total_harm, count,
+    )  # fmt: skip
+    return Impacts(first_harm, total_harm, count, *Impacts.no_obstacle(worlds.n))
+
+
+def _refuse_unsampled(worlds: Worlds, until: Floats, step_s: float) -> None:
+    """Raise ``InvalidInput`` for a step length, an end time or a state that the fixed-step map does not cover.
+
+    ``until``: end times, [n] s; ``step_s``: sampling period, s.
+    """
+    if not (SHORTEST_STEP_S <= step_s < math.inf):
+        raise InvalidInput(f"step_s = {step_s:g}: must be finite and at least {SHORTEST_STEP_S:g} s")
+    good = (until >= worlds.time_s) & (until <= worlds.time_s + MOST_STEPS * step_s)
+    if not good.all():
+        k = int(np.argmin(good))
+        raise InvalidInput(
+            f"advance_sampled: world {k} is at {worlds.time_s[k]:g} s and cannot be advanced to {until[k]:g} s in 0 to"
+            f" {MOST_STEPS:,} steps of {step_s:g} s"
+        )
+    start = worlds.vehicles.latency_s[:, 1]
+    position = (worlds.time_s - start) / step_s
+    before = position < -_ON_SAMPLE
+    good = before | (np.abs(position - np.rint(position)) <= _ON_SAMPLE)
+    if not good.all():
+        k = int(np.argmin(good))
+        raise InvalidInput(
+            f"advance_sampled: world {k} is at {worlds.time_s[k]:g} s, between two of its samples"
+            f" {start[k]:g} s + n * {step_s:g} s; begin at a sample or before the first"
+        )
+    good = ~before[:, np.newaxis] | (worlds.speeds_mps >= 0.0)
+    if not good.all():
+        k = int(np.argmin(good.all(axis=1)))
+        raise InvalidInput(
+            f"advance_sampled: world {k} has a negative speed at {worlds.time_s[k]:g} s, before its first sample at"
+            f" {start[k]:g} s; the map knows no impacts before that"
+        )

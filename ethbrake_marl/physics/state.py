@@ -1,0 +1,643 @@
+"""State and parameters of ``n`` independent worlds, each a line of ``N`` vehicles.
+
+Shape letters that the whole package uses:
+
+===  =========================================================
+n    worlds, advanced together and independent of each other
+N    vehicles in a line, index 0 = ``vehicle_1`` = the front one
+P    pairs, ``P = N - 1``; pair p is (vehicle p, vehicle p + 1)
+L    learners
+F    features of an observation
+===  =========================================================
+
+Only gaps and speeds are stored: absolute positions would lose precision as the line moves on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ethbrake_marl.errors import InvalidInput, count_of
+
+Floats = NDArray[np.float64]
+
+Bools = NDArray[np.bool_]
+
+Ints = NDArray[np.int64]
+
+UInt64s = NDArray[np.uint64]
+
+GRAVITY_MPS2 = 9.81
+
+_ON_ROADS = ("braking_capacity_mps2", "driving_capacity_mps2")  # limited by friction
+
+
+def as_road_allows(quantities: Mapping[str, Floats], friction: Floats) -> dict[str, Floats]:
+    """Return ``quantities`` with the braking and driving capacities limited to ``friction * GRAVITY_MPS2``.
+
+    ``quantities`` maps field names such as ``braking_capacity_mps2`` to arrays; ``friction`` broadcasts to their shape.
+    Other fields stay as they are.
+    """
+    most = friction * GRAVITY_MPS2
+    return {key: np.minimum(value, most) if key in _ON_ROADS else value for key, value in quantities.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Vehicles:
+    """Parameters of the vehicles: everything that does not change during an episode."""
+
+    braking_capacity_mps2: Floats  # [n, N] largest deceleration, > 0
+    driving_capacity_mps2: Floats  # [n, N] largest forward acceleration, >= 0
+    latency_s: Floats  # [n, N] commands have no effect before this time, >= 0; includes delays of a ``v2x`` channel
+    mass_t: Floats  # [n, N] > 0
+    speed_limit_mps: Floats  # [n, N] speed up to which a vehicle drives, > 0
+    restitution: Floats  # [n] in [0, 1]
+    # [n, N] > 0, rates at which the acceleration in force falls to a lower command and rises to a higher one (m/s3);
+    # infinite: at once
+    brake_rate_mps3: Floats
+    release_rate_mps3: Floats
+    # [n, N, 2 K] braking in pieces: start of each of K pieces (s after the latency; infinite: none), then their
+    # commands (m/s2), which replace every other command; [n, N, 0]: no vehicle brakes in pieces
+    pieces: Floats
+    own_latency_s: Floats  # [n, N] part of the latency without the channel; messages report this part
+    # [n, N, N] time from which vehicle i acts on news of vehicle j; infinite: never. At least latency_s of vehicle i,
+    # and equal to it for i = j. Without a channel this and own_latency_s share the memory of latency_s
+    known_from_s: Floats
+
+    def __repr__(self) -> str:
+        n, N = self.mass_t.shape
+        return f"Vehicles({count_of(n, 'world')} of {N}, masses {_span(self.mass_t)} t)"
+
+    def take(self, rows: ArrayLike) -> Vehicles:
+        """Return the vehicles of the worlds selected by ``rows`` (indices or a mask [n]); always a copy."""
+        index = np.asarray(rows)
+        return _combined(lambda column: np.ascontiguousarray(column[index]), self)
+
+    @classmethod
+    def at_once(
+        cls,
+        braking_mps2: Floats,
+        driving_mps2: Floats,
+        latency_s: Floats,
+        mass_t: Floats,
+        limit_mps: Floats,
+        restitution: Floats,
+        brake_rate_mps3: Floats | None = None,
+        release_rate_mps3: Floats | None = None,
+        pieces: Floats | None = None,
+    ) -> Vehicles:
+        """Return vehicles without a channel: each has only its own latency and knows everything from then on.
+
+        Arguments are arrays as in the fields of this class: capacities, latency, mass (t) and speed limit are [n, N],
+        ``restitution`` is [n], rates are [n, N]. Rates None: a command takes full effect at once. ``pieces`` None: no
+        vehicle follows a fixed sequence of commands.
+        """
+        known = cls.known_at_once(latency_s)
+        at_once = np.full(mass_t.shape, np.inf)
+        return cls(
+            braking_mps2, driving_mps2, latency_s, mass_t, limit_mps, restitution,
+            at_once if brake_rate_mps3 is None else brake_rate_mps3,
+            at_once if release_rate_mps3 is None else release_rate_mps3,
+            np.zeros((*mass_t.shape, 0)) if pieces is None else pieces, latency_s, known,
+        )  # fmt: skip
+
+    @staticmethod
+    def known_at_once(latency_s: Floats) -> Floats:
+        """Return ``known_from_s`` [n, N, N] without a channel, from the latencies [n, N] s.
+
+        Vehicle i acts on news of every vehicle from its own latency on. The result is a read-only view of
+        ``latency_s``; its last axis has stride 0, so it takes no memory.
+        """
+        latency = np.ascontiguousarray(latency_s, np.float64)
+        (n, N), size = latency.shape, latency.itemsize
+        view: Floats = np.ndarray((n, N, N), np.float64, latency, strides=(N * size, size, 0))
+        view.flags.writeable = False
+        return view
+
+    @property
+    def build_up(self) -> Bools:
+        """Whether some vehicle of a world has a finite brake or release rate, or a fixed sequence of commands, [n]."""
+        rates = np.minimum(self.brake_rate_mps3, self.release_rate_mps3)
+        return np.asarray(np.isfinite(rates).any(axis=1) | self.in_pieces)
+
+    @property
+    def in_pieces(self) -> Bools:
+        """Whether some vehicle of a world brakes in pieces, that is, by a fixed sequence of commands, [n]."""
+        return np.asarray(np.isfinite(self.pieces).any(axis=(1, 2)))
+
+    def piece_commands(self, command_mps2: Floats, time_s: Floats) -> Floats:
+        """Return the commands in which vehicles that brake in pieces follow their current piece, [n, N] m/s2.
+
+        A piece is a time interval of constant command.
+
+        Args:
+            command_mps2: commands of all vehicles, [n, N] m/s2; kept for vehicles without pieces.
+            time_s: absolute time in each world, [n] s.
+
+        """
+        command, count = command_mps2, self.pieces.shape[2] // 2
+        for piece in range(count):
+            begins = self.latency_s + self.pieces[:, :, piece]
+            begun = (begins <= time_s[:, np.newaxis]) if piece else np.isfinite(begins)
+            command = np.where(begun, self.pieces[:, :, count + piece], command)
+        return command
+
+    def hide_from(self, vehicle: int) -> Bools:
+        """Return whether a channel hides part of the line from ``vehicle`` (index from 0) at its first decision, [n].
+
+        Either news of another vehicle has not arrived yet, or another vehicle reacts later than its own latency, which
+        is all that a message reports. Without a channel nothing is hidden.
+        """
+        late = self.latency_s > self.own_latency_s
+        hidden = (self.known_from_s[:, vehicle] > self.latency_s[:, [vehicle]]) | late
+        hidden[:, vehicle] = False
+        return np.asarray(hidden.any(axis=1))
+
+    @property
+    def is_known_at_once(self) -> bool:
+        """Whether every vehicle knows everything from its own latency on: there is no channel, or it has no effect."""
+        if self._is_view:
+            return True
+        own, latency = self.own_latency_s, self.latency_s
+        return bool((own == latency).all() and (self.known_from_s == latency[:, :, np.newaxis]).all())
+
+    @property
+    def _is_view(self) -> bool:
+        """Whether own latency and news share the memory of the latency, as ``at_once`` makes them."""
+        latency, news = self.latency_s, self.known_from_s
+        return self.own_latency_s is latency and news.base is latency and news.strides[1:] == (latency.itemsize, 0)
+
+
+_OF_VEHICLES = tuple(f.name for f in fields(Vehicles))
+
+_WITHOUT_NEWS = _OF_VEHICLES[:-2]
+
+
+@dataclass(frozen=True, slots=True)
+class Worlds:
+    """State of ``n`` worlds at their times ``time_s``.
+
+    >>> import ethbrake_marl as eb
+    >>> worlds = eb.make_worlds(
+    ...     [7.0, 7.0], [20.0, 18.0, 20.0], braking_capacity_mps2=[6.0, 7.0, 6.0], driving_capacity_mps2=3.0,
+    ...     latency_s=[0.0, 0.5, 0.8], mass_t=[4.5, 5.5, 5.9], restitution=0.1,
+    ... )
+    >>> worlds.n, worlds.N, worlds.gaps_m
+    (1, 3, array([[7., 7.]]))
+
+    """
+
+    vehicles: Vehicles  # constant parameters
+    gaps_m: Floats  # [n, P] bumper to bumper, >= 0 (negative only in the paper's fixed-step map)
+    speeds_mps: Floats  # [n, N] forward positive; negative only after a bounce-back
+    time_s: Floats  # [n] since Vehicle 1 began to brake
+    pair_hit: Bools  # [n, P] whether the pair has had an impact
+    command_mps2: Floats  # [n, N] signed acceleration in force up to this time; 0 up to the latency
+    obstacle_gap_m: Floats  # [n] from Vehicle 1's front to an unmovable obstacle ahead, >= 0; infinite: there is none
+    obstacle_hit: Bools  # [n] whether Vehicle 1 has had an impact with the obstacle
+    messages: Floats  # [n, M] state of the periodic messages (``physics.messages``); [n, 0] without them
+    # [n, 1 + 2 N] friction of the road, and braking and driving capacities on a dry road (m/s2), from which friction
+    # gives the capacities of ``vehicles``; [n, 0]: no friction is modelled
+    road: Floats
+
+    def __repr__(self) -> str:
+        found = f"gaps {_span(self.gaps_m)} m, speeds {_span(self.speeds_mps)} m/s, at {_span(self.time_s)} s"
+        return f"Worlds({count_of(self.n, 'world')} of {self.N} vehicles: {found})"
+
+    @property
+    def n(self) -> int:
+        """Number of worlds."""
+        return int(self.speeds_mps.shape[0])
+
+    @property
+    def N(self) -> int:
+        """Number of vehicles in each line."""
+        return int(self.speeds_mps.shape[1])
+
+    def _each(self, change: Callable[..., NDArray[Any]], *others: Worlds) -> Worlds:
+        """Return new worlds, each field of which is ``change(own field, field of the first of others, ...)``.
+
+        ``change`` takes one array per batch and returns one array: it selects or joins rows.
+        """
+        parts = (self, *others)
+        columns = (change(*(getattr(w, name) for w in parts)) for name in _OF_WORLDS)
+        return Worlds(_combined(change, *(w.vehicles for w in parts)), *columns)
+
+    def copy(self) -> Worlds:
+        """Return a copy in new memory; ``vehicles`` are shared, because they do not change."""
+        return Worlds(self.vehicles, *(getattr(self, name).copy() for name in _OF_WORLDS))
+
+    def take(self, rows: ArrayLike) -> Worlds:
+        """Return the worlds selected by ``rows`` (indices or a mask [n]); always a copy."""
+        index = np.asarray(rows)
+        return self._each(lambda column: np.ascontiguousarray(column[index]))
+
+    @staticmethod
+    def concatenate(parts: Sequence[Worlds]) -> Worlds:
+        """Join the batches ``parts``, all with the same number of vehicles, into one batch, in this order."""
+        parts = _alike(parts)
+        return parts[0]._each(lambda *columns: np.concatenate(columns), *parts[1:])
+
+    def assign(self, rows: Ints, fresh: Worlds) -> Worlds:
+        """Return a copy of the batch with the worlds at indices ``rows`` [k] replaced by the k worlds of ``fresh``."""
+
+        def assigned(whole: NDArray[Any], part: NDArray[Any]) -> NDArray[Any]:
+            copy = whole.copy()
+            copy[rows] = part
+            return copy
+
+        whole, part = _alike((self, fresh))
+        return whole._each(assigned, part)
+
+    def running(
+        self,
+        time_s: ArrayLike,
+        gaps_m: ArrayLike,
+        speeds_mps: ArrayLike,
+        *,
+        command_mps2: ArrayLike = 0.0,
+        pair_hit: ArrayLike = False,
+    ) -> Worlds:
+        """Return these worlds with a later state, for example from another simulator.
+
+        >>> import ethbrake_marl as eb
+        >>> alert = eb.load_scenario("paper-random").sample(2, seed=7).worlds
+        >>> alert.running(0.7, [4.0, 6.0], [18.0, 17.0, 19.0], command_mps2=[-5.0, -2.0, 0.0]).time_s
+        array([0.7, 0.7])
+
+        Args:
+            time_s: time since Vehicle 1 began to brake, broadcast to [n], s.
+            gaps_m: bumper to bumper, broadcast to [n, P], m.
+            speeds_mps: broadcast to [n, N], m/s.
+            command_mps2: acceleration in force of each vehicle, broadcast to [n, N], m/s2.
+            pair_hit: whether each pair has had an impact, broadcast to [n, P].
+
+        Raises ``InvalidInput`` naming the field and its first bad entry.
+
+        """
+        (n, N), inf = self.speeds_mps.shape, math.inf
+        return replace(
+            self,
+            time_s=_full("time_s", time_s, (n,), 0.0, inf),
+            gaps_m=_full("gaps_m", gaps_m, (n, N - 1), 0.0, inf),
+            speeds_mps=_full("speeds_mps", speeds_mps, (n, N), -inf, inf),
+            command_mps2=_full("command_mps2", command_mps2, (n, N), -inf, inf),
+            pair_hit=_full("pair_hit", np.asarray(pair_hit, np.float64), (n, N - 1), 0.0, 1.0) == 1.0,
+        )
+
+    def read_only(self) -> Worlds:
+        """Return the same worlds as read-only views."""
+        return self._each(_unwritable)
+
+    def on_road(self, friction: Floats, dry: Mapping[str, Floats] | None = None) -> Worlds:
+        """Return these worlds on a road with this ``friction`` [n]; capacities are at most ``friction * GRAVITY_MPS2``.
+
+        ``dry`` gives new capacities on a dry road, [n, N] by field name, for example ``{"braking_capacity_mps2":
+        array}``; fields that it does not name keep theirs.
+        """
+        on_dry = {name: self.dry(name) for name in _ON_ROADS} | dict(dry or {})
+        vehicles = replace(self.vehicles, **as_road_allows(on_dry, friction[:, np.newaxis]))
+        return replace(
+            self, vehicles=vehicles, road=np.concatenate([friction[:, np.newaxis], *on_dry.values()], axis=1)
+        )
+
+    @property
+    def friction(self) -> Floats:
+        """Friction coefficient of the road, [n]; infinite if no friction is modelled."""
+        return self.road[:, 0] if self.road.shape[1] else np.full(self.n, np.inf)
+
+    def dry(self, name: str) -> Floats:
+        """Return the field ``name`` of ``vehicles``, [n, N]; a braking or driving capacity as it is on a dry road."""
+        value: Floats = getattr(self.vehicles, name)
+        if self.road.shape[1] and name in _ON_ROADS:
+            begin = 1 + self.N * _ON_ROADS.index(name)
+            value = self.road[:, begin : begin + self.N]
+        return value
+
+    def play_pieces(self, pieces: Mapping[int, Sequence[tuple[float, float]]]) -> Worlds:
+        """Return these worlds with some vehicles braking in pieces, that is, by a fixed sequence of commands.
+
+        ``pieces`` maps a vehicle (index from 0) to its sequence of (start, braking): seconds after its latency, 0 for
+        the first piece; and deceleration in m/s2. Vehicles that it does not name do not brake in pieces, nor does a
+        vehicle with a single piece.
+        """
+        several = {i: np.array(each, np.float64) for i, each in pieces.items() if len(each) > 1}
+        if not several and not self.vehicles.pieces.shape[2]:
+            return self
+        most = max(map(len, several.values()), default=0)
+        found = np.full((self.n, self.N, 2, most), np.inf)
+        for i, each in several.items():
+            found[:, i, 0, : len(each)], found[:, i, 1, : len(each)] = each[:, 0], 0.0 - each[:, 1]
+        return replace(self, vehicles=replace(self.vehicles, pieces=found.reshape(self.n, self.N, 2 * most)))
+
+    def refuse_build_up(self, who: str) -> None:
+        """Raise ``InvalidInput`` if some vehicle has a finite brake or release rate, or follows a sequence of commands.
+
+        For callers that have no exact answer in these worlds. ``who`` names the caller in the message.
+        """
+        slow = self.vehicles.build_up
+        if self.vehicles.in_pieces.any():
+            raise InvalidInput(
+                f"{who}: a vehicle of world {int(np.argmax(self.vehicles.in_pieces))} brakes in pieces (profile), and"
+                " nothing exact is known for these; give a constant command"
+            )
+        if slow.any():
+            raise InvalidInput(
+                f"{who}: brakes of world {int(np.argmax(slow))} build up (brake_rate_mps3, release_rate_mps3), and"
+                " nothing exact is known for these; leave the rates out"
+            )
+
+    def first_decision_s(self, deciders: Sequence[int]) -> Floats:
+        """Return the time of the first decision, [n] s: the least latency of the ``deciders``, at least ``time_s``.
+
+        ``deciders`` are the indices (from 0) of the vehicles that choose their commands. Without deciders it is
+        ``time_s``.
+        """
+        if len(deciders) == 0:
+            return self.time_s.copy()
+        first: Floats = np.maximum(self.vehicles.latency_s[:, list(deciders)].min(axis=1), self.time_s)
+        return first
+
+    # The kernels treat the obstacle ahead of Vehicle 1 as one more vehicle in front, which nothing moves. Everywhere
+    # else the obstacle has columns of its own, so the vehicles keep their indices.
+
+    @property
+    def obstacle_ahead(self) -> Bools:
+        """Whether a world has an obstacle ahead of Vehicle 1, [n]."""
+        return np.isfinite(self.obstacle_gap_m)
+
+    def with_obstacle(self) -> Worlds:
+        """Return these worlds with the obstacle as vehicle 0, so that vehicle i becomes vehicle i + 1.
+
+        Every world must have an obstacle.
+        """
+
+        def ahead(value: float, columns: Floats) -> Floats:
+            return np.concatenate([np.full((len(columns), 1), value), columns], axis=1)
+
+        vehicles = self.vehicles
+        written_out = Vehicles.at_once(  # the physics needs no observations
+            ahead(0.0, vehicles.braking_capacity_mps2),
+            ahead(0.0, vehicles.driving_capacity_mps2),
+            ahead(0.0, vehicles.latency_s),
+            ahead(math.inf, vehicles.mass_t),
+            ahead(0.0, vehicles.speed_limit_mps),
+            vehicles.restitution,
+            ahead(math.inf, vehicles.brake_rate_mps3),
+            ahead(math.inf, vehicles.release_rate_mps3),
+            np.concatenate([np.full((self.n, 1, vehicles.pieces.shape[2]), np.inf), vehicles.pieces], axis=1),
+        )
+        return Worlds(
+            written_out,
+            np.concatenate([self.obstacle_gap_m[:, np.newaxis], self.gaps_m], axis=1),
+            ahead(0.0, self.speeds_mps),
+            self.time_s,
+            np.concatenate([self.obstacle_hit[:, np.newaxis], self.pair_hit], axis=1),
+            ahead(0.0, self.command_mps2),
+            np.full(self.n, np.inf),
+            np.zeros(self.n, np.bool_),
+            self.messages,
+            np.zeros((self.n, 0)),
+        )
+
+    def with_post_ahead(self, duration_s: Floats) -> Worlds:
+        """Return these worlds with an obstacle each: their own, or one out of Vehicle 1's reach for ``duration_s`` [n].
+
+        Worlds store gaps and speeds, not places. With the obstacle, the change of its gap is the distance that Vehicle
+        1 travels. An added obstacle changes no motion: it is farther away than ``T sqrt(2 E / m_1)``, the distance that
+        Vehicle 1 would travel in the duration T if it had all the energy E that the line can ever have. Impacts and
+        brakes only remove energy; driving adds at most ``m a v`` per second, and never above the speed limit.
+        """
+        vehicles = self.vehicles
+        driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
+        energy = sum_rows(vehicles.mass_t * (self.speeds_mps * self.speeds_mps / 2.0 + driving))
+        farthest = 1.01 * duration_s * np.sqrt(2.0 * energy / vehicles.mass_t[:, 0])
+        return replace(self, obstacle_gap_m=np.where(self.obstacle_ahead, self.obstacle_gap_m, farthest + 1.0))
+
+
+def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
+    """Return the batches ``parts``, made alike so that their columns can be joined.
+
+    All get columns for equally many pieces of braking; if some have a road, the others get one with infinite friction.
+    """
+    most = max(part.vehicles.pieces.shape[2] for part in parts)
+    if any(part.vehicles.pieces.shape[2] < most for part in parts):
+        parts = [
+            replace(part, vehicles=replace(part.vehicles, pieces=_padded(part.vehicles.pieces, most))) for part in parts
+        ]
+    if len({part.road.shape[1] for part in parts}) == 1:
+        return parts
+    return [part if part.road.shape[1] else part.on_road(part.friction) for part in parts]
+
+
+def _padded(pieces: Floats, most: int) -> Floats:
+    """Return ``pieces`` [n, N, 2 K] with added empty pieces (infinite entries), [n, N, most].
+
+    ``most`` is even: each piece has a start and a command.
+    """
+    n, N, width = pieces.shape
+    halves = pieces.reshape(n, N, 2, width // 2)
+    more = [(0, 0), (0, 0), (0, 0), (0, (most - width) // 2)]
+    return np.pad(halves, more, constant_values=np.inf).reshape(n, N, most)
+
+
+_OF_WORLDS = tuple(f.name for f in fields(Worlds))[1:]
+
+
+def _unwritable(array: NDArray[Any]) -> NDArray[Any]:
+    """Return a read-only view of ``array``; ``array`` itself stays writable."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def _span(values: Floats) -> str:
+    """Format the smallest and largest value; one value if they are equal, ``none`` if there are no values."""
+    if not values.size:
+        return "none"
+    low, high = float(values.min()), float(values.max())
+    return f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+
+
+def _combined(change: Callable[..., NDArray[Any]], *parts: Vehicles) -> Vehicles:
+    """Return new vehicles, each field of which is ``change(field of the first part, field of the second, ...)``.
+
+    ``change`` takes one array per part and returns one array: it selects or joins rows. If no part has a channel,
+    ``latency_s``, ``own_latency_s`` and ``known_from_s`` share one memory in the result, as in ``at_once``.
+    """
+    at_once = all(part._is_view for part in parts)
+    columns = [
+        change(*(getattr(part, name) for part in parts)) for name in (_WITHOUT_NEWS if at_once else _OF_VEHICLES)
+    ]
+    return Vehicles.at_once(*columns) if at_once else Vehicles(*columns)
+
+
+def sum_rows(values: Floats) -> Floats:
+    """Return ``values.sum(axis=1)`` to the same bits; faster for short rows, which NumPy adds entry by entry."""
+    if not 0 < values.shape[1] < 8:
+        total: Floats = values.sum(axis=1)
+        return total
+    total = values[:, 0].copy()
+    for column in values.T[1:]:
+        total += column
+    return total
+
+
+def real_numbers(value: ArrayLike) -> Floats:
+    """Return ``value`` as float64, without a copy if it already is.
+
+    Raises ``ValueError``, with the reason as its text, for anything that is not a number, even if numpy would convert
+    it: truth values, masked entries, texts, tensors that need gradients or are on another device.
+    """
+    if type(value) is np.ndarray and value.dtype.kind in "fiu":
+        return np.asarray(value, np.float64)
+    if isinstance(value, list | tuple):
+        parts = [real_numbers(part) for part in value]
+        if len({part.shape for part in parts}) > 1:
+            raise ValueError("has rows of different lengths")
+        return np.array(parts, np.float64)
+    if np.ma.is_masked(value):
+        raise ValueError("is masked")
+    if getattr(value, "requires_grad", False):
+        raise ValueError("needs gradients; pass its .detach()")
+    try:
+        array = np.asarray(value)
+        if array.dtype.hasobject and array.ndim > 0:
+            return real_numbers(list(array))
+        entry = array.item() if array.dtype.hasobject else None
+        if array.dtype.kind == "b" or isinstance(entry, bool | np.bool_):
+            raise ValueError("is a truth value")
+        if array.dtype.kind in "fiu" or hasattr(entry, "__float__"):
+            return array.astype(np.float64)
+    except (TypeError, RuntimeError, OverflowError):
+        pass
+    raise ValueError("is not a number")
+
+
+def checked_numbers(name: str, value: ArrayLike) -> Floats:
+    """Return ``value`` as a float64 array; raise ``InvalidInput`` with ``name`` and the value if it is not numeric."""
+    try:
+        return real_numbers(value)
+    except ValueError as error:
+        raise InvalidInput(f"{name} = {value!r}: {error}; must be a number or an array of numbers") from None
+
+
+def make_worlds(
+    gaps_m: ArrayLike,
+    speeds_mps: ArrayLike,
+    *,
+    braking_capacity_mps2: ArrayLike,
+    driving_capacity_mps2: ArrayLike,
+    latency_s: ArrayLike,
+    mass_t: ArrayLike,
+    restitution: ArrayLike,
+    speed_limit_mps: ArrayLike = 40.0,
+    brake_rate_mps3: ArrayLike = np.inf,
+    release_rate_mps3: ArrayLike = np.inf,
+    obstacle_gap_m: ArrayLike | None = None,
+    friction: ArrayLike | None = None,
+) -> Worlds:
+    """Build and check worlds at ``t = 0``; every parameter broadcasts to its full shape.
+
+    Args:
+        gaps_m: bumper to bumper, [n, P], [P] or one number, m.
+        speeds_mps: [n, N] or [N], m/s.
+        braking_capacity_mps2: largest deceleration, m/s2, broadcast to [n, N].
+        driving_capacity_mps2: largest forward acceleration, m/s2, broadcast to [n, N].
+        latency_s: time before which commands have no effect, s, broadcast to [n, N].
+        mass_t: mass, t, broadcast to [n, N].
+        restitution: coefficient of restitution of every impact, in [0, 1], broadcast to [n].
+        speed_limit_mps: speed up to which a vehicle drives, m/s, broadcast to [n, N].
+        brake_rate_mps3: rate at which the acceleration in force falls to a lower command, m/s3, broadcast to [n, N];
+            inf: at once.
+        release_rate_mps3: rate at which it rises to a higher command, m/s3, broadcast to [n, N]; inf: at once.
+        obstacle_gap_m: gap from Vehicle 1 to an obstacle ahead, m, broadcast to [n]; None: no obstacle.
+        friction: friction of the road, broadcast to [n]; it limits capacities to ``friction * GRAVITY_MPS2``. None: no
+            limit.
+
+    Raises ``InvalidInput`` with the field, the first invalid entry and the valid range.
+
+    """
+    speeds = np.atleast_2d(checked_numbers("speeds_mps", speeds_mps))
+    if speeds.ndim != 2 or speeds.shape[1] < 2:
+        raise InvalidInput(f"speeds_mps: shape {speeds.shape}; a line needs at least 2 vehicles, as [n, N]")
+    gaps = checked_numbers("gaps_m", gaps_m)
+    n = speeds.shape[0] if gaps.ndim < 2 else max(speeds.shape[0], gaps.shape[0])
+    N = speeds.shape[1]
+    restitution_ = _full("restitution", restitution, (n,), 0.0, 1.0)
+    vehicles = Vehicles.at_once(
+        _full("braking_capacity_mps2", braking_capacity_mps2, (n, N), 0.0, np.inf, open_low=True),
+        _full("driving_capacity_mps2", driving_capacity_mps2, (n, N), 0.0, np.inf),
+        _full("latency_s", latency_s, (n, N), 0.0, np.inf),
+        _full("mass_t", mass_t, (n, N), 0.0, np.inf, open_low=True),
+        _full("speed_limit_mps", speed_limit_mps, (n, N), 0.0, np.inf, open_low=True),
+        restitution_,
+        _full("brake_rate_mps3", brake_rate_mps3, (n, N), 0.0, np.inf, open_low=True, finite=False),
+        _full("release_rate_mps3", release_rate_mps3, (n, N), 0.0, np.inf, open_low=True, finite=False),
+    )
+    speeds = _full("speeds_mps", speeds, (n, N), 0.0, np.inf)
+    if not np.all(speeds <= vehicles.speed_limit_mps):
+        world, vehicle = np.argwhere(~(speeds <= vehicles.speed_limit_mps))[0]
+        raise InvalidInput(
+            f"speeds_mps[{world}, {vehicle}] = {speeds[world, vehicle]:g}: above this vehicle's"
+            f" speed_limit_mps {vehicles.speed_limit_mps[world, vehicle]:g}"
+        )
+    worlds = Worlds(
+        vehicles,
+        _full("gaps_m", gaps, (n, N - 1), 0.0, np.inf),
+        speeds,
+        np.zeros(n),
+        np.zeros((n, N - 1), dtype=np.bool_),
+        np.zeros((n, N)),
+        np.full(n, np.inf) if obstacle_gap_m is None else _full("obstacle_gap_m", obstacle_gap_m, (n,), 0.0, np.inf),
+        np.zeros(n, dtype=np.bool_),
+        np.zeros((n, 0)),
+        np.zeros((n, 0)),
+    )
+    return worlds if friction is None else worlds.on_road(_full("friction", friction, (n,), 0.0, np.inf, open_low=True))
+
+
+def _full(
+    name: str,
+    value: ArrayLike,
+    shape: tuple[int, ...],
+    low: float,
+    high: float,
+    *,
+    open_low: bool = False,
+    finite: bool = True,
+) -> Floats:
+    """Return a new array with ``value`` broadcast to ``shape``; raise ``InvalidInput`` for an entry out of range.
+
+    Args:
+        name: name of the field, for the message.
+        value: number or array.
+        shape: shape of the result.
+        low: least valid entry.
+        high: largest valid entry.
+        open_low: ``low`` itself is invalid.
+        finite: infinite entries are invalid.
+
+    """
+    given = checked_numbers(name, value)
+    try:
+        full = np.array(np.broadcast_to(given, shape), dtype=np.float64, order="C")
+    except ValueError:
+        raise InvalidInput(f"{name}: shape {given.shape} does not fit {shape}") from None
+    good = (
+        (np.isfinite(full) if finite else ~np.isnan(full))
+        & (full <= high)
+        & ((full > low) if open_low else (full >= low))
+    )
+    if not good.all():
+        at = tuple(int(k) for k in np.argwhere(~good)[0])
+        bracket = "(" if open_low else "["
+        finite_too = "finite and " if finite else ""
+        raise InvalidInput(f"{name}{list(at)} = {full[at]:g}: must be {finite_too}in {bracket}{low:g}, {high:g}]")
+    return full

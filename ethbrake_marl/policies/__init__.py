@@ -1,0 +1,1 @@
+"""Policies as plain files (JSON and safetensors, never a pickle), run without torch."""

@@ -1,0 +1,174 @@
+"""A policy in memory: its manifest, its tensors and its deterministic action."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import safetensors.numpy
+from pydantic import ValidationError
+from safetensors import SafetensorError
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.arrays import ArrayRow, check_arrays, safetensors_headers
+from ethbrake_marl.files.model import first_mistake
+from ethbrake_marl.files.store import new_folder, write_file
+from ethbrake_marl.game.observations import ObservationSpec
+from ethbrake_marl.policies.actor import Actor
+from ethbrake_marl.policies.manifest import Manifest, ObservationSchema, content_sha256, installed_versions
+from ethbrake_marl.policies.network_spec import Float32s
+from ethbrake_marl.policies.onnx_model import onnx_model
+
+MANIFEST = "manifest.json"
+
+WEIGHTS = "weights.safetensors"
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy in memory: manifest, tensors, and ``policy(observation)`` for the deterministic action.
+
+    >>> import ethbrake_marl as eb
+    >>> import numpy as np
+    >>> policy = eb.load_shipped("ppo")
+    >>> policy.manifest.algorithm, policy.observation.size
+    ('ppo', 27)
+    >>> policy(np.zeros((2, 27), np.float32)).shape
+    (2, 1)
+
+    """
+
+    manifest: Manifest  # network, observation, training, versions and hashes
+    tensors: Mapping[str, Float32s]  # weights and biases by name, see ``NetworkSpec.tensors``
+
+    def __repr__(self) -> str:
+        told, scenario = self.manifest, self.manifest.scenario.get("name")
+        return (
+            f"Policy({told.algorithm!r}, {self.observation.size} observations, {told.steps:,} steps on"
+            f" {scenario!r:.66}, sha256 {told.manifest_sha256[:12]})"
+        )
+
+    @cached_property
+    def _actor(self) -> Actor:
+        return Actor(self.manifest.network, self.tensors)
+
+    def __call__(self, observation: Float32s) -> Float32s:
+        """Map observation [n, F] float32 to action [n, A] float32 in [-1, 1]; row k depends on row k alone."""
+        return self._actor(observation)
+
+    @cached_property
+    def observation(self) -> ObservationSpec:
+        """The observation that this policy takes, with the time step of the scenario that it was trained on.
+
+        It is built from the feature names on first use. Raises ``UnknownName`` if a feature does not exist any more.
+        """
+        spec, step = self.manifest.observation.spec, self.manifest.scenario.get("time_step_s")
+        return spec.at_steps_of(float(step)) if isinstance(step, int | float) else spec
+
+    def policy_sha256(self) -> str:
+        """Return the hash of the policy (manifest and weights), as hexadecimal digits."""
+        return self.manifest.manifest_sha256
+
+    @property
+    def steps(self) -> int:
+        """Number of learners' decisions in training before the policy was saved."""
+        return self.manifest.steps
+
+    @property
+    def drivers(self) -> dict[str, Policy]:
+        """Vehicle -> policy for each vehicle that the policy learned to control: ``{"vehicle_2": policy}``."""
+        return dict.fromkeys(self.manifest.learners, self)
+
+    @classmethod
+    def make(
+        cls, tensors: Mapping[str, Float32s], *, observation: ObservationSpec | ObservationSchema, **manifest: Any
+    ) -> Self:
+        """Make a policy from tensors and the fields of its manifest; hashes and format are computed.
+
+        Args:
+            tensors: weights and biases by name, see ``NetworkSpec.tensors``.
+            observation: the observation that the networks take.
+            **manifest: the other fields of ``Manifest``; ``versions`` defaults to the installed versions.
+
+        Raises ``InvalidInput`` naming the tensor or field that does not fit.
+
+        """
+        data = _serialise(tensors)
+        seen = observation if isinstance(observation, ObservationSchema) else ObservationSchema.of(observation)
+        given = {"versions": installed_versions(), **manifest, "format_version": manifest["network"].format_version}
+        try:
+            weights = hashlib.sha256(data).hexdigest()
+            draft = Manifest(**given, observation=seen, weights_sha256=weights, manifest_sha256="0" * 64)
+            own = content_sha256(draft.model_dump(mode="json"))
+            checked = draft.model_copy(update={"manifest_sha256": own})
+            return cls(checked, checked_tensors(data, checked))
+        except ValidationError as error:
+            raise InvalidInput(f"policy: {first_mistake(error)}") from None
+        except ValueError as error:
+            raise InvalidInput(f"policy: {error}") from None
+
+    @property
+    def among(self) -> tuple[Policy, ...]:
+        """The policies that this policy's network chooses among (``NetworkSpec.among``); empty for most policies."""
+        follows = {"network", "observation", "format_version", "weights_sha256", "manifest_sha256"}
+        fields = self.manifest.model_dump(exclude=follows)
+        found = []
+        for k, network in enumerate(self.manifest.network.among, start=1):
+            start = f"among_{k}."
+            tensors = {name.removeprefix(start): each for name, each in self.tensors.items() if name.startswith(start)}
+            found.append(Policy.make(tensors, network=network, observation=self.manifest.observation, **fields))
+        return tuple(found)
+
+    @staticmethod
+    def stands_in(folder: Path) -> bool:
+        """Return whether ``folder`` contains the files of a policy bundle; they are not read."""
+        return all((folder / name).is_file() for name in (MANIFEST, WEIGHTS))
+
+    def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
+        """Write the bundle as a new folder, completely or not at all; raise ``AlreadyExists`` if the folder exists.
+
+        With ``replace`` an existing folder is deleted once the new one is written.
+        """
+        own = content_sha256(self.manifest.model_dump(mode="json"))  # keys of older versions are not written
+        manifest = self.manifest.model_copy(update={"manifest_sha256": own})
+        with new_folder(Path(folder), replace=replace) as partial:
+            write_file(partial / WEIGHTS, _serialise(self.tensors))
+            write_file(partial / MANIFEST, manifest.model_dump_json(indent=2).encode() + b"\n")
+
+    def to_onnx(self) -> bytes:
+        """Return the ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
+
+        The acceleration is the action times the own braking capacity (action below 0) or driving capacity (above 0),
+        both read from the observation. Results agree with this package's within rounding, not to the bit, because
+        products are summed in another order. Raises ``MissingExtra`` if the package onnx is not installed.
+        """
+        return onnx_model(self.manifest, self.observation, self.tensors)
+
+
+def _serialise(tensors: Mapping[str, Float32s]) -> bytes:
+    return safetensors.numpy.save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()})
+
+
+def checked_tensors(data: bytes, manifest: Manifest) -> dict[str, Float32s]:
+    """Load the tensors of a policy from safetensors ``data``, after checking names and shapes against its ``manifest``.
+
+    The result maps names to read-only arrays. Raises ``ValueError`` naming the first tensor that does not fit or is not
+    finite.
+    """
+    rows = [ArrayRow(row.name, "F32", row.shape) for row in manifest.network.tensors]
+    check_arrays(safetensors_headers(data), rows, "tensor")
+    try:
+        tensors = safetensors.numpy.load(data)
+    except SafetensorError as error:
+        raise ValueError(f"not a safetensors file ({error})") from None
+    for name, tensor in tensors.items():
+        if not np.isfinite(tensor).all():
+            raise ValueError(f"tensor {name!r} holds a number that is not finite")
+        tensor.setflags(write=False)
+    return tensors

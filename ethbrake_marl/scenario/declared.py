@@ -1,0 +1,506 @@
+"""``ScenarioFields``: the fields of a scenario file, and what follows from the fields alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from difflib import get_close_matches
+from functools import cached_property
+from operator import not_
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_validator
+from pydantic_core import PydanticCustomError
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, FileModel, refuse, require, suggestion
+from ethbrake_marl.files.yaml import YamlPath
+from ethbrake_marl.game.features import ListedFeatures, listed_features
+from ethbrake_marl.game.objectives import objectives_of
+from ethbrake_marl.physics.motion import stopping_distances
+from ethbrake_marl.physics.state import Floats, Ints, Worlds, as_road_allows
+from ethbrake_marl.scenario.channel import V2X, Equipage, Equipped
+from ethbrake_marl.scenario.distributions import LEAVE_OUT, AnyQuantity, AnyTypeQuantity, Quantity, TableColumn, support
+from ethbrake_marl.scenario.fields import ALSO, MEANING, QUANTITY, Entry, columns_of_table, is_tabled
+from ethbrake_marl.scenario.member import Member
+from ethbrake_marl.scenario.roles import LEARNER, Role, Roles, ScriptSpec
+from ethbrake_marl.scenario.vehicle_types import (
+    ANY,
+    LEFT_OUT,
+    ListedByVehicle,
+    ObjectiveName,
+    PerVehicle,
+    Table,
+    Types,
+    TypesOfLine,
+    VehicleTypes,
+)
+
+
+class ScenarioFields(FileModel):
+    """The declared fields of a scenario, and what follows from the declaration alone. See ``Scenario``."""
+
+    name: str = Field(pattern=NAME_PATTERN, description="name; equal to the file's name without .yaml")
+    title: str = Field(default="", description="one line for lists and figures")
+    description: str = Field(default="", description="what the scenario is for")
+    source: str = Field(default="", description="where the values come from")
+    vehicles: int = Field(default=3, ge=2, le=64, description="number of vehicles N, vehicle_1 in front")
+    vehicle_types: VehicleTypes | None = Field(
+        default=None, exclude_if=not_, description="what a car, a truck, ... is: type -> weight and quantities"
+    )
+    types: Types | None = Field(
+        default=None,
+        exclude_if=not_,
+        description="which types may stand where: a type, any, or a weight for each; one entry for all or one for each",
+    )
+    mixture: Annotated[tuple[Member, ...], Field(strict=False)] | None = Field(
+        default=None, exclude_if=not_, description="scenarios that each world is drawn from one of, by weight"
+    )
+    table: Table | None = Field(
+        default=None, exclude_if=not_, description="measured rows of which every world takes one; the rest is drawn"
+    )
+    time_step_s: float = Field(default=0.1, ge=1e-3, allow_inf_nan=False, description="time between two decisions")
+    horizon_s: float = Field(
+        default=8.0, gt=0.0, le=3600.0, allow_inf_nan=False, description="time after which an episode is cut off"
+    )
+    gaps_m: PerVehicle | None = Field(default=None, description=MEANING["gaps_m"])
+    time_gaps_s: PerVehicle | None = Field(default=None, description=MEANING["time_gaps_s"])
+    speeds_mps: PerVehicle | None = Field(default=None, description=MEANING["speeds_mps"])
+    line_speed_mps: Quantity | None = Field(default=None, description=MEANING["line_speed_mps"])
+    speed_deviations_mps: PerVehicle = Field(default=0.0, description=MEANING["speed_deviations_mps"])
+    braking_capacity_mps2: PerVehicle | None = Field(
+        default_factory=lambda: LEFT_OUT, validate_default=True, description=MEANING["braking_capacity_mps2"]
+    )
+    driving_capacity_mps2: PerVehicle | None = Field(
+        default_factory=lambda: LEFT_OUT, validate_default=True, description=MEANING["driving_capacity_mps2"]
+    )
+    mass_t: PerVehicle | None = Field(
+        default_factory=lambda: LEFT_OUT, validate_default=True, description=MEANING["mass_t"]
+    )
+    latency_s: PerVehicle | None = Field(
+        default_factory=lambda: LEFT_OUT, validate_default=True, description=MEANING["latency_s"]
+    )
+    speed_limit_mps: PerVehicle = Field(default=40.0, description=MEANING["speed_limit_mps"])
+    restitution: Quantity = Field(default=0.1, description=MEANING["restitution"])
+    roles: dict[str, Role] = Field(
+        default_factory=lambda data: Roles.complete(None, data.get("vehicles", 3)),
+        description="learner or a script for each vehicle; vehicles left out of a given mapping brake fully",
+    )
+    obstacle_gap_m: Quantity | None = Field(default=None, description=MEANING["obstacle_gap_m"])
+    obstacle_margin_m: Quantity | None = Field(default=None, description=MEANING["obstacle_margin_m"])
+    friction: Quantity | None = Field(default=None, exclude_if=not_, description=MEANING["friction"])
+    brake_rate_mps3: PerVehicle | None = Field(default=None, exclude_if=not_, description=MEANING["brake_rate_mps3"])
+    release_rate_mps3: PerVehicle | None = Field(
+        default=None, exclude_if=not_, description=MEANING["release_rate_mps3"]
+    )
+    alert_s: Quantity | None = Field(default=None, exclude_if=not_, description=MEANING["alert_s"])
+    early_impacts: Literal["keep", "reject"] = Field(
+        default="keep", description="what happens to worlds with an impact before the first learner may act"
+    )
+
+    objective: ObjectiveName | Annotated[tuple[ObjectiveName, ...], Field(strict=False)] = Field(
+        default="total", description="whose harm a reward counts: one for all vehicles, or one for each"
+    )
+    observation: ListedFeatures | ListedByVehicle | None = Field(
+        default=None,
+        exclude_if=not_,
+        description="what vehicles observe, or by name what each does: groups and single features, in this order",
+    )
+    v2x: V2X = Field(
+        default_factory=V2X, description="what each vehicle knows when: a preset, and what differs from it"
+    )
+
+    _members: tuple[ScenarioFields, ...] = PrivateAttr(default=())
+    _columns: dict[Entry, TableColumn] = PrivateAttr(default_factory=dict)  # columns of the table, by what they give
+
+    @model_validator(mode="after")
+    def _tabulated(self) -> ScenarioFields:
+        if self.table is not None:
+            known = columns_of_table(QUANTITY.declared, self.vehicles)
+            self._columns = {known[name]: column for name, column in self.table.column_values().items()}
+        return self
+
+    @classmethod
+    def of_dump(cls, content: Mapping[str, Any]) -> Self:
+        """Rebuild a scenario from the result of ``model_dump``, which also writes keys with default values.
+
+        Raises ``ValueError`` if the content is not a scenario.
+        """
+        usual = {key: (None, field.default) for key, field in cls.model_fields.items()}
+
+        def given(part: Any) -> Any:
+            if isinstance(part, Mapping):
+                return {key: given(value) for key, value in part.items() if value is not None}
+            return [given(each) for each in part] if isinstance(part, list | tuple) else part
+
+        usual["v2x"] = None, given(V2X().model_dump(mode="json"))  # next to a mixture it would apply to all members
+
+        def declared(scenario: Mapping[str, Any]) -> dict[str, Any]:
+            told = {key: given(value) for key, value in scenario.items() if given(value) not in usual.get(key, ())}
+            if "mixture" in told:
+                told["mixture"] = [{**each, "scenario": declared(each["scenario"])} for each in told["mixture"]]
+            return told
+
+        return cls.model_validate(declared(content))
+
+    @field_validator(
+        *QUANTITY.alternatives, *QUANTITY.alternatives.values(), *QUANTITY.optional, "alert_s", mode="before"
+    )
+    @classmethod
+    def _given(cls, value: Any) -> Any:
+        """Refuse ``null`` as the value of a quantity: a key that is not used must be left out."""
+        require(value is not None, (), value, LEAVE_OUT)
+        return value
+
+    @field_validator(*QUANTITY.needed, mode="before")
+    @classmethod
+    def _needed(cls, value: Any, info: ValidationInfo) -> Any:
+        """Require a value for a quantity without default, unless every vehicle type or the table gives it.
+
+        A mixture needs none either.
+        """
+        key, data = str(info.field_name), info.data
+        kinds = data.get("vehicle_types")
+        without = None if kinds is None else next((k for k, kind in kinds.items() if getattr(kind, key) is None), None)
+        if value is not LEFT_OUT:
+            require(value is not None, (), value, LEAVE_OUT)
+            require(kinds is None or without is not None, (), value, "every type declares it; leave it out")
+            return value
+        if data.get("mixture") is None and {"vehicle_types", "mixture"} <= data.keys() and not is_tabled(data, key):
+            if kinds is None:
+                raise PydanticCustomError("missing", "missing", {"at": ()})
+            right = f"type {without} does not declare it: give it there, or here for every type that does not"
+            require(without is None, (), UNSHOWN, right)
+        return None
+
+    @field_validator("vehicle_types", "types", "mixture", "table", mode="before")
+    @classmethod
+    def _not_empty(cls, value: Any) -> Any:
+        empty = value is None or (isinstance(value, dict | list | tuple) and not value)
+        require(not empty, (), value, "must not be empty; a key that is not used is left out")
+        return value
+
+    @field_validator("types")
+    @classmethod
+    def _types(cls, value: Any, info: ValidationInfo) -> Any:
+        """Check that every entry names declared types, and that a list has one entry per vehicle."""
+        if not {"vehicles", "vehicle_types"} <= info.data.keys():
+            return value
+        vehicles, kinds = info.data["vehicles"], info.data["vehicle_types"]
+        require(kinds is not None, (), value, "needs vehicle_types, which says what the types are")
+        listed = isinstance(value, tuple)
+        right = f"has {len(value)} entries; {vehicles} vehicles need {vehicles}, or one for all"
+        require(not listed or len(value) == vehicles, (), UNSHOWN, right)
+        for index, entry in enumerate(value if listed else (value,)):
+            at: YamlPath = (index,) if listed else ()
+            names = [entry] if isinstance(entry, str) else list(entry)
+            require(len(names) > 0, at, entry, "must name a type")
+            for name in names:
+                hint = suggestion(name, kinds) or f"known: {', '.join(kinds)}"
+                known = name in kinds or (name == ANY and isinstance(entry, str))
+                require(known, at, entry, f"unknown type {name}; {hint}")
+        return value
+
+    @field_validator("table")
+    @classmethod
+    def _columns_of_line(cls, value: Table | None, info: ValidationInfo) -> Table | None:
+        """Check that every column of the table exists for this line and that its numbers are in range."""
+        if value is None or "vehicles" not in info.data:
+            return value
+        known = columns_of_table({**QUANTITY.usual, **QUANTITY.optional}, info.data["vehicles"])
+        for name, column in value.column_values().items():
+            hint = suggestion(name, known) or f"known: {', '.join(known)}"
+            require(name in known, ("columns",), name, f"unknown column; {hint}")
+            rule = QUANTITY.declared[known[name][0]]
+            bad = [k for k, number in enumerate(column.rows.tolist()) if not rule.allows(number, number)]
+            at = ("rows", bad[0], value.columns.index(name)) if bad else ()
+            require(not bad, at, column.rows[bad[0]] if bad else 0.0, f"{name} must be {rule.interval}")
+        return value
+
+    @field_validator(*QUANTITY.declared)
+    @classmethod
+    def _entries(cls, value: Any, info: ValidationInfo) -> Any:
+        """Check that all possible values of a quantity are in range, and that a list has the right length."""
+        rule, vehicles = QUANTITY.declared[str(info.field_name)], info.data.get("vehicles")
+        if value is None:
+            return value
+        listed = isinstance(value, tuple)
+        if listed and vehicles is not None:
+            count, per = rule.count(vehicles), "one per pair" if rule.per == "pair" else "one per vehicle"
+            right = f"has {len(value)} entries; {vehicles} vehicles need {count} ({per}), or one for all"
+            require(len(value) == count, (), UNSHOWN, right)
+        for index, entry in enumerate(value if listed else (value,)):
+            low, high = support(entry)
+            overlap = "; a negative gap means overlapping vehicles" if rule.per == "pair" and low < 0.0 else ""
+            at = (index,) if listed else ()
+            require(rule.allows(low, high), at, entry, f"must be {rule.interval}{overlap}")
+        return value
+
+    @field_validator("roles")
+    @classmethod
+    def _roles(cls, value: dict[str, str], info: ValidationInfo) -> dict[str, str]:
+        vehicles = info.data.get("vehicles")
+        if vehicles is None:
+            return value
+        names = [f"vehicle_{i + 1}" for i in range(vehicles)]
+        for name, role in value.items():
+            close = [] if name.startswith("vehicle_") else get_close_matches(name, names, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"this scenario has vehicle_1 ... vehicle_{vehicles}"
+            require(name in names, (name,), role, f"unknown vehicle; {hint}")
+            try:
+                ScriptSpec.parse(role).is_state_free()
+            except InvalidInput as error:
+                refuse((name,), role, str(error))
+            require(not role.startswith(f"{LEARNER}:"), (name,), role, f"{LEARNER} takes no argument")
+        return Roles.complete(value, vehicles)
+
+    @field_validator("objective", mode="before")
+    @classmethod
+    def _objective(cls, value: Any, info: ValidationInfo) -> Any:
+        if "vehicles" in info.data:
+            try:
+                objectives_of(value, info.data["vehicles"])
+            except InvalidInput as error:
+                refuse((), value, str(error).removeprefix("objective: "))
+        return value
+
+    @field_validator("observation", mode="before")
+    @classmethod
+    def _observation(cls, value: Any, info: ValidationInfo) -> Any:
+        vehicles = info.data.get("vehicles", 0)
+        names = [f"vehicle_{i + 1}" for i in range(vehicles)]
+        for name, listed in value.items() if isinstance(value, dict) and value else [(None, value)]:
+            at = () if name is None else (name,)
+            right = f"unknown vehicle; this scenario has vehicle_1 ... vehicle_{vehicles}"
+            require(name is None or not names or name in names, at, UNSHOWN, right)
+            try:
+                listed_features(listed)
+            except InvalidInput as error:
+                refuse(at, listed, str(error).removeprefix("observation: "))
+        return value
+
+    @property
+    def members(self) -> tuple[ScenarioFields, ...]:
+        """The scenarios that a mixture consists of; empty for any other scenario."""
+        return self._members
+
+    @cached_property
+    def vehicle_names(self) -> tuple[str, ...]:
+        """Names ``vehicle_1`` (front) to ``vehicle_N`` (rear)."""
+        return tuple(f"vehicle_{i + 1}" for i in range(self.vehicles))
+
+    @property
+    def learners(self) -> tuple[int, ...]:
+        """Indices (from 0) of the vehicles that learn."""
+        return tuple(i for i, name in enumerate(self.vehicle_names) if self.roles[name] == LEARNER)
+
+    @property
+    def scripts(self) -> dict[int, str]:
+        """Index (from 0) -> script of every vehicle that does not learn."""
+        roles = [self.roles[name] for name in self.vehicle_names]
+        return {i: role for i, role in enumerate(roles) if role != LEARNER}
+
+    def play_pieces(self, worlds: Worlds, driven: Sequence[int] = ()) -> Worlds:
+        """Return these worlds with the pieces of ``profile`` scripts: braking by a fixed sequence of commands.
+
+        ``driven``: indices (from 0) of controlled vehicles, which follow no script.
+        """
+        return worlds.play_pieces({i: ScriptSpec.parse(s).pieces for i, s in self.scripts.items() if i not in driven})
+
+    @property
+    def has_obstacle(self) -> bool:
+        """Whether there is an obstacle ahead of Vehicle 1; for a mixture: in one of its scenarios or more."""
+        if self.members:
+            return any(member.has_obstacle for member in self.members)
+        return self.declares("obstacle_gap_m") or self.obstacle_margin_m is not None
+
+    @property
+    def has_friction(self) -> bool:
+        """Whether the friction of the road is declared; for a mixture: in one of its scenarios or more."""
+        return any(member.has_friction for member in self.members) or self.declares("friction")
+
+    @property
+    def builds_up(self) -> bool:
+        """Whether brakes may build up (have a finite rate); for a mixture: in one of its scenarios or more."""
+        own = self.declares("brake_rate_mps3") or self.declares("release_rate_mps3")
+        return own or any(member.builds_up for member in self.members)
+
+    def declares(self, field: str) -> bool:
+        """Return whether the scenario declares the quantity ``field``, for example ``"mass_t"``.
+
+        It may do so under the key itself, in a vehicle type, or for all vehicles in its table.
+        """
+        kinds = (self.vehicle_types or {}).values() if field in QUANTITY.of_a_type else ()
+        return (
+            getattr(self, field) is not None
+            or any(getattr(kind, field) is not None for kind in kinds)
+            or is_tabled({"table": self.table, "vehicles": self.vehicles}, field)
+        )
+
+    @property
+    def table_entries(self) -> dict[Entry, TableColumn]:
+        """Columns of the scenario's table, ``{("gaps_m", 0): column}`` by quantity and index; empty without one."""
+        return self._columns
+
+    @property
+    def by_link(self) -> bool:
+        """Whether the channel differs from the paper's rule: a vehicle knows everything after its own latency.
+
+        For a mixture: in one of its scenarios or more.
+        """
+        return any(member.by_link for member in self.members) or self.v2x.by_link
+
+    @property
+    def types_of_line(self) -> TypesOfLine | None:
+        """The vehicle types that are possible at each place of the line, and their weights; None without types."""
+        return None if self.vehicle_types is None else TypesOfLine(self.vehicle_types, self.types, self.vehicles)
+
+    def equipped(self, types: Ints | None = None) -> Equipped:
+        """Return the V2X equipment of the vehicles in worlds with these vehicle ``types`` (indices, [n, N]).
+
+        Without ``types``: one row, [1, N], with the equipment that every vehicle has at least, whatever its type.
+        """
+        line, each = self.types_of_line, []
+        own = self.v2x.vehicles or {}
+        for i, name in enumerate(self.vehicle_names):
+            kinds = [Equipage()] if line is None else [kind.v2x or Equipage() for kind in line.kinds]
+            if name in own:
+                kinds = [own[name]] * len(kinds)
+            here = Equipped.of(kinds)
+            if types is not None:
+                each.append((here.sends[0, types[:, i]], here.hears[0, types[:, i]]))
+            else:
+                possible = [0] if line is None else line.possible(i)
+                each.append((here.sends[:, possible].all(axis=1), here.hears[:, possible].max(axis=1)))
+        sends, hears = zip(*each, strict=True)
+        return Equipped(np.stack(sends, axis=1), np.stack(hears, axis=1))
+
+    def possible_quantities(self, field: str) -> tuple[dict[int, AnyTypeQuantity], ...]:
+        """Return the declarations of a quantity by vehicle type, one mapping for each vehicle, pair or world.
+
+        For example ``({0: 2.0, 1: 9.5}, ...)`` for ``mass_t``. The keys are indices of the types that are possible
+        there; without types the only one is 0. A type that does not declare the quantity gets the declaration outside
+        the types. Raises like ``quantities``.
+        """
+        line = self.types_of_line
+        if line is None or field not in QUANTITY.of_a_type:
+            return tuple({0: each} for each in self.quantities(field))
+        found: list[dict[int, AnyTypeQuantity]] = []
+        for i in range(self.vehicles):
+            if (field, i) in self.table_entries:
+                found.append({0: self.table_entries[field, i]})
+                continue
+            own = {kind: getattr(line.kinds[kind], field) for kind in line.possible(i)}
+            found.append({kind: self.quantities(field)[i] if each is None else each for kind, each in own.items()})
+        return tuple(found)
+
+    def supports(self, field: str) -> tuple[tuple[float, float], ...]:
+        """Return (smallest, largest) value of the quantity ``field`` for each vehicle, pair or world.
+
+        All vehicle types that are possible are considered.
+        """
+        found = []
+        for each in self.possible_quantities(field):
+            lows, highs = zip(*(support(quantity) for quantity in each.values()), strict=True)
+            found.append((min(lows), max(highs)))
+        return tuple(found)
+
+    def quantities(self, field: str) -> tuple[AnyQuantity, ...]:
+        """Return the declaration of the quantity ``field``: a number or distribution for each vehicle, pair or world.
+
+        Gaps have one entry per pair; restitution and line speed have one per world. Raises ``InvalidInput`` for a key
+        that this scenario does not use, for example ``gaps_m`` if ``time_gaps_s`` is given.
+        """
+        declared: AnyQuantity | tuple[AnyQuantity, ...] | None = getattr(self, QUANTITY.declared[field].name)
+        if self.members:
+            raise InvalidInput(f"scenario {self.name!r}: is a mixture; its members say what {field} is")
+        if declared is None and not self.declares(field):
+            raise InvalidInput(f"scenario {self.name!r}: {field} is not given; it is derived, see Scenario.bounds")
+        count = QUANTITY.declared[field].count(self.vehicles)
+        entries: tuple[Any, ...] = declared if isinstance(declared, tuple) else (declared,) * count
+        return tuple(self.table_entries.get((field, i), entry) for i, entry in enumerate(entries))
+
+    def bounds(self, field: str, *, dry: bool = False) -> tuple[tuple[float, float], ...]:
+        """Return (smallest, largest) value of a quantity, for each vehicle, pair or world, however it is declared.
+
+        Args:
+            field: key of the quantity as a world has it: ``gaps_m``, ``speeds_mps``, ``mass_t``, ...
+            dry: do not limit braking and driving capacities by the friction of the road.
+
+        """
+        found = [world_quantities(member, _supports_of(member)) for member in self.members or (self,)]
+        at_once = np.full((2, self.vehicles), QUANTITY.declared[field].high)  # for members that declare no rate
+        lows, highs = zip(*((each if dry else on_road(each)).get(field, at_once) for each in found), strict=True)
+        return tuple(zip(np.min(lows, axis=0).tolist(), np.max(highs, axis=0).tolist(), strict=True))
+
+    @property
+    def farthest_obstacle_m(self) -> float:
+        """Largest possible distance (m) from Vehicle 1 to an obstacle that is declared by ``obstacle_margin_m``."""
+        found = on_road(world_quantities(self, _supports_of(self)))
+        low, high = ({key: bounds[[row]] for key, bounds in found.items()} for row in (0, 1))
+        slowest = high | {key: low[key] for key in ("braking_capacity_mps2", "brake_rate_mps3") if key in low}
+        farthest = obstacle_gap(self, slowest, lambda key: np.array([support(self.quantities(key)[0])[1]]))
+        assert farthest is not None
+        return float(farthest[0])
+
+
+def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]) -> dict[str, Floats]:
+    """Return every quantity of k worlds, [k, entries] each, from the declared ones.
+
+    Derived quantities are ``speed = line speed + own deviation`` and ``gap = time gap x speed of the pair's rear
+    vehicle``. Both increase with their inputs, so bounds of the declared values give bounds of the derived ones.
+
+    Args:
+        scenario: the scenario that declares the quantities.
+        declared: function of a key such as ``"time_gaps_s"`` that returns its values in the k worlds, [k, entries].
+
+    """
+    other = {"gaps_m": scenario.time_gaps_s, "speeds_mps": scenario.line_speed_mps}
+    found = {key: declared(key) for key in QUANTITY.usual if other.get(key) is None}
+    if scenario.alert_s is not None:
+        found["latency_s"] = found["latency_s"] + declared("alert_s")
+    for key in ALSO:
+        if scenario.declares(key):
+            found[key] = declared(key)
+    if scenario.line_speed_mps is not None:
+        found["speeds_mps"] = declared("line_speed_mps") + declared("speed_deviations_mps")
+    if scenario.time_gaps_s is not None:
+        found["gaps_m"] = declared("time_gaps_s") * found["speeds_mps"][:, 1:]
+    return {key: found[key] for key in (*QUANTITY.usual, *ALSO) if key in found}
+
+
+def on_road(found: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Return the quantities of worlds with capacities limited by friction: at most friction times gravity.
+
+    ``found`` maps keys such as ``"friction"`` and ``"braking_capacity_mps2"`` to values, [k, entries]. Without friction
+    nothing is limited.
+    """
+    return as_road_allows(found, found["friction"]) if "friction" in found else dict(found)
+
+
+def obstacle_gap(
+    scenario: ScenarioFields, found: Mapping[str, Floats], declared: Callable[[str], Floats]
+) -> Floats | None:
+    """Return the distance from Vehicle 1 to the obstacle ahead in k worlds, [k] m; None without an obstacle.
+
+    The distance is declared, or it is ``margin + v_1 tau_1 + v_1^2 / (2 a_1)``: the margin beyond the point where
+    Vehicle 1 stops by full braking.
+
+    Args:
+        scenario: the scenario that declares the obstacle.
+        found: other quantities of these worlds, [k, entries] by key.
+        declared: function of ``"obstacle_gap_m"`` or ``"obstacle_margin_m"`` that returns its value in each world, [k].
+
+    """
+    if scenario.declares("obstacle_gap_m"):
+        return declared("obstacle_gap_m")
+    if scenario.obstacle_margin_m is None:
+        return None
+    speed, latency, capacity = (found[key][:, 0] for key in ("speeds_mps", "latency_s", "braking_capacity_mps2"))
+    rate = found["brake_rate_mps3"][:, 0] if "brake_rate_mps3" in found else np.full(len(speed), np.inf)
+    return declared("obstacle_margin_m") + stopping_distances(speed, latency, capacity, rate)
+
+
+def _supports_of(scenario: ScenarioFields) -> Callable[[str], Floats]:
+    """Return a function: key of a quantity -> smallest and largest value for each vehicle or pair, [2, entries]."""
+    return lambda key: np.array(scenario.supports(key)).T

@@ -1,0 +1,310 @@
+"""A quantity of a scenario: a fixed number, or a declared distribution.
+
+Each distribution is drawn from one uniform number ``u`` in [0, 1), by its inverse cumulative distribution function. So
+a quantity uses exactly one uniform number, whatever its distribution is.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field as data_field, replace
+from operator import not_
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Discriminator, Field, PrivateAttr, Tag, ValidationError, field_validator, model_validator
+
+from ethbrake_marl.files.model import FileModel, refuse, require
+from ethbrake_marl.physics.elementary import exp_each, log, normal_probability, normal_quantile_each
+from ethbrake_marl.physics.state import Floats
+
+LEAVE_OUT = "must be a number or a distribution; a key that is not used is left out"
+
+LEAST_MASS = 1e-6  # least probability of a normal distribution within its bounds; below, the inverse loses precision
+
+_LEAST = f"[low, high] must hold at least {LEAST_MASS:g} of the untruncated distribution"
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+
+Pair = Annotated[tuple[Number, Number], Field(strict=False)]
+
+Numbers = Annotated[tuple[Number, ...], Field(strict=False, min_length=1)]
+
+
+class _Distribution(FileModel):
+    """Base class of the distributions, such as ``Uniform``, that a scenario file may name for a quantity.
+
+    A subclass declares its parameters as fields, and defines two members: the property ``support``, which is the
+    smallest and largest possible value; and ``value(u)``, which turns uniform numbers ``u`` in [0, 1) into values.
+    """
+
+
+class Uniform(_Distribution):
+    """``{uniform: [low, high]}``: uniform distribution from low to high."""
+
+    uniform: Pair = Field(description="[low, high]")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Uniform:
+        require(self.uniform[0] <= self.uniform[1], ("uniform",), self.uniform, "low must not be above high")
+        return self
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest possible value."""
+        return self.uniform
+
+    def value(self, u: Floats) -> Floats:
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape: ``low + (high - low) u``.
+
+        A value is never above high: u is at most 1 - 2^-53, so (high - low) u rounds to less than the rounded high -
+        low.
+        """
+        low, high = self.uniform
+        return low + (high - low) * u
+
+
+class LogUniform(_Distribution):
+    """``{loguniform: [low, high]}``: the logarithm is uniform, so 1 to 2 is as likely as 2 to 4."""
+
+    loguniform: Pair = Field(description="[low, high], both above 0")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> LogUniform:
+        low, high = self.loguniform
+        require(low > 0.0, ("loguniform",), self.loguniform, "low must be above 0")
+        require(low <= high, ("loguniform",), self.loguniform, "low must not be above high")
+        return self
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest possible value."""
+        return self.loguniform
+
+    def value(self, u: Floats) -> Floats:
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape: ``low (high / low)^u``."""
+        low, high = self.loguniform
+        return np.clip(low * exp_each((u * log(high / low)).ravel()).reshape(u.shape), low, high)
+
+
+class NormalShape(_Distribution):
+    """Mean and standard deviation of a normal distribution before truncation, and the bounds of the truncation."""
+
+    mean: Number  # before truncation
+    sd: Number  # standard deviation before truncation
+    low: Number  # smallest possible value
+    high: Number  # largest possible value
+
+
+class Normal(_Distribution):
+    """``{normal: {mean, sd, low, high}}``: a normal distribution truncated to [low, high]."""
+
+    normal: NormalShape  # its parameters
+
+    @model_validator(mode="after")
+    def _possible(self) -> Normal:
+        shape = self.normal
+        require(shape.sd > 0.0, ("normal",), shape, "sd must be above 0")
+        require(shape.low < shape.high, ("normal",), shape, "low must be below high")
+        below, above = self._bounds()
+        require(above - below >= LEAST_MASS, ("normal",), shape, _LEAST)
+        return self
+
+    def _bounds(self) -> tuple[float, float]:
+        """Return the probabilities that the untruncated distribution is below low, and below high."""
+        shape = self.normal
+        low, high = (normal_probability((end - shape.mean) / shape.sd) for end in (shape.low, shape.high))
+        return low, high
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest possible value."""
+        return self.normal.low, self.normal.high
+
+    def value(self, u: Floats) -> Floats:
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+
+        A value is ``mean + sd Q(p_low + (p_high - p_low) u)``; Q is the normal quantile, p_low and p_high are the
+        probabilities of being below the bounds.
+        """
+        shape = self.normal
+        below, above = self._bounds()
+        quantile = normal_quantile_each((below + (above - below) * u).ravel()).reshape(u.shape)
+        return np.clip(shape.mean + shape.sd * quantile, shape.low, shape.high)
+
+
+class LogNormalShape(_Distribution):
+    """Median and standard deviation of the logarithm, before truncation, and the bounds of the truncation."""
+
+    median: Number  # before truncation
+    sigma: Number  # standard deviation of the logarithm, before truncation
+    low: Number  # smallest possible value
+    high: Number  # largest possible value
+
+
+class LogNormal(_Distribution):
+    """``{lognormal: {median, sigma, low, high}}``: the logarithm is normal; truncated to [low, high]."""
+
+    lognormal: LogNormalShape  # its parameters
+    _of_logarithm: Normal = PrivateAttr()  # distribution of the logarithm
+
+    @model_validator(mode="after")
+    def _possible(self) -> LogNormal:
+        shape, at = self.lognormal, ("lognormal",)
+        require(min(shape.median, shape.low) > 0.0, at, shape, "median and low must be above 0")
+        require(shape.sigma > 0.0, at, shape, "sigma must be above 0")
+        require(shape.low < shape.high, at, shape, "low must be below high")
+        middle, low, high = (log(value) for value in (shape.median, shape.low, shape.high))
+        try:
+            self._of_logarithm = Normal(normal={"mean": middle, "sd": shape.sigma, "low": low, "high": high})  # type: ignore[arg-type]
+        except ValidationError:
+            refuse(at, shape, _LEAST)
+        return self
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest possible value."""
+        return self.lognormal.low, self.lognormal.high
+
+    def value(self, u: Floats) -> Floats:
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+
+        A value is ``exp(x)``; x has the truncated normal distribution of the logarithm.
+        """
+        drawn = exp_each(self._of_logarithm.value(u).ravel()).reshape(u.shape)
+        return np.clip(drawn, *self.support)
+
+
+class Choice(_Distribution):
+    """``{choice: [a, b, ...]}``: one of these values, with equal probability or in proportion to ``weights: [...]``."""
+
+    choice: Numbers  # the possible values
+    weights: Numbers | None = None  # weight of each value; None: equal
+
+    @model_validator(mode="after")
+    def _weighted(self) -> Choice:
+        if self.weights is not None:
+            fits = f"must have as many entries as choice, {len(self.choice)}"
+            require(len(self.weights) == len(self.choice), ("weights",), self.weights, fits)
+            positive = all(w > 0.0 for w in self.weights) and math.isfinite(sum(self.weights))
+            require(positive, ("weights",), self.weights, "every weight must be above 0, and their sum finite")
+        return self
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest possible value."""
+        return min(self.choice), max(self.choice)
+
+    def value(self, u: Floats) -> Floats:
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+
+        It is the first entry whose cumulative weight (of a total of 1) is above u.
+        """
+        cumulative = np.cumsum(np.asarray(self.weights or (1.0,) * len(self.choice)))
+        cumulative /= cumulative[-1]
+        return np.asarray(self.choice)[np.searchsorted(cumulative, u, side="right")]
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class TableColumn:
+    """A column of a scenario's table of measured values; every world takes one row of the table, by weight."""
+
+    name: str  # name of the column, such as ``gap_1_m``
+    rows: Floats = data_field(compare=False)  # [rows] value in each row of the table
+    cumulative: Floats = data_field(compare=False)  # [rows] cumulative weight of the rows, up to 1
+
+    def __repr__(self) -> str:
+        return f"column {self.name} of the table"
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest possible value."""
+        return float(self.rows.min()), float(self.rows.max())
+
+    @property
+    def middle(self) -> TableColumn:
+        """Column whose only row is the weighted median of this column."""
+        order = np.argsort(self.rows, kind="stable")
+        shares = np.cumsum(np.diff(self.cumulative, prepend=0.0)[order])
+        return replace(self, rows=self.rows[order][[np.searchsorted(shares, 0.5)]], cumulative=np.ones(1))
+
+    def value(self, u: Floats) -> Floats:
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+
+        It is the value of the first row whose cumulative weight is above u.
+        """
+        found: Floats = self.rows[np.searchsorted(self.cumulative, u, side="right")]
+        return found
+
+
+def _kind(value: object) -> str | None:
+    """Return the tag of the kind of ``Quantity`` that a value from a file means, such as ``"#uniform"``.
+
+    None for a list, or a mapping without a known distribution. The tag decides which error messages are shown.
+    """
+    if isinstance(value, _Distribution):
+        return f"#{type(value).__name__.lower()}"
+    if isinstance(value, dict):
+        return next((f"#{name}" for name in DISTRIBUTIONS if name in value), None)
+    return None if isinstance(value, list | tuple) else "#number"
+
+
+DISTRIBUTIONS = ("uniform", "loguniform", "normal", "lognormal", "choice")
+
+# Tags begin with # to distinguish them from keys in the location of an error.
+Quantity = Annotated[
+    Annotated[Number, Tag("#number")]
+    | Annotated[Uniform, Tag("#uniform")]
+    | Annotated[LogUniform, Tag("#loguniform")]
+    | Annotated[Normal, Tag("#normal")]
+    | Annotated[LogNormal, Tag("#lognormal")]
+    | Annotated[Choice, Tag("#choice")],
+    Discriminator(_kind, custom_error_type="quantity", custom_error_message="no such quantity"),
+]
+
+
+class WithLoad(_Distribution):
+    """``{with_load: [empty, full]}``, in a vehicle type only: a linear function of the vehicle's load, from 0 to 1.
+
+    ``spread`` is a distribution around 0 of a random amount that each vehicle adds.
+    """
+
+    with_load: Pair = Field(description="[empty, full]: at load 0 and at load 1")
+    spread: Quantity = Field(default=0.0, exclude_if=not_, description="what each vehicle adds to it by chance")
+
+    @field_validator("spread")
+    @classmethod
+    def _spreads(cls, value: Any) -> Any:
+        right = "must be a distribution around 0, such as {uniform: [-0.3, 0.3]}"
+        require(not isinstance(value, float), (), value, right)
+        return value
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest possible value."""
+        low, high = support(self.spread)
+        return min(self.with_load) + low, max(self.with_load) + high
+
+    def value(self, load: Floats, u: Floats) -> Floats:
+        """Return ``empty + (full - empty) load``, plus the random amount that the uniform numbers ``u`` give.
+
+        ``load`` in [0, 1] and ``u`` in [0, 1) have the same shape, as has the result.
+        """
+        empty, full = self.with_load
+        moved = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))
+        return moved if self.spread == 0.0 else moved + values(self.spread, u)
+
+
+AnyQuantity = float | Uniform | LogUniform | Normal | LogNormal | Choice | TableColumn
+
+AnyTypeQuantity = AnyQuantity | WithLoad
+
+
+def support(quantity: AnyTypeQuantity) -> tuple[float, float]:
+    """Return the smallest and largest value that ``quantity`` can have."""
+    return (quantity, quantity) if isinstance(quantity, float) else quantity.support
+
+
+def values(quantity: AnyQuantity, u: Floats) -> Floats:
+    """Return the values of ``quantity`` drawn by uniform numbers ``u`` in [0, 1), in the shape of ``u``."""
+    return np.full(u.shape, quantity) if isinstance(quantity, float) else quantity.value(u)

@@ -1,0 +1,134 @@
+"""Mixtures of scenarios: each world is drawn from one of them, the *members*, and equals this member's own world.
+
+The member is drawn by weight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.yaml import Document, flow_text
+from ethbrake_marl.scenario.declared import ScenarioFields
+from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.member import Member
+
+WORDS = ("title", "description", "source")
+
+_OWN = {"name", *WORDS, "mixture"}  # the mixture's own keys; every other key applies to all members
+
+_ONE_FOR_ALL = ("vehicles", "time_step_s", "horizon_s", "roles", "objective", "observation")
+
+_SHARED = (*_ONE_FOR_ALL, "v2x", "early_impacts")  # keys that the mixture takes over if all members agree
+
+AnyScenario = TypeVar("AnyScenario", bound=ScenarioFields)
+
+
+def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``content`` of a scenario file with the keys and values of ``changes``.
+
+    A new way to declare gaps or speeds replaces the old one: with ``time_gaps_s`` in the changes, ``gaps_m`` is
+    dropped.
+    """
+    old = {key for pair in QUANTITY.alternatives.items() for key in pair if changes.keys() & set(pair)}
+    if "speeds_mps" in changes:
+        old.add("speed_deviations_mps")
+    return {**{key: value for key, value in content.items() if key not in old}, **changes}
+
+
+def build_members(
+    document: Document, build: Callable[[Document], AnyScenario]
+) -> tuple[Document, tuple[AnyScenario, ...]]:
+    """Build the scenarios that the ``mixture`` of a file lists; return the completed document and these scenarios.
+
+    Keys next to ``mixture`` replace those of every listed scenario. Keys in which all scenarios agree are added to the
+    document. An invalid list gives the document unchanged and no scenarios; the schema refuses it later. Raises
+    ``InvalidInput`` naming the invalid scenario, or the key in which two of them differ.
+
+    Args:
+        document: parsed file with a key ``mixture``.
+        build: function that builds one scenario from a document.
+
+    """
+    listed, content = document.content["mixture"], document.content
+    if not (isinstance(listed, list | tuple) and listed and all(_is_whole(entry) for entry in listed)):
+        return document, ()
+    fields = set(ScenarioFields.model_fields) - _OWN - {"vehicles"}
+    beside = {key: value for key, value in content.items() if key in fields}
+    members = tuple(build(_member_document(document, i, entry, beside)) for i, entry in enumerate(listed))
+    _check_members(document, members)
+    mixture = [{**entry, "scenario": member_content(member)} for entry, member in zip(listed, members, strict=True)]
+    own = {key: value for key, value in content.items() if key not in beside}
+    told = [member.model_dump(mode="json", include=set(_SHARED), exclude_none=True) for member in members]
+    shared = {key: value for key, value in told[0].items() if all(each.get(key) == value for each in told)}
+    return Document(document.file, {**own, **shared, "mixture": mixture}, document.lines), members
+
+
+def _is_whole(entry: Any) -> bool:
+    known = Member.model_fields.keys()  # the schema reports an unknown key
+    return isinstance(entry, dict) and isinstance(entry.get("scenario"), dict) and entry.keys() <= known
+
+
+def member_content(member: ScenarioFields) -> dict[str, Any]:
+    """Return everything that determines the worlds of one scenario of a mixture, as plain data.
+
+    These are declared values and shared settings, without title, description and source.
+    """
+    declared = member.model_dump(mode="json", exclude_unset=True, exclude_none=True, exclude=set(WORDS))
+    return {**declared, **member.model_dump(mode="json", include=set(_SHARED), exclude_none=True)}
+
+
+def _member_document(document: Document, i: int, entry: Mapping[str, Any], beside: Mapping[str, Any]) -> Document:
+    """Return the document of one scenario of a mixture, without texts, with its line numbers.
+
+    Args:
+        document: parsed file of the mixture.
+        i: position of the scenario in its list.
+        entry: the list's entry at this position.
+        beside: keys next to the mixture, which replace those of the scenario.
+
+    """
+    own = {key: value for key, value in entry["scenario"].items() if key not in WORDS}
+    inside = {path[3:]: line for path, line in document.lines.items() if path[:3] == ("mixture", i, "scenario")}
+    own = {**{key: document.content[key] for key in ("vehicles",) if key in document.content}, **own}
+    above = {path: line for path, line in document.lines.items() if path and path[0] in beside}
+    where = f"{document.file}: mixture[{i}] ({own.get('name', 'without a name')})"
+    return Document(where, changed_content(own, beside), {**inside, **above})
+
+
+def _check_members(document: Document, members: Sequence[ScenarioFields]) -> None:
+    """Raise ``InvalidInput`` if the scenarios ``members`` of a mixture cannot be drawn together.
+
+    None may be a mixture, their names must differ, and they must fit into one batch. ``document``: the mixture's file,
+    for messages.
+    """
+    where = f"{document.where(('mixture',))}: mixture"
+    first = members[0]
+    if (given := document.content.get("vehicles", first.vehicles)) != first.vehicles:
+        raise InvalidInput(
+            f"{where}: vehicles = {given}: its scenarios have {first.vehicles}, which nothing beside them can change"
+        )
+    for k, member in enumerate(members):
+        if member.members:
+            raise InvalidInput(f"{where}[{k}]: {member.name} is a mixture itself; list its scenarios here")
+        if member.name in [other.name for other in members[:k]]:
+            raise InvalidInput(f"{where}[{k}]: {member.name} is given twice; give it once, with the sum of the weights")
+        for key in _ONE_FOR_ALL:
+            one, other = (_told(each, key) for each in (first, member))
+            if one != other:
+                way = "" if key == "vehicles" else f"; give {key} beside mixture, and it holds for all"
+                raise InvalidInput(
+                    f"{where}: {key} must be the same in all: {first.name} has {one}, {member.name} has {other}{way}"
+                )
+        samples = [each.v2x.channel.samples(each.time_step_s) for each in (first, member)]
+        if samples[0] != samples[1]:
+            raise InvalidInput(
+                f"{where}: v2x.persistence must be the same in all, and so must the delay of periodic messages:"
+                f" {first.name} and {member.name} differ; give v2x beside mixture, and it holds for all"
+            )
+
+
+def _told(scenario: ScenarioFields, key: str) -> str:
+    value = getattr(scenario, key)
+    return "nothing" if value is None else flow_text(dict(value) if key == "roles" else value, 120)

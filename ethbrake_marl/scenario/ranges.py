@@ -1,0 +1,125 @@
+"""The random numbers of a scenario as a unit cube, with one coordinate per number that it draws."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics.state import Bools, Floats
+from ethbrake_marl.scenario.declared import ScenarioFields, world_quantities
+from ethbrake_marl.scenario.distributions import AnyTypeQuantity, TableColumn, WithLoad, support
+from ethbrake_marl.scenario.fields import (
+    BLOCK,
+    BRAKES,
+    OBSTACLE,
+    OF_WORLD,
+    PER_TYPE,
+    QUANTITY,
+    ROW,
+    SURROUNDINGS,
+    TYPES,
+    Place,
+)
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.sampling import early_impact, sample_by
+
+_UNUSED = 0.5  # value of uniform numbers without effect
+
+
+@dataclass(frozen=True, slots=True)
+class Ranges:
+    """The numbers that a scenario draws, as coordinates of a unit cube: names and places."""
+
+    scenario: ScenarioFields  # the scenario that draws them
+    names: tuple[str, ...]  # name of each coordinate, such as ``mass_t of vehicle_1``
+    places: tuple[Place, ...]  # stream and column of each coordinate among a world's uniform numbers
+
+    def sample(self, points: Floats) -> tuple[Sample, Bools]:
+        """Return the worlds at ``points`` of the unit cube, and whether the scenario accepts each, [n].
+
+        A scenario that rejects early impacts does not accept a world that has one.
+
+        Args:
+            points: coordinates in [0, 1) in the order of ``names``, [n, coordinates].
+
+        """
+        n, vehicles = len(points), self.scenario.vehicles
+        widths = {(): BLOCK * vehicles, TYPES: PER_TYPE * vehicles, OBSTACLE: OF_WORLD, SURROUNDINGS: OF_WORLD}
+        widths[BRAKES] = widths[()]
+        streams = {of: np.full((n, width), _UNUSED) for of, width in widths.items()}
+        for (of, column), u in zip(self.places, points.T, strict=True):
+            streams[of][:, column] = u
+        found = sample_by(self.scenario, lambda _, of: streams[of], np.arange(n, dtype=np.int64))
+        if self.scenario.early_impacts == "keep" or not self.scenario.learners:
+            return found, np.ones(n, np.bool_)
+        return found, ~early_impact(self.scenario, found.worlds)
+
+
+def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:
+    """Return name -> (stream, column) of the uniform number of every quantity that the scenario draws."""
+    used: list[str] = []
+
+    def note(key: str) -> Floats:
+        used.append(key)
+        return np.ones((1, len(scenario.possible_quantities(key))))
+
+    world_quantities(scenario, note)
+    used += [key for key in ("obstacle_gap_m", "obstacle_margin_m") if getattr(scenario, key) is not None]
+    places: dict[str, Place] = {
+        _name(key, i): QUANTITY.declared[key].place(i)
+        for key in used
+        for i, possible in enumerate(scenario.possible_quantities(key))
+        if any(_drawn(entry.spread if isinstance(entry, WithLoad) else entry) for entry in possible.values())
+    }
+    if any(_drawn(column, tabled=True) for column in scenario.table_entries.values()):
+        places["row of the table"] = ROW
+    return places
+
+
+def _of_types(scenario: ScenarioFields) -> dict[str, Place]:
+    """Return name -> (stream, column) of the uniform numbers of each vehicle's type and load.
+
+    Only of those that have an effect: a type that is drawn, and a load on which some quantity depends.
+    """
+    if scenario.types_of_line is None:
+        return {}
+    places: dict[str, Place] = {}
+    for i, vehicle in enumerate(scenario.vehicle_names):
+        possible = [scenario.possible_quantities(key)[i] for key in QUANTITY.of_a_type if scenario.declares(key)]
+        if any(len(each) > 1 for each in possible):
+            places[f"{vehicle} type"] = (TYPES, PER_TYPE * i)
+        if any(isinstance(entry, WithLoad) for each in possible for entry in each.values()):
+            places[f"{vehicle} load"] = (TYPES, PER_TYPE * i + 1)
+    return places
+
+
+def _drawn(entry: AnyTypeQuantity, *, tabled: bool = False) -> bool:
+    low, high = support(entry)
+    return low != high and isinstance(entry, TableColumn) == tabled
+
+
+def _name(key: str, index: int) -> str:
+    owner = QUANTITY.declared[key].owner(index)
+    return f"{key} of {owner}" if owner else key
+
+
+def ranges(scenario: ScenarioFields) -> Ranges:
+    """Return every number that the scenario draws, as coordinates of a unit cube.
+
+    Raises ``InvalidInput`` for a scenario that draws nothing, for a mixture, and for a channel other than ``paper``,
+    because a point of the cube would not determine a world of these.
+    """
+    if scenario.members:
+        members = ", ".join(member.name for member in scenario.members)
+        raise InvalidInput(f"scenario {scenario.name!r}: is a mixture; take one of its scenarios: {members}")
+    if scenario.v2x.by_link:
+        raise InvalidInput(
+            f"scenario {scenario.name!r}: v2x: draws delays and losses, which no table of worlds holds; give v2x: paper"
+            " (--set v2x=paper)"
+        )
+    found = {**_of_types(scenario), **_of_quantities(scenario)}
+    if not found:
+        raise InvalidInput(f"scenario {scenario.name!r}: draws nothing: all its worlds are the same")
+    return Ranges(scenario, tuple(found), tuple(found.values()))

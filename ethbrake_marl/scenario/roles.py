@@ -1,0 +1,216 @@
+"""Roles: which vehicle learns, names of scripts (``name[:argument]``), and commands of scripts that need no state."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from functools import lru_cache
+from itertools import pairwise
+from typing import Annotated, Any, NamedTuple, NoReturn
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import BeforeValidator, PlainSerializer, WithJsonSchema
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.model import refuse
+from ethbrake_marl.files.yaml import parse_numeral
+from ethbrake_marl.physics.state import Floats
+
+LEARNER = "learner"
+
+_PROFILE = "profile"  # script with a piecewise constant command
+
+MOST_PIECES = 64
+
+_SPEC = re.compile(r"(?P<name>[a-z][a-z0-9_@.-]*)(:(?P<argument>\S+))?")
+
+
+class ScriptSpec(NamedTuple):
+    """``name[:argument]``, for example ``constant:3.5``: the name of an agent in a scenario or on the command line."""
+
+    name: str  # name of the agent, such as ``constant``
+    argument: str | None  # text after the colon, such as ``3.5``; None: no colon
+
+    def __str__(self) -> str:
+        return self.name if self.argument is None else f"{self.name}:{self.argument}"
+
+    @staticmethod
+    @lru_cache(maxsize=256)
+    def parse(spec: str) -> ScriptSpec:
+        """Parse ``spec``, a text ``name[:argument]``.
+
+        Raises ``InvalidInput`` unless the name matches ``[a-z][a-z0-9_@.-]*`` and the argument has no spaces. A Python
+        file is refused too: a scenario from somebody else must not run code.
+        """
+        match = _SPEC.fullmatch(spec) if isinstance(spec, str) else None
+        if match is None:
+            raise InvalidInput(
+                f"agent {spec!r}: must be name or name:argument, the name in lower case letters, digits and _ @ . -,"
+                " for instance full_brake or constant:3.5"
+            )
+        if match["name"].endswith(".py") or ".py:" in spec:
+            raise InvalidInput(
+                f"agent {spec!r}: is a function of a Python file, and those are loaded only where a person names them"
+                " (--agents); no scenario does. A package that you install can give it a name"
+            )
+        return ScriptSpec(match["name"], match["argument"])
+
+    @property
+    def deceleration_mps2(self) -> float | None:
+        """Deceleration a of ``constant:a`` (negative: drive); None for any other script.
+
+        Raises ``InvalidInput`` if a is missing or not a finite number.
+        """
+        if self.name != "constant":
+            return None
+        deceleration = parse_numeral(self.argument or "")
+        if deceleration is None or not math.isfinite(deceleration):
+            raise InvalidInput(
+                f"agent {str(self)!r}: constant needs a finite deceleration in m/s2 after the colon, for instance"
+                " constant:3.5"
+            )
+        return deceleration
+
+    @property
+    def pieces(self) -> tuple[tuple[float, float], ...]:
+        """Pieces of a ``profile``, as (start in s after the latency, braking in m/s2); empty for any other script.
+
+        A piece is a time interval of constant braking. Raises ``InvalidInput`` unless times start at 0 and increase,
+        and no braking is negative.
+        """
+        if self.name != _PROFILE:
+            return ()
+        given = [part.split("=") for part in (self.argument or "").split(",")]
+        return checked_pieces([[parse_numeral(number) for number in piece] for piece in given])
+
+    @property
+    def hardest_mps2(self) -> float | None:
+        """Largest deceleration (m/s2) of ``constant:a`` or a ``profile``; None for any other script."""
+        return max(braking for _, braking in self.pieces) if self.name == _PROFILE else self.deceleration_mps2
+
+    def is_state_free(self) -> bool:
+        """Return whether the script needs no state: ``full_brake``, ``coast``, ``constant:a`` or a profile.
+
+        Raises ``InvalidInput`` if such a script has an argument it does not take, or lacks the one it needs.
+        """
+        if self.name == _PROFILE:
+            return len(self.pieces) > 0
+        if self.name in ("full_brake", "coast"):
+            if self.argument is not None:
+                raise InvalidInput(f"agent {str(self)!r}: {self.name} takes no argument")
+            return True
+        return self.deceleration_mps2 is not None
+
+    def command(
+        self, braking_capacity_mps2: ArrayLike, driving_capacity_mps2: ArrayLike | None = None
+    ) -> Floats | None:
+        """Return the command (m/s2) of a script that needs no state, in the shape of ``braking_capacity_mps2``.
+
+        ``full_brake`` -> -capacity, ``coast`` -> 0, ``constant:a`` -> -a, ``profile`` -> its first piece; None for any
+        other script. Raises ``InvalidInput`` if a, or a piece, exceeds the braking capacity of some vehicle, or -a the
+        ``driving_capacity_mps2``, if given.
+        """
+        capacity = np.asarray(braking_capacity_mps2, dtype=np.float64)
+        if not self.is_state_free():
+            return None
+        deceleration = self.hardest_mps2
+        if deceleration is None:
+            return -capacity if self.name == "full_brake" else np.zeros(capacity.shape)
+        if not np.all(deceleration <= capacity):
+            raise InvalidInput(f"agent {str(self)!r}: above the braking capacity {np.min(capacity):g} m/s2")
+        if driving_capacity_mps2 is not None and not np.all(-deceleration <= np.asarray(driving_capacity_mps2)):
+            raise InvalidInput(
+                f"agent {str(self)!r}: above the driving capacity {np.min(driving_capacity_mps2):g} m/s2"
+            )
+        return np.full(capacity.shape, 0.0 - (self.pieces[0][1] if self.pieces else deceleration))
+
+
+def checked_pieces(given: object) -> tuple[tuple[float, float], ...]:
+    """Return the pieces of a ``profile``, ``((s, m/s2), ...)``, after checking them; raise ``InvalidInput`` if invalid.
+
+    ``given``: a list ``[[s after the latency, m/s2 of braking], ...]``, from a file and so of any type.
+    """
+    right = f"a profile is 1 to {MOST_PIECES} pieces [s after the latency, m/s2 of braking], such as [[0, 3], [1, 7]]"
+    if not isinstance(given, list | tuple) or not 1 <= len(given) <= MOST_PIECES:
+        raise InvalidInput(right)
+    for piece in given:
+        numbers = isinstance(piece, list | tuple) and len(piece) == 2
+        if not numbers or not all(type(each) in (int, float) and 0.0 <= each <= 3600.0 for each in piece):
+            raise InvalidInput(f"{right}; both in [0, 3600], which {piece!r:.60} is not")
+    if given[0][0] != 0.0 or not all(one[0] < other[0] for one, other in pairwise(given)):
+        raise InvalidInput(f"{right}; times begin with 0 and rise")
+    return tuple((float(begins), float(braking)) for begins, braking in given)
+
+
+def _role_text(role: object) -> object:
+    """Convert a role from a file to the name of a script: ``{profile: [[0, 3], [1, 7]]}`` is ``profile:0=3,1=7``."""
+    if not isinstance(role, dict):
+        return role
+    try:
+        if set(role) != {_PROFILE}:
+            raise InvalidInput("must be learner, a script, or {profile: [[0, 3], [1, 7]]} and nothing beside it")
+        pieces = checked_pieces(role[_PROFILE])
+    except InvalidInput as error:
+        refuse((), role, str(error))
+    numbers = (tuple(repr(number).removesuffix(".0") for number in piece) for piece in pieces)
+    return f"{_PROFILE}:" + ",".join(f"{begins}={braking}" for begins, braking in numbers)
+
+
+def _role_content(role: str) -> str | dict[str, list[list[float]]]:
+    """Convert a role to its form in a scenario file: ``profile:0=3`` to ``{"profile": [[0.0, 3.0]]}``.
+
+    Other roles stay as they are.
+    """
+    pieces = ScriptSpec.parse(role).pieces
+    return {_PROFILE: [list(piece) for piece in pieces]} if pieces else role
+
+
+_ROLE_SCHEMA = {
+    "anyOf": [
+        {"type": "string"},
+        {
+            "type": "object",
+            "required": [_PROFILE],
+            "additionalProperties": False,
+            "properties": {
+                _PROFILE: {
+                    "type": "array",
+                    "minItems": 1,
+                    "maxItems": MOST_PIECES,
+                    "items": {"type": "array", "minItems": 2, "maxItems": 2, "items": {"type": "number", "minimum": 0}},
+                }
+            },
+        },
+    ]
+}
+
+Role = Annotated[
+    str, BeforeValidator(_role_text), PlainSerializer(_role_content, return_type=Any), WithJsonSchema(_ROLE_SCHEMA)
+]
+
+
+class Roles(dict[str, str]):
+    """Vehicle -> ``learner`` or a script; immutable, like the rest of a scenario."""
+
+    def _refuse(self, *args: object, **kwargs: object) -> NoReturn:
+        raise InvalidInput("roles of a scenario are frozen; use scenario.replace(roles=...) or scenario.with_learners")
+
+    __setitem__ = __delitem__ = __ior__ = _refuse
+    update = setdefault = pop = popitem = clear = _refuse
+
+    def __reduce__(self) -> tuple[type[Roles], tuple[dict[str, str]]]:
+        """Copy and pickle through the constructor."""
+        return Roles, (dict(self),)
+
+    @staticmethod
+    def complete(given: Mapping[str, str] | None, vehicles: int) -> Roles:
+        """Return a role for each of ``vehicles`` vehicles: ``learner`` or the name of a script.
+
+        ``given`` maps names such as ``vehicle_2`` to roles; a vehicle that it leaves out brakes fully. None: vehicle_2
+        learns and the others brake fully.
+        """
+        roles = {"vehicle_2": LEARNER} if given is None else given
+        names = [f"vehicle_{i + 1}" for i in range(vehicles)]
+        return Roles({name: roles.get(name, "full_brake") for name in names})

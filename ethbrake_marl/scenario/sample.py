@@ -1,0 +1,74 @@
+"""A sample of a list of worlds: the worlds, their numbers in the list, and their vehicle types and scenarios."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ethbrake_marl.physics.state import Ints, Worlds
+
+_Texts = NDArray[np.str_]
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """Worlds at the alert (time 0), with their numbers in the list.
+
+    >>> import ethbrake_marl as eb
+    >>> sample = eb.load_scenario("paper-random").sample(2, seed=7)
+    >>> sample.index, sample.worlds.gaps_m.round(2)
+    (array([0, 1]), array([[6.62, 8.49], [5.33, 7.79]]))
+    """
+
+    worlds: Worlds  # at t = 0
+    index: Ints  # [n] number of each world in the list of its seed
+    rejected: int  # number of draws that were rejected for an early impact
+    types: _Texts | None = None  # [n, N] type of every vehicle; "": no type; None: a scenario without types
+    scenarios: _Texts | None = None  # [n] member of a mixture that each world was drawn from; None: no mixture
+
+    def __repr__(self) -> str:
+        numbers = f"numbers {self.index.min()} to {self.index.max()}" if len(self.index) else "no numbers"
+        return f"Sample({self.worlds!r}, {numbers}, {self.rejected:,} rejected)"
+
+    def take(self, rows: ArrayLike) -> Sample:
+        """Return the worlds selected by ``rows`` (indices or a mask [n]); always a copy, with ``rejected`` 0."""
+        some = np.asarray(rows)
+        types, scenarios = (None if each is None else each[some] for each in (self.types, self.scenarios))
+        return Sample(self.worlds.take(some), self.index[some], 0, types, scenarios)
+
+    @staticmethod
+    def join(parts: Sequence[Sample], rejected: int) -> Sample:
+        """Join samples into one, in the order of their world numbers.
+
+        Either all parts have types (or scenarios) or none has. ``rejected``: number of rejected draws to note in the
+        result.
+        """
+        index = np.concatenate([part.index for part in parts])
+        order = np.argsort(index)
+        joined: dict[str, _Texts] = {}
+        for name in ("types", "scenarios"):
+            given = [getattr(part, name) for part in parts if getattr(part, name) is not None]
+            joined |= {name: np.concatenate(given)[order]} if given else {}
+        worlds = Worlds.concatenate([part.worlds for part in parts]).take(order)
+        return Sample(worlds, index[order], rejected, **joined)
+
+    @property
+    def kinds(self) -> dict[str, _Texts]:
+        """Columns of text, [n] each: ``scenario`` of a mixture, and ``vehicle_1_type`` and so on if there are types."""
+        columns = {} if self.scenarios is None else {"scenario": self.scenarios}
+        types = () if self.types is None else self.types.T
+        return columns | {f"vehicle_{i + 1}_type": column for i, column in enumerate(types)}
+
+    def count_kinds(self) -> str:
+        """Return a text that counts the worlds of each scenario of a mixture and of each vehicle type.
+
+        For example ``"; vehicle_1_type: car 7, truck 3"``; empty without mixture and types.
+        """
+        told = ""
+        for kind, column in self.kinds.items():
+            names, counts = np.unique(column, return_counts=True)
+            told += f"; {kind}: " + ", ".join(f"{n or 'none'} {c}" for n, c in zip(names, counts, strict=True))
+        return told

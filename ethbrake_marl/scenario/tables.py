@@ -1,0 +1,318 @@
+"""Worlds with initial conditions from the user: a table with one row per world, or one state for ``reset``."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.model import suggestion
+from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.files.yaml import parse_numeral
+from ethbrake_marl.physics.state import Bools, Floats, Worlds, make_worlds, real_numbers
+from ethbrake_marl.scenario.declared import ScenarioFields, obstacle_gap, on_road
+from ethbrake_marl.scenario.distributions import support
+from ethbrake_marl.scenario.fields import QUANTITY, Entry, QuantityRule, columns_of_table
+
+SIZE_LIMIT = 64 << 20  # largest size of a table in bytes
+
+_ALWAYS_IN_A_TABLE = ("gaps_m", "speeds_mps")
+
+
+@dataclass(frozen=True, slots=True)
+class _Naming:
+    """How error messages name a value: by column and row of a table, or by key and index of a state."""
+
+    where: str  # the file, or what else was given, such as ``initial states``
+    kind: Literal["file", "table", "state"]  # CSV file, columns in memory, or one state by key
+    lines: Sequence[int] = ()  # of a file: line on which each row begins
+
+    def entry(self, entry: Entry) -> str:
+        field, index = entry
+        if self.kind != "state":
+            return f"column {QUANTITY.declared[field].column_of(index)}"
+        return field if QUANTITY.declared[field].per == "world" else f"{field}[{index}]"
+
+    def value(self, entry: Entry, row: int) -> str:
+        if self.kind == "state":
+            return f"{self.where}: {self.entry(entry)}"
+        place = f"line {self.lines[row]}" if self.kind == "file" else f"row {row}"
+        return f"{self.where}, {place}, {self.entry(entry)}"
+
+
+def _quantities(scenario: ScenarioFields) -> dict[str, QuantityRule]:
+    """Return key -> rule of the quantities that every world of this scenario has."""
+    there = {"obstacle_gap_m": scenario.has_obstacle, "friction": scenario.has_friction}
+    return QUANTITY.usual | {
+        key: rule for key, rule in QUANTITY.optional.items() if there.get(key, scenario.declares(key))
+    }
+
+
+def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Naming) -> Worlds:
+    """Build worlds from checked columns; take quantities without a column from the scenario, where they must be fixed.
+
+    Args:
+        given: values of each column, [n], by quantity and index.
+        scenario: the scenario that the worlds belong to.
+        naming: how messages name a value.
+
+    """
+    if scenario.members:
+        raise InvalidInput(
+            f"{naming.where}: scenario {scenario.name!r} is a mixture, and nothing says which of its scenarios a world"
+            f" belongs to; take one of them: {', '.join(member.name for member in scenario.members)}"
+        )
+    n = len(next(iter(given.values()))) if given else 1
+    full: dict[str, Floats] = {}
+    rules = _quantities(scenario)
+    last = ("gaps_m", "obstacle_gap_m")  # these may be derived from the others
+    for field, rule in sorted(rules.items(), key=lambda item: item[0] in last):
+        full[field] = np.empty((n, rule.count(scenario.vehicles)))
+        for index in range(rule.count(scenario.vehicles)):
+            column = given.get((field, index))
+            if column is None:
+                column = _fixed(scenario, field, index, full)
+            if column is None:
+                missing = naming.entry((field, index))
+                raise InvalidInput(f"{naming.where}: {missing} is missing, and random in scenario {scenario.name!r}")
+            good = (column > 0.0 if rule.positive else column >= 0.0) & (column <= rule.high)
+            _require_all(good, naming, (field, index), column, f"must be {rule.interval}")
+            full[field][:, index] = column
+    _check_together(full, scenario, naming)
+    of_world = {field: full.pop(field)[:, 0] for field, rule in rules.items() if rule.per == "world"}
+    worlds = make_worlds(full.pop("gaps_m"), full.pop("speeds_mps"), **of_world, **full)
+    line = scenario.types_of_line
+    drawn = line is not None and any(kind.v2x is not None for kind in line.kinds)
+    return scenario.v2x.with_fixed_news(
+        scenario.play_pieces(worlds), scenario.time_step_s, naming.where, None if drawn else scenario.equipped()
+    )
+
+
+def _fixed(scenario: ScenarioFields, field: str, index: int, full: Mapping[str, Floats]) -> Floats | None:
+    """Return the scenario's fixed value of one entry of a quantity, [n] or [1]; None if it is random.
+
+    A time gap is converted with the speeds in ``full``; an obstacle's margin counts from where Vehicle 1 stops with the
+    values in ``full``.
+
+    Args:
+        scenario: the scenario that declares the quantity.
+        field: key of the quantity, such as ``"gaps_m"``.
+        index: vehicle or pair, from 0.
+        full: quantities of the n worlds that are known already, [n, entries] by key.
+
+    """
+    if field == "obstacle_gap_m":
+        low, high = support(scenario.quantities(field if scenario.declares(field) else "obstacle_margin_m")[0])
+        return obstacle_gap(scenario, on_road(full), lambda key: np.array([low])) if low == high else None
+    by_time = field == "gaps_m" and scenario.time_gaps_s is not None
+    told = scenario.bounds(field, dry=True)[index]
+    low, high = support(scenario.quantities("time_gaps_s")[index]) if by_time else told
+    if low != high:
+        return None
+    return low * full["speeds_mps"][:, index + 1] if by_time else np.array([low])
+
+
+def _check_together(full: Mapping[str, Floats], scenario: ScenarioFields, naming: _Naming) -> None:
+    for index in range(scenario.vehicles):
+        latency, speed, limit = (full[f][:, index] for f in ("latency_s", "speeds_mps", "speed_limit_mps"))
+        right = f"must be below the scenario's horizon_s ({scenario.horizon_s:g} s)"
+        _require_all(latency < scenario.horizon_s, naming, ("latency_s", index), latency, right)
+        good = speed <= limit
+        limit_mps = limit[np.argmin(good)]  # limit in the world that the message names
+        right = f"must not be above speed_limit_mps of vehicle_{index + 1}, {limit_mps:g} m/s"
+        _require_all(good, naming, ("speeds_mps", index), speed, right)
+
+
+def _require_all(good: Bools, naming: _Naming, entry: Entry, column: Floats, right: str) -> None:
+    """Raise ``InvalidInput`` for the first world in which ``good`` [n] is False.
+
+    Args:
+        good: whether the value is valid in each world, [n].
+        naming: how messages name a value.
+        entry: quantity and index of the value.
+        column: the values, [n].
+        right: what would be valid, for the message.
+
+    """
+    if not good.all():
+        row = int(np.argmin(good))
+        raise InvalidInput(f"{naming.value(entry, row)} = {column[row]:.12g}: {right}")
+
+
+def _known_columns(header: list[str], scenario: ScenarioFields, where: str) -> list[Entry]:
+    """Return quantity and index of each column of a table with this header.
+
+    Raises ``InvalidInput``, with ``where`` in its text, for unknown, repeated and missing columns.
+    """
+    known = table_columns(scenario)
+    if twice := [name for name, times in Counter(header).items() if times > 1]:
+        raise InvalidInput(f"{where}: column {twice[0]!r} is given twice")
+    for name in header:
+        if name not in known:
+            hint = suggestion(name, known) or f"known: {', '.join(known)}"
+            separator = "; columns are separated by commas" if ";" in name or "\t" in name else ""
+            raise InvalidInput(f"{where}: unknown column {name!r}; {hint}{separator}")
+    for name, (field, _) in known.items():
+        if field in _ALWAYS_IN_A_TABLE and name not in header:
+            raise InvalidInput(f"{where}: column {name!r} is missing; {scenario.vehicles} vehicles need it")
+    return [known[name] for name in header]
+
+
+def _numbers(what: str, value: ArrayLike) -> Floats:
+    try:
+        return real_numbers(value)
+    except ValueError as error:
+        raise InvalidInput(f"{what} = {value!r}: {error}; must be a number or a list of numbers") from None
+
+
+def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
+    """Return the header of a CSV file, its rows (at least one), and the line number at which each row begins.
+
+    Values are texts and are not checked.
+    """
+    rows: list[list[str]] = []
+    lines: list[int] = []
+    data = read_plain(file, SIZE_LIMIT)
+    try:
+        reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
+        begins = 1
+        for row in reader:
+            rows.append(row)
+            lines.append(begins)
+            begins = reader.line_num + 1
+    except (csv.Error, ValueError) as error:
+        raise InvalidInput(f"{file}: cannot be read as CSV: {error}") from None
+    while rows and not rows[-1]:
+        rows.pop()  # blank lines at the end
+    if not rows or not rows[0]:
+        raise InvalidInput(f"{file}, line 1: must name the columns, for instance gap_1_m,gap_2_m,speed_1_mps,...")
+    if len(rows) == 1:
+        raise InvalidInput(f"{file}: has a header but no rows; one row is one world")
+    return [name.strip() for name in rows[0]], rows[1:], lines[1:]
+
+
+def _number_at(file: Path, header: list[str], row: list[str], line: int, column: str) -> float:
+    """Return the number in one column of a CSV row; raise ``InvalidInput`` if it is not a number.
+
+    Args:
+        file: the file, for messages.
+        header: names of the columns.
+        row: texts of the row.
+        line: line on which the row begins, for messages.
+        column: name of the column to read.
+
+    """
+    if len(row) != len(header):
+        raise InvalidInput(f"{file}, line {line}: {len(row)} values, but the header has {len(header)} columns")
+    text = row[header.index(column)]
+    number = parse_numeral(text.strip())
+    if number is None:
+        raise InvalidInput(f"{file}, line {line}, column {column}: {text!r:.60} is not a number")
+    return number
+
+
+def table_columns(scenario: ScenarioFields) -> dict[str, Entry]:
+    """Return name -> (quantity, index) of the columns that a table of initial states may have for this scenario.
+
+    For example ``{"gap_1_m": ("gaps_m", 0), "speed_1_mps": ("speeds_mps", 0)}``.
+    """
+    return columns_of_table(_quantities(scenario), scenario.vehicles)
+
+
+def read_worlds(scenario: ScenarioFields, path: str | Path) -> Worlds:
+    """Read worlds from a CSV file with a header line; columns as in ``worlds_from_table``.
+
+    Raises ``InvalidInput`` with file, line and column for an unknown, repeated or missing column, a value that is not a
+    number or out of range, a row of the wrong length, a file without rows, or one larger than ``SIZE_LIMIT``.
+    """
+    file = Path(path)
+    header, rows, lines = _read_csv(file)
+    entries = _known_columns(header, scenario, f"{file}, line 1")
+    table = np.empty((len(rows), len(header)))
+    for r, row in enumerate(rows):
+        table[r] = [_number_at(file, header, row, lines[r], name) for name in header]
+    given = {entry: table[:, c] for c, entry in enumerate(entries)}
+    return _worlds(given, scenario, _Naming(str(file), "file", lines))
+
+
+def read_rows(file: Path, columns: object, weights: object) -> dict[str, Any]:
+    """Read the rows of a scenario's table, and their weights, from a CSV file.
+
+    Returns ``{"rows": [[7.0, 8.0], ...]}``, with ``"weights": [1.0, ...]`` if weights are given. Raises
+    ``InvalidInput`` naming file, line and column.
+
+    Args:
+        file: the CSV file, with a header line.
+        columns: names of the columns to read, from the scenario file (unchecked).
+        weights: name of the column with the weight of each row; None: no weights.
+
+    """
+    header, rows, lines = _read_csv(file)
+    weights_of = [] if weights is None else [weights]
+    if not isinstance(columns, list | tuple):
+        raise InvalidInput(f"{file}: columns = {columns!r:.60}: must be a list of columns: {', '.join(header)}")
+    for name in (*columns, *weights_of):
+        if header.count(name) != 1:
+            many = "is there twice" if name in header else f"is not there; {suggestion(str(name), header)}"
+            raise InvalidInput(f"{file}, line 1: column {name!r:.60} {many.removesuffix('; ')}")
+    found = [
+        [_number_at(file, header, row, line, str(name)) for name in (*columns, *weights_of)]
+        for row, line in zip(rows, lines, strict=False)  # ignore blank lines at the end
+    ]
+    told: dict[str, Any] = {"rows": [row[: len(columns)] for row in found]}
+    return told if weights is None else told | {"weights": [row[-1] for row in found]}
+
+
+def worlds_from_table(scenario: ScenarioFields, columns: Mapping[str, ArrayLike]) -> Worlds:
+    """Build worlds from columns of equal length n: ``{"gap_1_m": [7, 8], "speed_1_mps": [20, 19], ...}``.
+
+    Gaps and speeds are needed. Optional: ``braking_capacity_1_mps2``, ``driving_capacity_1_mps2``, ``latency_1_s``,
+    ``mass_1_t``, ``speed_limit_1_mps`` and so on for each vehicle, ``restitution``, and ``obstacle_gap_m`` if the
+    scenario has an obstacle. A column that is left out is taken from the scenario, where it must be a fixed number.
+    Raises ``InvalidInput`` naming the column and the row (from 0).
+    """
+    entries = _known_columns(list(columns), scenario, "initial states")
+    given = {
+        entry: _numbers(f"initial states: {name}", column)
+        for entry, (name, column) in zip(entries, columns.items(), strict=True)
+    }
+    shapes = {column.shape for column in given.values()}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 1:
+        lengths = ", ".join(f"{name} {list(np.shape(column))}" for name, column in columns.items())
+        raise InvalidInput(f"initial states: columns must be lists of one and the same length, not {lengths}")
+    return _worlds(given, scenario, _Naming("initial states", "table"))
+
+
+def worlds_from_state(scenario: ScenarioFields, initial_state: Mapping[str, Any]) -> Worlds:
+    """Build one world (n = 1) from a state ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``.
+
+    Keys are a scenario's quantities. A single number applies to every vehicle. A key that is left out is taken from the
+    scenario, where it must be a fixed number. Raises ``InvalidInput`` naming the key and the entry.
+    """
+    if not isinstance(initial_state, Mapping):
+        raise InvalidInput(f"initial_state = {initial_state!r}: must be a mapping such as {{'gaps_m': [7, 7]}}")
+    given: dict[Entry, Floats] = {}
+    known = _quantities(scenario)
+    for field, value in initial_state.items():
+        if field not in known:
+            if field in QUANTITY.optional:
+                raise InvalidInput(f"initial_state: {field} is not of this scenario: {scenario.name!r} has no {field}")
+            hint = suggestion(str(field), known) or f"known: {', '.join(known)}"
+            raise InvalidInput(f"initial_state: unknown key {field!r}; {hint}")
+        count = known[field].count(scenario.vehicles)
+        numbers = _numbers(f"initial_state: {field}", value)
+        if numbers.shape not in ((), (count,)):
+            several = f"{scenario.vehicles} vehicles need {count} numbers, or one for all"
+            right = "must be one number" if known[field].per == "world" else several
+            raise InvalidInput(f"initial_state: {field} has shape {list(numbers.shape)}; {right}")
+        for index, number in enumerate(np.broadcast_to(numbers, (count,))):
+            given[field, index] = np.array([number])
+    return _worlds(given, scenario, _Naming("initial_state", "state"))

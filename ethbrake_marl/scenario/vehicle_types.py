@@ -1,0 +1,228 @@
+"""Vehicle types: the quantities of a car, a van or a truck, and which types are possible at each place of a line.
+
+A vehicle first draws its type, then its quantities as that type declares them. Quantities that depend on the load,
+``{with_load: [empty, full]}``, depend on the same load: a full truck is heavy *and* brakes weakly.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from operator import not_
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    Discriminator,
+    Field,
+    GetJsonSchemaHandler,
+    Tag,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
+
+from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, FileModel, require
+from ethbrake_marl.game.features import ListedFeatures
+from ethbrake_marl.game.objectives import OBJECTIVES
+from ethbrake_marl.physics.state import Floats, Ints
+from ethbrake_marl.scenario.channel import Equipage
+from ethbrake_marl.scenario.distributions import LEAVE_OUT, Numbers, Quantity, TableColumn, Uniform, WithLoad, support
+from ethbrake_marl.scenario.fields import MEANING, QUANTITY
+
+ANY = "any"  # in ``types``: every type, in proportion to its weight
+
+TypeName = Annotated[str, Field(pattern=NAME_PATTERN)]
+
+ListedByVehicle = Annotated[
+    dict[Annotated[str, Field(pattern=r"^vehicle_[1-9][0-9]?$")], ListedFeatures],
+    Field(min_length=1, json_schema_extra={"additionalProperties": False}),
+]
+
+Weight = Annotated[float, Field(gt=0.0, le=1e9, allow_inf_nan=False)]
+
+
+def _loaded(value: object) -> str:
+    return "#with_load" if isinstance(value, WithLoad) or (isinstance(value, dict) and "with_load" in value) else "#one"
+
+
+TypeQuantity = Annotated[
+    Annotated[Quantity, Tag("#one")] | Annotated[WithLoad, Tag("#with_load")], Discriminator(_loaded)
+]
+
+
+class VehicleType(FileModel):
+    """One type of vehicle: its weight and its quantities; other quantities come from outside ``vehicle_types``."""
+
+    weight: Weight = Field(default=1.0, description="how likely it is, relative to the other types")
+    load: Quantity = Field(
+        default_factory=lambda: Uniform(uniform=(0.0, 1.0)), description="share of the full load, 0 to 1"
+    )
+    braking_capacity_mps2: TypeQuantity | None = Field(default=None, description=MEANING["braking_capacity_mps2"])
+    driving_capacity_mps2: TypeQuantity | None = Field(default=None, description=MEANING["driving_capacity_mps2"])
+    mass_t: TypeQuantity | None = Field(default=None, description=MEANING["mass_t"])
+    latency_s: TypeQuantity | None = Field(default=None, description=MEANING["latency_s"])
+    speed_limit_mps: TypeQuantity | None = Field(default=None, description=MEANING["speed_limit_mps"])
+    brake_rate_mps3: TypeQuantity | None = Field(default=None, exclude_if=not_, description=MEANING["brake_rate_mps3"])
+    release_rate_mps3: TypeQuantity | None = Field(
+        default=None, exclude_if=not_, description=MEANING["release_rate_mps3"]
+    )
+    v2x: Equipage | None = Field(default=None, exclude_if=not_, description="what it has of V2X; by default all")
+
+    @field_validator(*QUANTITY.of_a_type)
+    @classmethod
+    def _in_range(cls, value: Any, info: ValidationInfo) -> Any:
+        require(value is not None, (), value, LEAVE_OUT)
+        rule = QUANTITY.declared[str(info.field_name)]
+        require(rule.allows(*support(value)), (), value, f"must be {rule.interval}")
+        return value
+
+    @field_validator("load")
+    @classmethod
+    def _share(cls, value: Any) -> Any:
+        low, high = support(value)
+        require(low >= 0.0 and high <= 1.0, (), value, "must be in [0, 1]: 0 empty, 1 full")
+        return value
+
+
+def _check_type_names(kinds: dict[str, VehicleType]) -> dict[str, VehicleType]:
+    require(ANY not in kinds, (ANY,), UNSHOWN, f"{ANY} stands for every type; give another name")
+    return kinds
+
+
+VehicleTypes = Annotated[dict[TypeName, VehicleType], Field(min_length=1), AfterValidator(_check_type_names)]
+
+TypesHere = str | dict[str, Weight]  # types of one vehicle: a type, ``any``, or a weight per possible type
+
+
+def _one_or_each(value: object) -> str:
+    return "#each" if isinstance(value, list | tuple) else "#one"
+
+
+Types = Annotated[
+    Annotated[TypesHere, Tag("#one")]
+    | Annotated[tuple[TypesHere, ...], Field(strict=False, min_length=1), Tag("#each")],
+    Discriminator(_one_or_each),
+]
+
+
+class TypesOfLine:
+    """The possible vehicle types at each place of a line, and their probabilities.
+
+    Args:
+        kinds: declaration of each type, by name; their order gives the indices of the types.
+        types: types that are possible at each place; None: all, in proportion to their weights.
+        vehicles: number of vehicles in the line.
+
+    """
+
+    def __init__(self, kinds: Mapping[str, VehicleType], types: Types | None, vehicles: int) -> None:
+        self.names = tuple(kinds)
+        self.kinds = tuple(kinds.values())
+        given: Sequence[TypesHere]
+        given = types if isinstance(types, tuple) else (ANY if types is None else types,) * vehicles
+        self.weights = np.array([[_weight(kinds, name, here) for name in kinds] for here in given])
+
+    def possible(self, vehicle: int) -> list[int]:
+        """Return the indices of the types that are possible for ``vehicle`` (index from 0)."""
+        return np.flatnonzero(self.weights[vehicle] > 0.0).tolist()
+
+    def draw(self, u: Floats) -> tuple[Ints, Floats]:
+        """Return type (index) and load (0 empty to 1 full) of every vehicle, both [n, N].
+
+        ``u``: uniform numbers in [0, 1), [n, N, 2 or more]; the first draws the type, the second the load.
+        """
+        n, vehicles = u.shape[:2]
+        types, load = np.zeros((n, vehicles), np.int64), np.zeros((n, vehicles))
+        for i in range(vehicles):
+            cumulative = np.cumsum(self.weights[i])
+            types[:, i] = np.searchsorted(cumulative / cumulative[-1], u[:, i, 0], side="right")
+            for kind in self.possible(i):
+                rows, shape = types[:, i] == kind, self.kinds[kind].load
+                load[rows, i] = shape if isinstance(shape, float) else shape.value(u[rows, i, 1])
+        return types, load
+
+
+def _weight(kinds: Mapping[str, VehicleType], name: str, here: TypesHere) -> float:
+    if isinstance(here, str):
+        return kinds[name].weight if here == ANY else float(here == name)
+    return here.get(name, 0.0)
+
+
+LEFT_OUT: Any = object()  # default that marks a missing key, which a check then accepts or refuses
+
+PerVehicle = Annotated[
+    Annotated[Quantity, Tag("#one")] | Annotated[tuple[Quantity, ...], Field(strict=False, min_length=1), Tag("#each")],
+    Discriminator(_one_or_each),
+]
+
+
+class _ObjectiveSchema:
+    """Annotation of a text field that holds an objective: its JSON schema lists all objectives.
+
+    Objectives that are registered before the schema is made are included.
+    """
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        kinds = OBJECTIVES.usable()
+        plain = [name for name, kind in kinds.items() if ":" not in kind.form]
+        with_argument = "|".join(name for name, kind in kinds.items() if ":" in kind.form)
+        return {"type": "string", "anyOf": [{"enum": plain}, {"pattern": f"^({with_argument}):"}]}
+
+
+ObjectiveName = Annotated[str, _ObjectiveSchema]
+
+MOST_NUMBERS = 100_000  # largest number of values in a table, which every copy of the scenario contains
+
+Column = Annotated[str, Field(pattern=r"^[a-z_]+(_[0-9]+)?[a-z0-9_]*$", max_length=64)]
+
+
+class Table(FileModel):
+    """Rows of measured values; every world takes one row, by weight.
+
+    In a scenario file they may come from a CSV file.
+    """
+
+    file: str = Field(default="", exclude_if=not_, description="CSV file with a header, from the scenario's folder on")
+    columns: Annotated[tuple[Column, ...], Field(strict=False, min_length=1)] = Field(
+        description="as in a table of initial states: gap_1_m, speed_2_mps, ...; of a file those that are used"
+    )
+    weights: str | Annotated[Numbers, Field()] | None = Field(
+        default=None, exclude_if=not_, description="how likely each row is; of a file the column that says it"
+    )
+    rows: Annotated[tuple[Numbers, ...], Field(strict=False, min_length=1)] | None = Field(
+        default=None, description="one row of numbers for each; left out with a file, which has them"
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> Table:
+        read = "files are read where they stand in a file (load_scenario); give rows"
+        require(not (self.file and self.rows), ("file",), self.file, "give either a file or rows, not both")
+        require(self.rows is not None and not isinstance(self.weights, str), ("rows",), UNSHOWN, read)
+        rows = self.rows or ()
+        for k, row in enumerate(rows):
+            right = f"has {len(row)} numbers; there are {len(self.columns)} columns"
+            require(len(row) == len(self.columns), ("rows", k), UNSHOWN, right)
+        numbers = len(rows) * len(self.columns)
+        require(numbers <= MOST_NUMBERS, ("rows",), UNSHOWN, f"{numbers:,} numbers; at most {MOST_NUMBERS:,}")
+        twice = [name for name in self.columns if self.columns.count(name) > 1]
+        require(not twice, ("columns",), twice[:1], "each column can be given once")
+        if isinstance(self.weights, tuple):
+            fits = f"must be one for each of {len(rows)} rows, all above 0, and their sum finite"
+            good = len(self.weights) == len(rows) and min(self.weights) > 0.0 and math.isfinite(sum(self.weights))
+            require(good, ("weights",), UNSHOWN, fits)
+        return self
+
+    def column_values(self) -> dict[str, TableColumn]:
+        """Return the columns of the table by name, each with the weights of the rows."""
+        rows = np.array(self.rows)
+        weights = self.weights if isinstance(self.weights, tuple) else (1.0,) * len(rows)
+        cumulative = np.cumsum(np.asarray(weights))
+        return {
+            name: TableColumn(name, column, cumulative / cumulative[-1])
+            for name, column in zip(self.columns, rows.T, strict=True)
+        }

@@ -1,0 +1,176 @@
+"""Attach a shield to an environment: the same options and checks for every interface."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.agents.learned import LearnedAgent, LearnedPolicy
+from ethbrake_marl.agents.protocol import Agent, Team
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.errors import InvalidInput, check_one_learner
+from ethbrake_marl.game.observations import ObservationSpec
+from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.shield.contract import Guarded, ShieldGuard
+from ethbrake_marl.shield.options import ShieldOptions
+
+
+def proposing_agent(policy: object, where: str) -> Agent:
+    """Return ``policy`` as an agent that proposes actions: an agent unchanged, a learned policy as a ``LearnedAgent``.
+
+    Anything else raises ``InvalidInput``, whose message begins with ``where``.
+    """
+    if not isinstance(policy, type):
+        if isinstance(policy, Agent):
+            return policy
+        if callable(policy) and isinstance(getattr(policy, "observation", None), ObservationSpec):
+            return LearnedAgent(policy)  # type: ignore[arg-type]  # it is callable, and says what it observes
+    raise InvalidInput(
+        f"{where}: policy = {policy!r}: must be an agent or a policy (eb.load_policy), which says what it observes"
+    )
+
+
+def proposing_agents(
+    policy: Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy], vehicles: Sequence[int], where: str
+) -> dict[int, Agent]:
+    """Return the proposing agent of each shielded vehicle: vehicle index -> agent.
+
+    Args:
+        policy: a team, a mapping from vehicle name to policy, or one policy that proposes for all vehicles.
+        vehicles: indices of the shielded vehicles.
+        where: name of the interface, for error messages.
+
+    Raises ``InvalidInput`` for anything else, and if the team or mapping does not cover exactly these vehicles.
+
+    """
+    if isinstance(policy, Team):
+        given: dict[int, Agent] = policy.drivers
+    elif isinstance(policy, Mapping):
+        by_name = {f"vehicle_{i + 1}": i for i in vehicles}
+        given = {by_name.get(name, -1): proposing_agent(each, where) for name, each in policy.items()}
+    else:
+        agent = proposing_agent(policy, where)
+        return dict.fromkeys(vehicles, agent)
+    if set(given) != set(vehicles):
+        names = ", ".join(f"vehicle_{i + 1}" for i in vehicles)
+        raise InvalidInput(f"{where}: policy: one for each of {names} is needed, and for nobody else")
+    return {i: given[i] for i in vehicles}
+
+
+Proposing = Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy]
+"""Who proposes: one for every shielded vehicle, a team, or one for each by its vehicle's name."""
+
+
+def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -> ShieldGuard:
+    """Return the guard that shields all learners of an engine.
+
+    Args:
+        engine: the engine, which is not changed.
+        policy: proposes the actions that the caller leaves out; None: nobody. Mode ``episode`` needs it.
+        options: settings of the shield.
+
+    Raises ``InvalidInput`` if no vehicle learns, if several learn in another mode than ``step``, and if ``policy`` is
+    not a policy.
+
+    """
+    where, mode, scenario, vehicles = options.where, options.mode, engine.scenario, engine.learners
+    if not vehicles:
+        raise InvalidInput(
+            f"{where}: no vehicle of scenario {scenario.name!r} learns, so there is nobody to shield; pass"
+            " learners=['vehicle_2'] to the environment"
+        )
+    if mode != "step":
+        check_one_learner(
+            scenario.name,
+            [scenario.vehicle_names[i] for i in vehicles],
+            f"{where} needs exactly one learner in mode {mode}: what it certifies is known only if every other vehicle"
+            " follows a script; mode step shields several together; or pass learners=['vehicle_2'] to the environment",
+        )
+    if mode == "episode":
+        return options.guard(engine, {vehicles[0]: proposing_agent(policy, where)})
+    policies = {} if policy is None else proposing_agents(policy, vehicles, where)
+    return options.guard(engine, policies, warns=True)
+
+
+class Attached:
+    """The link between a wrapper of an environment and the guard that it puts into the environment's engine.
+
+    Args:
+        env: the environment to shield.
+        interface: class of which ``env`` must be an instance, such as ``gymnasium.Env``.
+        maker: code that makes such an environment, for error messages.
+        policy: proposes the actions that the caller leaves out; None: nobody.
+        where: name of the wrapper, for error messages.
+        options: keywords of ``ShieldOptions``.
+
+    The attributes are ``engine``, ``guard`` and ``options``, besides the properties below. Raises ``InvalidInput`` if
+    ``env`` is not an environment of this package, or is shielded already.
+
+    """
+
+    def __init__(
+        self, env: object, interface: type, maker: str, policy: Proposing | None, where: str, options: Mapping[str, Any]
+    ) -> None:
+        self.options, self._env = ShieldOptions(**options, where=where), env
+        engine = self._reached()
+        if isinstance(engine, Engine) and isinstance(engine.guard, ShieldGuard):
+            first = engine.guard
+            raise InvalidInput(
+                f"{where}: a {first.where} (mode {first.mode.name.lower()}) shields this environment already, and its"
+                " bound holds for one shield alone; give that one other options, or close() it first"
+            )
+        if isinstance(getattr(env, "attached", None), Attached):
+            raise InvalidInput(f"{where}: {env} is a shield that was closed; put this one around what that is around")
+        if not (isinstance(env, interface) and isinstance(engine, Engine)):
+            raise InvalidInput(
+                f"{where}: goes around {maker}, not {env}; eb.shield(env) chooses the one for an environment of ours"
+            )
+        self.engine, self._left = engine, Guarded(None, {})
+        self.guard = guard_of(engine, policy, self.options)
+        engine.protect(self.guard)
+
+    @property
+    def memory(self) -> Guarded:
+        """Current memory of the guard; after ``close``, its last memory."""
+        memory: Guarded | None = self.engine.guarded if self.engine.guard is self.guard else self._left
+        return Guarded(None, {}) if memory is None else memory
+
+    @property
+    def shield(self) -> Any:
+        """Current state of the shield, for reading only; None before the first reset.
+
+        A ``StepShield`` in mode ``step``, the memory of the ``HybridAgent`` in mode ``episode``, or the shield of
+        another mode.
+        """
+        return self.memory.shield
+
+    def _reached(self) -> Any:
+        """Return the engine of the wrapped environment, looked up anew at each call; None if there is none."""
+        return getattr(getattr(self._env, "unwrapped", self._env), "engine", None)
+
+    def check_open(self) -> None:
+        """Raise ``InvalidInput`` if this shield was closed, or if the environment inside the wrapper was replaced."""
+        if self._reached() is not self.engine:
+            raise InvalidInput(
+                f"{self.options.where}: another environment is inside than the one that is shielded; put a shield"
+                " around that one"
+            )
+        if self.engine.guard is not self.guard:
+            raise InvalidInput(f"{self.options.where}: this shield was closed; put a new one around the environment")
+
+    def close(self) -> None:
+        """Remove the guard from the engine. ``memory`` and ``shield`` keep their last values."""
+        if self.engine.guard is self.guard:
+            self._left = self.memory
+            self.engine.protect(None)
+
+    def penalty(self) -> Floats:
+        """Return the intervention penalty of the last step, [n, L], for the wrapper to subtract from the rewards."""
+        self.check_open()
+        ruling = self.engine.ruling
+        if ruling is None:
+            return np.zeros((self.engine.n, len(self.engine.learners)))
+        intervened = self.guard.intervened(ruling) & ruling.asked[:, np.newaxis]
+        return np.asarray(self.options.intervention_penalty * intervened, np.float64)

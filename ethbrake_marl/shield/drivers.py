@@ -1,0 +1,122 @@
+"""Agents and teams behind a shield, for evaluations: the agent proposes, and a guard in the engine decides."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+from ethbrake_marl.agents.protocol import Agent, ByPolicy, Driver, Knowledge, Source, Team, check_agent
+from ethbrake_marl.engine.engine import Engine, Guard
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics.state import Worlds
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.shield.checks import check_scenario
+from ethbrake_marl.shield.options import ShieldOptions
+from ethbrake_marl.shield.paper_hybrid import HybridAgent
+
+
+class ShieldedDriver(ByPolicy):
+    """An agent or a team behind a shield that certifies every action: mode ``step``, or a mode of an extension.
+
+    At the alert the policy is simulated to the end. Where it harms no more than E-V2X-BM, it drives without
+    interventions and its harm is the bound. Elsewhere each action must be certified by the rest of the plan, by a
+    constant action, or by a rollout: a simulation of the policy from the state after the action. A team's proposals are
+    decided together.
+
+    Args:
+        policy: the agent or team that proposes.
+        scenario: the scenario in which actions are certified.
+        later_rollouts: whether a rollout of the policy may certify an action.
+        told: worlds at the alert as the shield assumes them; None: the true worlds. The policy always sees the true
+            worlds.
+        options: keywords of ``ShieldOptions``.
+
+    Raises ``InvalidInput`` where ``policy`` is not an agent or team, for options that do not fit, and where a team does
+    not drive every learner.
+
+    >>> import ethbrake_marl as eb
+    >>> eb.make_agent("coast+step", scenario=eb.load_scenario("paper-random")).on([1]).name
+    'coast+step'
+
+    """
+
+    def __init__(
+        self,
+        policy: Driver,
+        scenario: Scenario,
+        *,
+        later_rollouts: bool = True,
+        told: Worlds | None = None,
+        **options: Any,
+    ) -> None:
+        self.options = ShieldOptions(**options)
+        if self.options.mode == "episode":
+            raise InvalidInput("shield: mode = 'episode': HybridAgent is that of mode episode")
+        check_agent(policy, str(self.options.mode), alone=not isinstance(policy, Team))
+        check_scenario(scenario, str(self.options.mode))
+        if not (told is None or isinstance(told, Worlds)):
+            raise InvalidInput(f"step: told = {told!r}: must be worlds at the alert, or None")
+        if isinstance(policy, Team) and (
+            undriven := [scenario.vehicle_names[i] for i in scenario.learners if i not in policy.drivers]
+        ):
+            raise InvalidInput(
+                f"team {policy.name!r}: does not drive {', '.join(undriven)}; beside a shielded vehicle every other one"
+                " is shielded too, or follows a script"
+            )
+        self.policy, self.scenario = policy, scenario
+        self._how = {"later_rollouts": later_rollouts, "told": told}
+        self.name = f"{policy.name}+{self.options.written}"
+        self.options.check_in(scenario, several=isinstance(policy, Team))
+
+    @property
+    def adds(self) -> Source:
+        """Knowledge (``Source``) that the shield uses to certify actions, in addition to what the policy knows."""
+        return self.options.adds
+
+    @property
+    def knows(self) -> Knowledge:
+        """Combined knowledge of the policy and the shield."""
+        return Knowledge.of(self.policy, also=self.adds)
+
+    @classmethod
+    def around(cls, driver: Driver, task: Task, **settings: Any) -> Team:
+        """Return a team that drives the vehicles of ``task`` with copies of ``driver`` behind one shield.
+
+        ``settings`` are further keywords of ``ShieldedDriver``; scenario and harm count are the task's.
+        """
+        if isinstance(driver, Team) and len(task.vehicles) == 1:
+            driver = Team.of(driver, task.vehicles).drivers[task.vehicle]
+        elif isinstance(driver, Agent) and len(task.vehicles) > 1:
+            driver = Team.of(driver, task.vehicles)
+        return cls(driver, task.scenario, harm_count=task.harm_count, **settings).on(task.vehicles)
+
+    def on(self, vehicles: Collection[int]) -> Team:
+        """Return a team behind one shield, in which each of these vehicles is driven by its own copy of the policy.
+
+        ``vehicles`` are indices (0 = front).
+        """
+        return Team(Team.of(self.policy, vehicles).drivers, self.name, shield=self)
+
+    def guard(self, engine: Engine, policies: Mapping[int, Agent]) -> Guard:
+        """Return the guard for ``engine``, in which ``policies`` (vehicle index -> agent) propose."""
+        return self.options.guard(engine, policies, several=isinstance(self.policy, Team), **self._how)
+
+
+def shielded(driver: Driver, scenario: Scenario, mode: str, **options: Any) -> Driver:
+    """Return an agent or a team behind a shield.
+
+    Args:
+        driver: the agent or team. If the scenario has several learners, a copy of an agent drives each.
+        scenario: the scenario in which actions are certified.
+        mode: ``step``, ``episode`` or a mode of an extension.
+        options: further keywords of ``ShieldOptions``.
+
+    """
+    if mode == "episode":
+        settings = ShieldOptions(mode, **options)
+        return HybridAgent(driver, scenario, bound=settings.bound, harm_count=settings.harm_count)  # type: ignore[arg-type]  # which refuses a team
+    if isinstance(driver, Agent) and len(scenario.learners) > 1:
+        driver = Team.of(driver, scenario.learners)
+    around = ShieldedDriver(driver, scenario, mode=mode, **options)
+    return around.on(driver.drivers) if isinstance(driver, Team) else around

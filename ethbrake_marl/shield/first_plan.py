@@ -1,0 +1,104 @@
+"""The plan with which a step shield starts at the alert: the constant actions of least harm.
+
+A plan holds one action for each decision. For one shielded vehicle, the constant action is E-V2X-BM's (the coupled
+optimum). For several vehicles, the plan is the best of these candidates: all brake fully; one vehicle takes its coupled
+optimum while the others brake fully; and the result of a coordinate descent, vehicle by vehicle, from the best of
+those.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.game.actions import command_to_action
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.physics.state import Floats, Worlds
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.certify import CONSTANTS, bettered_plan, descend_constants, plan_harm
+from ethbrake_marl.shield.running import Running
+
+LOOKED_AT = np.linspace(0.0, -1.0, 101)  # constant actions tried at the alert if a world has several possible worlds
+
+GRID = np.linspace(0.0, -1.0, 21)  # constant actions tried in the coordinate descent of several vehicles
+
+ROUNDS = 2  # rounds of the coordinate descent
+
+LADDER = np.linspace(0.0, -1.0, 5)  # possible actions of the first and of the last vehicle in ``joint_constants``
+
+
+def best_constants(
+    worlds: Worlds,
+    running: Running,
+    vehicle: int | tuple[int, ...],
+    width: int,
+    scenario: Scenario,
+    harm_count: HarmCount,
+) -> Floats:
+    """Return plans that hold the best constant actions found: [n, width], or [n, width, K] for several vehicles.
+
+    Args:
+        worlds: n worlds at the alert.
+        running: the episodes of these worlds, with all their possible worlds.
+        vehicle: index of the shielded vehicle (0 = front), or indices of several.
+        width: number of decisions of a plan.
+        scenario: the scenario of these worlds.
+        harm_count: impacts whose harm is minimised: ``first`` (each pair's first) or ``total`` (all).
+
+    """
+    vehicles = [vehicle] if isinstance(vehicle, int) else list(vehicle)
+    others = np.array(running.problem.command[:: running.members, running.problem.command.shape[1] - worlds.N :])
+    others[:, vehicles] = -worlds.vehicles.braking_capacity_mps2[:, vehicles]
+
+    def optimum(i: int) -> Floats:
+        """Return E-V2X-BM's deceleration of vehicle ``i`` as an action [n]; other shielded vehicles brake fully."""
+        best = optimise_coupled(worlds, i, harm_count=harm_count, horizon_s=scenario.horizon_s, others_mps2=others)
+        return command_to_action(-best.deceleration_mps2, worlds.vehicles, i)
+
+    if isinstance(vehicle, int):
+        plan = np.repeat(optimum(vehicle)[:, np.newaxis], width, axis=1)
+    elif running.members > 1:  # a team of one vehicle: no other team is shielded in several possible worlds
+        plan = held(optimum(vehicles[0])[:, np.newaxis], width)
+    else:
+        return held(_best_joint_action(running, [optimum(i) for i in vehicles], width), width)
+    return plan if running.members == 1 else bettered_plan(running, plan, LOOKED_AT)[0]
+
+
+def _best_joint_action(running: Running, optima: list[Floats], width: int) -> Floats:
+    """Return the best constant actions of K vehicles, [n, K] in [-1, 1].
+
+    Args:
+        running: n episodes at the alert.
+        optima: for each of the K vehicles, the action [n] that is best while the others brake fully.
+        width: number of decisions of a plan.
+
+    """
+    best = np.full((running.n, len(optima)), -1.0)
+    least = plan_harm(running, held(best, width))
+    for c in range(len(optima) + 1):
+        if c < len(optima):
+            action = np.full_like(best, -1.0)
+            action[:, c] = optima[c]
+        else:
+            action = best.copy()
+            descend_constants(running.uncapped, GRID, ROUNDS, action)
+        harm = plan_harm(running, held(action, width))
+        best, least = np.where((harm < least)[:, np.newaxis], action, best), np.minimum(harm, least)
+    return best
+
+
+def joint_constants(vehicles: int) -> Floats:
+    """Return constant actions to try for several vehicles together, [C, K] in [-1, 0], front to rear.
+
+    ``vehicles`` is their number K. The actions of one row are either all equal, or change linearly from the first to
+    the last vehicle.
+    """
+    alike = np.repeat(np.array(CONSTANTS)[:, np.newaxis], vehicles, axis=1)
+    share = np.linspace(0.0, 1.0, vehicles)
+    ladders = [first + share * (last - first) for first in LADDER for last in LADDER if first != last]
+    return np.concatenate([alike, ladders])
+
+
+def held(action: Floats, width: int) -> Floats:
+    """Return plans [n, width, K] that hold the actions ``action`` [n, K] at each of ``width`` decisions."""
+    return np.repeat(action[:, np.newaxis], width, axis=1)

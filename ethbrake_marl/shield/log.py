@@ -1,0 +1,56 @@
+"""Log of a step shield: every decision in which it replaced a proposed action."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.physics.state import Floats, Ints
+from ethbrake_marl.shield.certify import Backup, Decision
+from ethbrake_marl.shield.running import Running
+
+
+class Intervention(NamedTuple):
+    """Log entry: one proposed action that the shield replaced."""
+
+    world: int  # row of the world in the batch
+    vehicle: int  # index of the shielded vehicle, 0 = front
+    episode: int  # number of the episode in that row, from 0
+    step: int  # number of the decision in the episode, from 0
+    time_s: float  # time of the decision since the alert (s)
+    proposed: float  # proposed action, before clipping to [-1, 1]
+    applied: float  # applied action, in [-1, 1]
+    reason: int  # code of ShieldReason
+    bound: float  # harm of the episode that the shield guarantees from now on (m2/s2)
+    margin: float  # accepted harm minus least harm found after the proposal (m2/s2); negative: the proposal exceeds it
+    state: Floats  # [S] speeds, gaps, hit flags and harm at the decision, in the layout of ``Running.states``
+    plan: Floats  # [L], or [L, K] for K vehicles: plan at the decision; entries before ``step`` are the applied actions
+
+
+def interventions(
+    now: Running, episode: Ints, vehicles: Sequence[int], proposed: Floats, decision: Decision, held: Backup
+) -> list[Intervention]:
+    """Return one log entry for each action that a decision replaced.
+
+    Args:
+        now: the n episodes before the decision.
+        episode: [n] number of the episode in each row.
+        vehicles: indices of the K shielded vehicles.
+        proposed: [n] or [n, K] proposed actions.
+        decision: the decision.
+        held: the plan that the shield held before the decision.
+
+    """
+    times, states, shape = now.time_s, now.nominal().states, (now.n, len(vehicles))
+    columns = (proposed, decision.applied, decision.reason, decision.margin, decision.intervened)
+    given, applied, reason, margin, replaced = (np.reshape(column, shape) for column in columns)
+    return [
+        Intervention(
+            k, vehicles[c], int(episode[k]), int(now.steps[k]), float(times[k]), float(given[k, c]),
+            float(applied[k, c]), int(reason[k, c]), float(decision.bound[k]), float(margin[k, c]), states[k].copy(),
+            held.plan[k].copy(),
+        )
+        for k, c in np.argwhere(replaced).tolist()
+    ]  # fmt: skip

@@ -1,0 +1,149 @@
+"""The paper's hybrid (Algorithm 1): at the alert, choose policy or baseline for the whole episode.
+
+The policy is rolled out in the engine from the alert on. Its harm is compared with ``H*``, the harm of the baseline
+E-V2X-BM, and whichever harms less drives the episode.
+
+With the coupled ``H*``, which comes from the same engine, the hybrid is never worse than the baseline in any world, as
+long as the policy repeats its rollout. A policy with random actions does not; it needs the step shield. With the
+paper's pairwise ``H*`` this guarantee does not hold: that value treats the two pairs as independent, and is about half
+of the harm that the same deceleration causes in the engine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.e_v2x_bm.coupled import EV2XBM
+from ethbrake_marl.agents.protocol import Agent, AgentAround, Source, check_agent
+from ethbrake_marl.engine.engine import Engine, Ruling
+from ethbrake_marl.engine.memory import Memory, ask_script, begin_script, renew_memory
+from ethbrake_marl.engine.scripts import Script
+from ethbrake_marl.game.actions import command_to_action
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.checks import check_scenario
+from ethbrake_marl.shield.contract import Guarded, ShieldGuard, ShieldMode
+
+Bound = Literal["coupled", "pairwise"]  # source of H* and a*: the engine's physics, or the paper's closed form
+
+
+class HybridAgent(AgentAround):
+    """Agent that drives by ``policy`` in the worlds where its rollout harms at most ``H*``, else by E-V2X-BM.
+
+    The rollout simulates the episode from the alert; ``H*`` is the harm of E-V2X-BM's constant deceleration. ``bound``
+    chooses how both are computed: in the engine's physics (``coupled``), or in the paper's closed form (``pairwise``).
+    ``harm_count`` chooses the harm that is compared. The memory holds ``chosen_policy`` [n], true where the policy
+    drives; the two compared harms ``policy_harm`` [n] and ``bound_harm`` [n]; and ``predicted_harm`` [n], the lower of
+    the two. Raises ``InvalidInput`` for an unknown ``bound`` or ``harm_count``, and if ``policy`` is not an agent.
+    """
+
+    adds = Source.MODEL  # both candidates are compared in the true model
+
+    def __init__(
+        self, policy: Agent, scenario: Scenario, *, bound: Bound = "coupled", harm_count: HarmCount = "first"
+    ) -> None:
+        check_agent(policy, "hybrid")
+        check_scenario(scenario, "hybrid")
+        super().__init__(policy, f"{policy.name}+episode{'' if bound == 'coupled' else ':pairwise'}")
+        self.backup = EV2XBM(bound, harm_count=harm_count, horizon_s=scenario.horizon_s)
+        self.scenario = scenario
+        self.bound: Bound = bound
+        self.harm_count: HarmCount = harm_count
+
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        """Simulate the policy's episode, choose the driver of each world, and return the memory.
+
+        Args:
+            alert: n worlds at the alert.
+            vehicle: index of the controlled vehicle (0 = front).
+            scripts: index of each scripted vehicle -> its script.
+
+        """
+        policy = begin_script(self.policy, alert, vehicle, scripts)
+        backup = begin_script(self.backup, alert, vehicle, scripts)
+        policy_harm = self._harm(alert, self.policy, vehicle)
+        bound = backup["predicted_harm"]
+        if self.bound == "coupled":
+            bound = self._harm(alert, FixedCommand(-backup["deceleration_mps2"]), vehicle)
+        return {
+            "policy": policy, "backup": backup, "policy_harm": policy_harm, "bound_harm": bound,
+            "predicted_harm": np.minimum(policy_harm, bound), "chosen_policy": policy_harm <= bound,
+        }  # fmt: skip
+
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        """Return the command of the driver that ``begin`` chose at the alert, [n] m/s2, and the new memory.
+
+        ``worlds`` are the worlds now; ``memory`` is what ``begin`` or the last call returned; ``vehicle`` is the index
+        of the controlled vehicle.
+        """
+        command, policy = ask_script(self.policy, worlds, memory["policy"], vehicle)
+        constant, _ = self.backup.act(worlds, memory["backup"], vehicle)
+        return np.where(memory["chosen_policy"], command, constant), {**memory, "policy": policy}
+
+    def _harm(self, worlds: Worlds, agent: Agent, vehicle: int) -> Floats:
+        return drive(worlds, agent, self.scenario, vehicle).ledger.world_harm(self.harm_count)
+
+
+class FixedCommand:
+    """Agent that holds the command ``command_mps2`` [n] of each world for the whole episode."""
+
+    name = "fixed"
+
+    def __init__(self, command_mps2: Floats) -> None:
+        self.command_mps2 = command_mps2
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """Return the command of each world, [n] m/s2."""
+        return self.command_mps2
+
+
+ROUNDING = 1e-6  # rounding error of an action in 32 bits
+
+
+class EpisodeGuard(ShieldGuard):
+    """Guard of mode ``episode``: at each alert the agent ``hybrid`` chooses who drives the whole episode.
+
+    The choice is the policy inside ``hybrid`` or E-V2X-BM; proposed actions do not change it. A proposal counts as
+    replaced where it differs from the applied action by more than the rounding of 32 bits. ``engine`` is the engine
+    that the guard will protect; ``where`` names the interface in error messages.
+    """
+
+    def __init__(self, engine: Engine, hybrid: HybridAgent, *, where: str = "shield") -> None:
+        super().__init__(engine, {}, None, mode=ShieldMode.EPISODE, where=where)  # the hybrid queries its policy itself
+        self._hybrid = hybrid
+
+    def _started(self, shield: Memory, alert: Worlds, rows: Ints) -> Memory:
+        begun = begin_script(self._hybrid, alert, self.vehicles[0], self.scripts)
+        return begun if shield is None else renew_memory(shield, rows, begun)
+
+    def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
+        """Return the actions of the driver that was chosen at the alert.
+
+        Args:
+            running: the engine before the step.
+            memory: memory of the guard.
+            proposed: [n, 1] proposed actions, which have no effect.
+
+        """
+        worlds = running.worlds
+        command, hybrid = ask_script(self._hybrid, worlds, memory.shield, self.vehicles[0])
+        applied = command_to_action(command, worlds.vehicles, self.vehicles[0])[:, np.newaxis]
+        memory = memory._replace(shield=hybrid)
+        return Ruling(proposed, applied, ~hybrid["chosen_policy"], ~running.ended, None, memory)
+
+    def intervened(self, ruling: Ruling) -> Bools:
+        """Return whether the applied action differs from the proposed one, [n, 1], for the decision ``ruling``."""
+        return np.asarray(abs(ruling.applied - ruling.proposed) > ROUNDING, np.bool_)
+
+    def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
+        """Return the infos by name: chosen driver and compared harms, each [n], and the actions.
+
+        ``ruling`` is the decision in the last step, or None. ``proposed_action`` is NaN where nothing was proposed.
+        """
+        compared = {name: memory.shield[name] for name in ("chosen_policy", "policy_harm", "bound_harm")}
+        return self._of_step(ruling) | compared

@@ -1,0 +1,210 @@
+"""Rollouts of the proposing policies: simulations in which they drive, whose actions become a plan.
+
+A plan holds one action for each decision. A rollout starts at the alert or at a later decision, and its plan is
+certified like any other (``plan_harm``). If a policy later deviates from its rollout, this costs interventions, but the
+bound still holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.driving import episode_engine, write_down
+from ethbrake_marl.agents.protocol import Agent, AgentAround, Team
+from ethbrake_marl.engine.memory import Memory, ask_script, begin_script, take_memory
+from ethbrake_marl.engine.scripts import Script
+from ethbrake_marl.errors import renumbered
+from ethbrake_marl.game.actions import action_to_command, command_to_action
+from ethbrake_marl.physics.episode import CLOCK
+from ethbrake_marl.physics.motion import has_acted
+from ethbrake_marl.physics.state import Floats, Ints, Worlds
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.certify import Backup, Decision, certify, from_now, plan_harm
+from ethbrake_marl.shield.comparison import ends_under, worlds_at
+from ethbrake_marl.shield.reasons import NO_CERTIFICATE, NOT_A_NUMBER, ShieldReason
+from ethbrake_marl.shield.running import Running
+
+
+class Proposer(NamedTuple):
+    """The proposing policies, with everything that a rollout of them needs."""
+
+    policies: Mapping[int, Agent]  # index of each shielded vehicle -> its policy, front to rear
+    memories: Mapping[int, Memory]  # index -> memory of its policy after this decision's action
+    worlds: Worlds  # the n worlds at this decision
+
+
+def rolled_out(
+    worlds: Worlds, policies: Mapping[int, Agent], scenario: Scenario, vehicle: int | tuple[int, ...], width: int
+) -> Floats:
+    """Return the actions of policies that drive unshielded from the alert to the end of the episodes.
+
+    Args:
+        worlds: n worlds at the alert.
+        policies: index of each shielded vehicle -> its policy.
+        scenario: the scenario, whose scripts drive the other vehicles.
+        vehicle: index of the shielded vehicle, or a tuple of indices, which chooses the shape of the result.
+        width: number of decisions to return.
+
+    Returns [n, width] for one index, [n, width, K] for a tuple. After the end of an episode, the action is full
+    braking.
+
+    """
+    team = Team({i: _Rounded(policy) for i, policy in policies.items()}, next(iter(policies.values())).name)
+    engine = episode_engine(worlds, team, scenario)
+    columns = write_down(engine, width, lambda: np.stack([engine.memories[i]["action"] for i in team.drivers], axis=1))
+    actions = np.where(np.isnan(columns), -1.0, columns)
+    return actions[:, :, 0] if isinstance(vehicle, int) else actions
+
+
+def certify_by_policy(
+    decision: Decision, running: Running, proposed: Floats, budget: Floats, held: Floats, proposer: Proposer
+) -> Decision:
+    """Return the decision with every rejected proposal accepted that a rollout (simulation) of the policy certifies.
+
+    Args:
+        decision: the decision without rollouts.
+        running: the n episodes at this decision.
+        proposed: [n] or [n, K] proposed actions.
+        budget: [n] largest accepted harm, m2/s2.
+        held: [n, L] or [n, L, K] plans that the shield held before the decision: one action for each decision.
+        proposer: the policies.
+
+    """
+    rejected = (decision.reason == NO_CERTIFICATE).reshape(running.n, -1).any(axis=1)
+    rows = np.flatnonzero(rejected)
+    if not rows.size:
+        return decision
+    again = certify_rollouts(running, proposed, rows, budget, held, proposer)
+    margin, plan = decision.margin.copy(), again.backup.plan
+    margin[rows] = np.maximum(margin[rows], again.margin)
+    assert (plan == from_now(decision.backup.plan[rows], plan, again.after.steps - 1)).all()  # same past
+    kept = np.flatnonzero((again.reason != NO_CERTIFICATE).reshape(len(rows), -1).all(axis=1))
+    return decision._replace(margin=margin).put(rows[kept], again._replace(margin=margin[rows]), kept)
+
+
+def certify_rollouts(
+    running: Running, proposed: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
+) -> Decision:
+    """Decide again in worlds whose proposals have no certificate, with rollouts of the policy as plans.
+
+    The plan that is tried consists of the clipped proposal and the policy's actions from the state after it. If this
+    plan keeps the budget, it becomes the backup and the proposal is accepted. Otherwise the reason stays
+    ``NO_CERTIFICATE``. With several vehicles, a vehicle whose proposal is NaN keeps its planned action.
+
+    Args:
+        running: the n episodes of the whole batch.
+        proposed: [n] or [n, K] proposed actions of the whole batch.
+        rows: [m] worlds in which to decide again.
+        budget: [n] largest accepted harm, m2/s2.
+        held: [n, L] or [n, L, K] plans (one action for each decision) that the shield now holds in the whole batch.
+        proposer: the policies.
+
+    Returns a decision for the m worlds of ``rows`` only.
+
+    """
+    part, least, silent = running.take(rows), budget[rows], np.isnan(proposed[rows])
+    planned = held[rows, np.minimum(running.steps[rows], held.shape[1] - 1)]
+    first = np.where(silent, planned, np.clip(proposed[rows], -1.0, 1.0))
+    plan = _later_plan(running.nominal(), first, rows, budget, held, proposer)
+    with renumbered(rows):
+        harm = plan_harm(part, plan)
+        kept = harm <= least
+        if part.caps.size:
+            within = (ends_under(part, plan)[1] <= part.caps).all(axis=1)
+            kept &= within.reshape(part.n, -1).all(axis=1)
+        decision = certify(part, first, Backup(plan, harm, no_constants(plan)), np.maximum(least, harm))
+    each = kept.reshape(-1, *[1] * (first.ndim - 1))
+    told = np.where(silent, NOT_A_NUMBER, ShieldReason.POLICY_ROLLOUT)
+    margin = np.broadcast_to((least - harm).reshape(each.shape), first.shape)
+    return decision._replace(intervened=silent | ~each, margin=margin, reason=np.where(each, told, NO_CERTIFICATE))
+
+
+def _later_plan(
+    running: Running, first: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
+) -> Floats:
+    """Return plans of m worlds: past actions, then ``first``, then the actions of a rollout of the policies.
+
+    A rollout stops as soon as its harm exceeds the budget.
+
+    Args:
+        running: the n episodes, with one possible world each.
+        first: [m] or [m, K] actions of the present decision.
+        rows: [m] the worlds.
+        budget: [n] largest accepted harm, m2/s2.
+        held: [n, L] or [n, L, K] current plans, which hold the past actions.
+        proposer: the policies.
+
+    """
+    policies, memories, worlds = proposer
+    memories, seen = take_memory(memories, rows), worlds.take(rows)
+    episodes, most, action = running.take(rows), budget[rows], first
+    plan, nothing = from_now(held[rows], -1.0, episodes.steps), np.zeros(len(rows))
+    while True:
+        going = np.flatnonzero(~episodes.ended)
+        plan[going, episodes.steps[going]] = action[going]
+        with renumbered(rows):
+            episodes = certify(episodes, action, Backup(plan, nothing, no_constants(plan)), nothing).after
+        N = episodes.problem.mass.shape[1]
+        harm = 4 * N - 3 if episodes.problem.clock[0, CLOCK.HARM_IS_TOTAL] == 1.0 else 3 * N - 2
+        so_far = episodes.states[:, harm : harm + N - 1].sum(axis=1)
+        episodes = episodes._replace(ended=episodes.ended | (so_far > most))
+        if episodes.ended.all():
+            return plan
+        # the worlds as a driver sees them at the next decision, with the last actions in force
+        commands = episodes.problem.command[:, -seen.N :].copy()  # without an obstacle ahead
+        for c, vehicle in enumerate(policies):
+            column = action if action.ndim == 1 else action[:, c]
+            commands[:, vehicle] = action_to_command(column, seen.vehicles, vehicle)
+        time, vehicles, force = episodes.time_s, seen.vehicles, episodes.states[:, -seen.N :]
+        commands = vehicles.piece_commands(commands, time)
+        acts = np.where(has_acted(vehicles.latency_s, time[:, np.newaxis]), commands, 0.0)
+        at_once = np.isinf(np.where(acts < force, vehicles.brake_rate_mps3, vehicles.release_rate_mps3))
+        in_force = np.where(at_once, acts, force)
+        seen = replace(worlds_at(seen, episodes.states), time_s=time, command_mps2=in_force)
+        with renumbered(rows):
+            proposed, memories = proposed_actions(policies, memories, seen)
+        action = proposed.reshape(first.shape)
+        action = np.where(np.isnan(action), -1.0, action)  # the shield does not apply NaN either
+
+
+def no_constants(plan: Floats) -> Floats:
+    """Return an empty list of constant actions for plans like ``plan``, so that none can replace the rest of a plan."""
+    return np.zeros((0, *plan.shape[2:]))
+
+
+def proposed_actions(
+    policies: Mapping[int, Agent], memories: Mapping[int, Memory], worlds: Worlds
+) -> tuple[Floats, dict[int, Memory]]:
+    """Return the actions that the policies propose, [n, K] in [-1, 1], and vehicle index -> new memory.
+
+    ``policies`` and ``memories`` map the index of each of K vehicles to its policy and the policy's memory; ``worlds``
+    are n worlds at a decision.
+    """
+    asked = {i: proposed_action(policy, worlds, memories[i], i) for i, policy in policies.items()}
+    after = {i: memory for i, (_, memory) in asked.items()}
+    return np.stack([action for action, _ in asked.values()], axis=1), after
+
+
+def proposed_action(policy: Agent, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+    """Return the actions [n] in [-1, 1] that ``policy`` proposes for ``vehicle`` (index), and its new memory.
+
+    A command that is NaN stays NaN.
+    """
+    command, memory = ask_script(policy, worlds, memory, vehicle)
+    return np.where(np.isnan(command), np.nan, command_to_action(command, worlds.vehicles, vehicle)), memory
+
+
+class _Rounded(AgentAround):
+    """Policy whose commands are converted to actions and back, as in a plan. Its memory holds the last ``action``."""
+
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        return {"policy": begin_script(self.policy, alert, vehicle, scripts), "action": np.zeros(alert.n)}
+
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        action, policy = proposed_action(self.policy, worlds, memory["policy"], vehicle)
+        action = np.where(np.isnan(action), -1.0, action)
+        return action_to_command(action, worlds.vehicles, vehicle), {"policy": policy, "action": action}

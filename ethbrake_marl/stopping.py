@@ -1,0 +1,40 @@
+"""Ctrl-C and SIGTERM as a flag to check between two steps, instead of an exception in the middle of one."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[Callable[[], bool]]:
+    """Context manager: yield a function that returns whether Ctrl-C or SIGTERM has asked to stop.
+
+    A second Ctrl-C or SIGTERM has its usual effect. Outside the main thread, where Python delivers no signals, the
+    function always returns False.
+    """
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked.is_set
+        return
+    before = {number: signal.getsignal(number) for number in _SIGNALS}
+
+    def listen(number: int, frame: FrameType | None) -> None:
+        asked.set()
+        restore()
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    try:
+        for number in _SIGNALS:
+            signal.signal(number, listen)
+        yield asked.is_set
+    finally:
+        restore()

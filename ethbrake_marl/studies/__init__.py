@@ -1,1 +1,0 @@
-"""Studies: what is trained, measured and shown by one command each."""

@@ -1,0 +1,245 @@
+"""The main experiment: train a policy, and evaluate it, alone and behind its shield, beside the baselines."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from ethbrake_marl.agents.learned import TRAINED_POLICY, LearnedAgent
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.errors import check_one_learner
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.identity import EPISODES, LIST_SEED
+from ethbrake_marl.evaluation.lineup import make_agents
+from ethbrake_marl.evaluation.per_world import results_to_json, write_per_world
+from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.evaluation.summary import SummaryTable, summarise
+from ethbrake_marl.evaluation.summary_row import SummaryRow
+from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.files.sheet import csv_text
+from ethbrake_marl.files.store import write_output
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.progress import OnProgress, Progress
+from ethbrake_marl.registry import Registry
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.paper_hybrid import HybridAgent
+from ethbrake_marl.training.recipe import TrainingRecipe
+from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.session import TrainResult, train
+
+BASELINES = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")
+
+
+@dataclass(frozen=True, slots=True)
+class Experiment:
+    """A trained policy and its evaluation: the input of the functions that write reports about a run."""
+
+    trained: TrainResult  # result of the training, which may have been interrupted
+    agents: Mapping[str, Agent]  # by name: baselines, the trained policy, and ``hybrid``, the policy behind its shield
+    evaluation: Evaluation  # outcomes of these agents on the evaluation list
+    rows: SummaryTable  # results table of the evaluation, one row per agent
+    list_seed: int  # seed of the evaluation's worlds
+    harm_count: HarmCount  # harm that all agents minimise
+    started: float  # start of the experiment by ``time.monotonic`` (s)
+
+    @property
+    def run(self) -> RunDirectory:
+        """Folder of the run, as an object that names its files."""
+        return RunDirectory(self.trained.directory)
+
+
+@dataclass(frozen=True, slots=True)
+class RunReport:
+    """What ``ethbrake run`` prints about a report that was written."""
+
+    tables: tuple[Any, ...]  # tables to print instead of the usual ones
+    note: str  # text that says where the report is
+
+
+MakeReport = Callable[[Experiment, OnProgress], RunReport]  # writes a report; the second argument takes its progress
+
+
+def register_run_report(name: str, make: MakeReport) -> None:
+    """Register a function that writes a report into the folder of every ``ethbrake run``, after its results.
+
+    ``name`` is the name of the report, which no other report may have; ``make`` writes it from an ``Experiment``.
+
+    An installed package does the same with an entry point of the group ``ethbrake_marl.run_reports``.
+    """
+    RUN_REPORTS.add(name, make, lambda other: other is make)
+
+
+RUN_REPORTS: Registry[MakeReport] = Registry("report of a run", "run_reports", register_run_report)
+
+
+@dataclass(frozen=True, slots=True)
+class ExperimentResult:
+    """What ``run_experiment`` returns: the training, the results, and the tables and notes to print."""
+
+    trained: TrainResult  # result of the training, which may have been interrupted
+    results: list[dict[str, Any]]  # content of results.json: one object per agent
+    tables: tuple[Any, ...]  # tables of the evaluation for a terminal
+    notes: tuple[str, ...]  # texts that say where results and reports are
+
+
+def run_experiment(
+    scenario: Scenario,
+    directory: Path,
+    *,
+    recipe: TrainingRecipe,
+    steps: int | None = None,
+    seed: int | None = None,
+    episodes: int = EPISODES,
+    list_seed: int = LIST_SEED,
+    force: bool = False,
+    settings: Sequence[str] = (),
+    on_progress: OnProgress | None = None,
+) -> ExperimentResult:
+    """Train a policy, evaluate it alone and behind its shield beside the baselines, and write the results.
+
+    All agents minimise the harm that the policy is trained for (``reward.harm_count`` of the recipe). Installed
+    extensions then write their reports.
+
+    Ctrl-C during the training ends it after the current update, and the policy so far is evaluated. A second Ctrl-C, or
+    one during the evaluation, raises ``KeyboardInterrupt``; the folder still contains the policy. ``run.json`` records
+    how the run ended.
+
+    Args:
+        scenario: scenario with exactly one learner.
+        directory: the new folder of the run.
+        recipe: recipe of the training.
+        steps: overrides the recipe's number of decisions.
+        seed: overrides the recipe's seed of the training.
+        episodes: number of worlds of the evaluation list.
+        list_seed: seed of the evaluation list.
+        force: replace an earlier run.
+        settings: how recipe and scenario differ from their files, ``KEY=VALUE`` each; recorded in ``config.json``.
+        on_progress: called with the progress of training, evaluation and reports.
+
+    Raises what ``train`` and ``evaluate`` raise; ``AlreadyExists`` for an existing run, before any work.
+
+    """
+    started = time.monotonic()
+    tell = on_progress or (lambda progress: None)
+    names = [scenario.vehicle_names[i] for i in scenario.learners]
+    check_one_learner(scenario.name, names, "say which vehicle the agents drive")
+    reports = [RUN_REPORTS[name] for name in RUN_REPORTS]  # one that cannot be loaded ends the run before it begins
+    sample = scenario.sample(episodes, list_seed)
+    trained = train(
+        recipe, scenario, directory, steps=steps, seed=seed, force=force, settings=settings, on_progress=on_progress
+    )
+    run, harm_count = RunDirectory(trained.directory), recipe.reward.harm_count
+    with _status(run, trained.status):
+        agents = compared_agents(trained.policy, scenario, harm_count)
+        order, n = list(agents), sample.worlds.n
+        total = n * len(order)
+        if trained.status == "interrupted":
+            note = (
+                f"interrupted after {trained.steps:,} steps: evaluating the policy so far; Ctrl-C again stops at once"
+            )
+            tell(Progress("evaluation", 0, total, note=note))
+        evaluation = evaluate(
+            sample,
+            agents,
+            scenario=scenario,
+            seed=list_seed,
+            on_progress=lambda name, done: tell(Progress("evaluation", n * order.index(name) + done, total)),
+        )
+        tell(Progress("results", 0, 1))
+        rows = summarise(evaluation)
+        per_world = run.path / "per_world.csv"
+        write_per_world(per_world, evaluation, force=True)
+        results = write_results(run.path, "results", rows, harm_count, per_world)
+        tell(Progress("results", 1, 1))
+        experiment = Experiment(trained, agents, evaluation, rows, list_seed, harm_count, started)
+        made = [make(experiment, tell) for make in reports]
+    tables = tuple(table for report in made for table in report.tables)
+    notes = tuple(report.note for report in made)
+    return ExperimentResult(
+        trained,
+        results,
+        tables or (*rows.tables(),),
+        notes or (f"results, with every measure: {run.path / 'results.json'}",),
+    )
+
+
+def compared_agents(
+    policy: Policy, scenario: Scenario, harm_count: HarmCount, baselines: Sequence[str] = BASELINES
+) -> dict[str, Agent]:
+    """Return the agents to compare, by name: the baselines, the policy alone, and ``hybrid``, the policy shielded.
+
+    Args:
+        policy: the trained policy.
+        scenario: scenario whose only learner they drive.
+        harm_count: harm that baselines minimise and the shield bounds: ``first`` or ``total``.
+        baselines: specs of the baselines.
+
+    """
+    alone = LearnedAgent(policy, TRAINED_POLICY)
+    learned: dict[str, Agent] = {TRAINED_POLICY: alone, "hybrid": HybridAgent(alone, scenario, harm_count=harm_count)}
+    return {**make_agents(baselines, scenario, harm_count=harm_count), **learned}
+
+
+def write_results(
+    folder: Path, name: str, rows: Sequence[SummaryRow], harm_count: HarmCount, per_world: Path | None = None
+) -> list[dict[str, Any]]:
+    """Write a results table as ``NAME.json`` and ``NAME.csv`` into ``folder``; return the content of the JSON file.
+
+    Args:
+        folder: existing folder.
+        name: name of the files, without their endings.
+        rows: rows of the table, one per agent.
+        harm_count: harm that the agents minimise, which is recorded.
+        per_world: existing file with one row per world, to which the JSON file refers.
+
+    """
+    results = results_to_json(rows, per_world=per_world, settings={"harm_count": harm_count})
+    content = json.dumps(results, indent=2, allow_nan=False) + "\n"
+    write_output(folder / f"{name}.json", content.encode(), force=True)
+    write_output(folder / f"{name}.csv", results_csv(rows).encode(), force=True)
+    return results
+
+
+def results_csv(rows: Sequence[SummaryRow]) -> str:
+    """Return a results table as CSV text, with one line per agent.
+
+    ``rows`` is the table. The interval of column ``x`` is in ``x_low`` and ``x_high``; missing values are empty.
+    """
+    lines = []
+    for told in (row.to_json() for row in rows):
+        parameters = told.pop("parameters")
+        for name, value in told.items():
+            if isinstance(value, list | dict) and not name.endswith("_interval"):
+                told[name] = json.dumps(value, allow_nan=False)
+        lines.append({"scenario": parameters["scenario"], "seed": parameters["seed"], **told})
+    return csv_text(lines)
+
+
+@contextmanager
+def _status(run: RunDirectory, status: str) -> Iterator[None]:
+    """Context manager around the evaluation of a run: record in ``run.json`` that it is running, then how it ended.
+
+    Without an exception, ``status`` (the status of the training) is recorded. For an exception inside, ``interrupted``
+    (Ctrl-C) or ``failed`` is recorded with the error, which is raised again.
+    """
+    _note(run, "running", "evaluation", None)
+    try:
+        yield
+    except BaseException as error:
+        _note(run, "interrupted" if isinstance(error, KeyboardInterrupt) else "failed", "evaluation", repr(error))
+        raise
+    _note(run, status, "report", None)
+
+
+def _note(run: RunDirectory, status: str, stage: str, reason: str | None) -> None:
+    """Update status, stage and reason in ``run.json``. Its steps and ``wall_s`` remain those of the training."""
+    content = read_object(run.status)
+    ended = None if status == "running" else datetime.now(UTC).isoformat(timespec="seconds")
+    run.write_json(run.status, {**content, "status": status, "stage": stage, "ended_utc": ended, "reason": reason})

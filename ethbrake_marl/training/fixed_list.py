@@ -1,0 +1,83 @@
+"""Measurement of policies during training, on the fixed list of worlds that the recipe names (``evaluation``)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.agents.driving import Episodes, drive, script_agents
+from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.protocol import Team
+from ethbrake_marl.errors import AgentFailed, PhysicsError
+from ethbrake_marl.evaluation.statistics import mean
+from ethbrake_marl.game.objectives import objective_harm
+from ethbrake_marl.physics.left_out import leaving_out_failed
+from ethbrake_marl.physics.state import Worlds
+from ethbrake_marl.policies.teams import Trained
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.training import Training
+
+AT_HORIZON = "horizon_rate"  # share of the fixed list's episodes in which something still moves at the horizon
+
+CHUNK = 2_500  # worlds driven together; limits memory, and does not change results
+
+Evaluate = Callable[[Any], Mapping[str, float]]  # takes a ``Policy`` or a ``PolicyTeam``; returns its metrics
+
+Measure = Callable[[Training], Evaluate]  # takes a training; returns the function that measures its policies
+
+
+def measure_on_list(training: Training) -> Evaluate:
+    """Draw the fixed list of worlds that the recipe names, and return the function that measures policies on it.
+
+    That function takes a ``Policy`` or ``PolicyTeam``, and returns means over the list by name, equal to the results of
+    ``evaluate``: ``first_impact_harm``, ``total_harm``, ``collision_rate`` and ``horizon_rate``. If a learner has
+    another objective than the line's harm, it adds ``objective_vehicle_2`` and so on, and their mean ``objective``.
+    """
+    recipe, scenario = training.recipe, training.scenario
+    names, harm_count = scenario.vehicle_names, recipe.reward.harm_count
+    objectives = recipe.reward.settled(scenario.objective, scenario.vehicles)[1]
+    worlds = scenario.sample(recipe.evaluation.worlds, recipe.evaluation.seed).worlds
+
+    def measure(trained: Trained) -> dict[str, float]:
+        drivers = {names.index(name): LearnedAgent(policy, "policy") for name, policy in trained.drivers.items()}
+        parts = list(drive_list(worlds, Team(drivers, "policy"), scenario))
+
+        def joined(column: Callable[[Episodes], NDArray[Any]]) -> NDArray[Any]:
+            return np.concatenate([column(part) for part in parts])
+
+        metrics = {
+            "first_impact_harm": mean(joined(lambda part: part.ledger.world_harm("first"))).value,
+            "total_harm": mean(joined(lambda part: part.ledger.world_harm("total"))).value,
+            "collision_rate": float(joined(lambda part: part.ledger.collided).mean()),
+            AT_HORIZON: float(joined(lambda part: ~part.at_rest).mean()),
+        }
+        if objectives:
+            harm = joined(lambda part: objective_harm(part.ledger, harm_count, objectives))
+            each = {names[i]: mean(harm[:, i]).value for i in scenario.learners}
+            metrics[RunDirectory.OBJECTIVE] = sum(each.values()) / len(each)
+            metrics |= {f"{RunDirectory.OBJECTIVE}_{name}": value for name, value in each.items()}
+        return metrics
+
+    return measure
+
+
+def drive_list(worlds: Worlds, team: Team, scenario: Scenario) -> Iterator[Episodes]:
+    """Let a team drive worlds from the alert, and yield the results of each chunk of 2,500 worlds.
+
+    Worlds that cannot be advanced are left out. Raises ``PhysicsError`` if every world is left out.
+    """
+    scripts = [script.name for script in script_agents(scenario, except_for=team.drivers).values()]
+    failed: dict[int, str] = {}
+    for first in range(0, worlds.n, CHUNK):
+        rows = np.arange(first, min(first + CHUNK, worlds.n))
+        with AgentFailed.naming(team.name, scripts):
+            episodes, _, lost = leaving_out_failed(lambda some: drive(worlds.take(some), team, scenario), rows)
+        failed |= lost
+        if episodes is not None:
+            yield episodes
+    if len(failed) == worlds.n:
+        raise PhysicsError(failed)

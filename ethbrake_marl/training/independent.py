@@ -1,0 +1,182 @@
+"""Independent learners: one PPO each, with its own network, optimiser and buffer, in the same worlds.
+
+A row of the environment ends with the number of its learner (``make_sb3_vec_env(..., appended="number")``). Rollouts
+are collected for all learners together; then each learner learns from its own part, with Stable-Baselines3's
+``PPO.train``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import torch
+from gymnasium.spaces import Box, Space
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor, nn
+
+
+class SeparatePolicies(BasePolicy):
+    """One actor-critic policy for each learner, with its own optimiser, behind the interface of a single policy.
+
+    The last entry of an observation row is the number of the learner that it belongs to (0 = foremost). Learners whose
+    numbers are in ``resting`` do not explore: they act by their mean.
+
+    Args:
+        observation_space: space of a row, whose last entry is the number of the learner.
+        action_space: space of one learner's action.
+        lr_schedule: learning rate as a function of the remaining share of the training.
+        use_sde: whether to use state-dependent exploration.
+        columns: for each learner, front to rear, the columns of a row that it observes.
+        network: other keyword arguments of ``ActorCriticPolicy``.
+
+    """
+
+    def __init__(
+        self,
+        observation_space: Space[Any],
+        action_space: Any,
+        lr_schedule: Schedule,
+        use_sde: bool = False,
+        *,
+        columns: Sequence[Sequence[int]],
+        **network: Any,
+    ) -> None:
+        super().__init__(observation_space, action_space)
+        assert isinstance(observation_space, Box)
+        low, high, kind = observation_space.low, observation_space.high, observation_space.dtype.type
+        own = [Box(low[list(each)], high[list(each)], dtype=kind) for each in columns]
+        self.columns = columns
+        self.members = nn.ModuleList(
+            ActorCriticPolicy(space, action_space, lr_schedule, use_sde=use_sde, **network) for space in own
+        )
+        self.resting: frozenset[int] = frozenset()
+
+    @property
+    def log_std(self) -> Tensor:
+        """Logarithm of the exploration noise of all learners, front to rear, concatenated to [L]."""
+        return torch.cat([member.log_std for member in self.policies])
+
+    @property
+    def policies(self) -> list[ActorCriticPolicy]:
+        """Policy of each learner, front to rear, as a list; the same objects as ``members``."""
+        return [member for member in self.members if isinstance(member, ActorCriticPolicy)]
+
+    def forward(self, observation: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+        """Return actions [n, 1], values [n, 1] and log-probabilities [n] for observation rows [n, F + 1].
+
+        ``deterministic``: all learners act by their means, without exploration.
+        """
+        count = len(observation)
+        actions, values, likelihood = torch.empty(count, 1), torch.empty(count, 1), torch.empty(count)
+        for number, policy, rows in self._by_learner(observation):
+            still = deterministic or number in self.resting
+            actions[rows], values[rows], likelihood[rows] = policy(observation[rows][:, self.columns[number]], still)
+        return actions, values, likelihood
+
+    def predict_values(self, observation: Any) -> Tensor:
+        """Return the critics' values [n, 1] of observation rows [n, F + 1]."""
+        values = torch.empty(len(observation), 1)
+        for number, policy, rows in self._by_learner(observation):
+            values[rows] = policy.predict_values(observation[rows][:, self.columns[number]])
+        return values
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
+        return self.forward(observation, deterministic)[0]
+
+    def _by_learner(self, observation: Tensor) -> Iterator[tuple[int, ActorCriticPolicy, Tensor]]:
+        numbers = observation[:, -1]
+        for number, policy in enumerate(self.policies):
+            rows = (numbers == number).nonzero()[:, 0]
+            if len(rows):
+                yield number, policy, rows
+
+
+class IndependentPPO(PPO):
+    """One PPO for each learner, all in the same worlds.
+
+    They learn all at once or, with ``turns``, one after the other. While one learner learns, the others drive by their
+    means; the turns divide the updates of the training evenly. The log of a learner's training is named
+    ``vehicle_2/loss`` and so on.
+
+    Args:
+        env: vectorised environment whose rows end with the number of their learner.
+        names: names of the learners, front to rear.
+        turns: how often each learner has its turn to learn; None: all learn at once.
+        columns: for each learner, the columns of a row that it observes.
+        settings: other keyword arguments of ``PPO``.
+
+    """
+
+    policy: SeparatePolicies  # type: ignore[assignment]  # has the parts of an actor-critic policy that PPO uses
+
+    def __init__(
+        self, env: VecEnv, names: Sequence[str], turns: int | None, columns: Sequence[Sequence[int]], **settings: Any
+    ) -> None:
+        self.names, self.turns = tuple(names), turns
+        arguments = {**settings.pop("policy_kwargs"), "columns": columns}
+        super().__init__(SeparatePolicies, env, policy_kwargs=arguments, **settings)  # type: ignore[arg-type]
+        self._learning: tuple[int, ...] = ()
+
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
+    ) -> bool:
+        """Collect rollouts as PPO does, but let only those learners explore whose turn it is to learn.
+
+        The arguments are those of Stable-Baselines3. Returns False if the callback stopped the training.
+        """
+        everyone = range(len(self.names))
+        self._learning = tuple(everyone) if self.turns is None else (self._whose_turn(self.turns),)
+        self.policy.resting = frozenset(everyone) - frozenset(self._learning)
+        return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+
+    def train(self) -> None:
+        """Update each learner whose turn it is, by ``PPO.train`` on its own rows and with its own optimiser."""
+        joint, buffer, log, updates = self.policy, self.rollout_buffer, self._logger, self._n_updates
+        parts = {number: self._part(buffer, number) for number in self._learning}
+        try:
+            for number, part in parts.items():
+                self.policy, self.rollout_buffer = joint.policies[number], part  # type: ignore[assignment]
+                self._logger, self._n_updates = Logger(None, []), updates
+                super().train()
+                for name, value in self._logger.name_to_value.items():
+                    excluded = self._logger.name_to_excluded[name]
+                    log.record(name.replace("train", self.names[number], 1), value, excluded)
+        finally:
+            self.policy, self.rollout_buffer, self._logger = joint, buffer, log
+
+    def _whose_turn(self, turns: int) -> int:
+        """Return the number of the learner (0 = foremost) that learns in the next update.
+
+        Each learner has ``turns`` turns in a training. The result follows from the number of steps so far, so a resumed
+        training agrees.
+        """
+        rollout = self.n_envs * self.n_steps
+        planned = -(-self._total_timesteps // rollout)
+        stretch = self.num_timesteps // rollout * turns * len(self.names) // planned
+        return stretch % len(self.names)
+
+    def _part(self, buffer: RolloutBuffer, number: int) -> RolloutBuffer:
+        """Return a new buffer with the experience of learner ``number`` (0 = foremost) only."""
+        own = self.policy.policies[number].observation_space
+        count = len(self.names)
+        part = RolloutBuffer(
+            buffer.buffer_size,
+            own,
+            self.action_space,
+            self.device,
+            gae_lambda=self.gae_lambda,
+            gamma=self.gamma,
+            n_envs=self.n_envs // count,
+        )
+        for name in ("actions", "rewards", "episode_starts", "values", "log_probs", "returns", "advantages"):
+            setattr(part, name, getattr(buffer, name)[:, number::count].copy())
+        part.observations = buffer.observations[:, number::count][:, :, self.policy.columns[number]]
+        part.pos, part.full = buffer.buffer_size, True
+        return part

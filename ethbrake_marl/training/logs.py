@@ -1,0 +1,36 @@
+"""Logs of a training: ``progress.csv`` and TensorBoard events."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from stable_baselines3.common.logger import CSVOutputFormat, KVWriter, TensorBoardOutputFormat
+from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+
+from ethbrake_marl.training.checkpoint import TrainingState
+from ethbrake_marl.training.run_folder import RunDirectory
+
+
+def open_logs(run: RunDirectory, state: TrainingState | None) -> list[KVWriter]:
+    """Open ``progress.csv`` and the TensorBoard events of a run for writing.
+
+    Args:
+        run: folder of the run.
+        state: checkpoint after whose rows to continue; rows after it are dropped. None: begin with empty logs.
+
+    Returns the two writers, for ``output_formats`` of Stable-Baselines3's logger.
+
+    """
+    run.progress.unlink(missing_ok=True)  # it may be a link
+    if state is None:
+        for left in run.tensorboard.glob("events.out.tfevents.*"):
+            left.unlink()
+    table = CSVOutputFormat(str(run.progress))
+    events: Any = TensorBoardOutputFormat(str(run.tensorboard))  # whose writer torch declares as None
+    if state is not None:
+        table.file.write(state.numbers["progress"])
+        table.file.flush()
+        table.keys = [name for name in state.numbers["progress"].partition("\n")[0].split(",") if name]
+        restart = Event(step=state.steps + 1, session_log=SessionLog(status=SessionLog.START))
+        events.writer.file_writer.add_event(restart)  # makes TensorBoard drop all events from this step on
+    return [table, events]

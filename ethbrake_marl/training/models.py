@@ -1,0 +1,107 @@
+"""Build the environment and the model of a training, and turn the model's weights into policies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.game.full_state import Appended
+from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.policies.teams import PolicyTeam, Trained
+from ethbrake_marl.training.algorithm import Algorithm
+from ethbrake_marl.training.finite import refuse_gradients
+from ethbrake_marl.training.recipe import Scheme
+from ethbrake_marl.training.training import Training
+
+Model = BaseAlgorithm  # a model of Stable-Baselines3
+
+
+class Learner(NamedTuple):
+    """A model that learns, with its algorithm and the training that it is for."""
+
+    training: Training  # recipe and scenario
+    algorithm: Algorithm  # how to read the model's policies, optimisers and other learned tensors
+    model: Model  # the model of Stable-Baselines3
+
+    def policies(self) -> Trained:
+        """Return a copy of the current policy, or one policy for each learner in the scheme ``independent``."""
+        actors = self.algorithm.actors(self.model)
+        return make_policies(
+            self.training, self.model.num_timesteps, lambda k, network: self.algorithm.tensors(actors[k], network)
+        )
+
+
+def make_environment(training: Training) -> EthBrakeVecEnv:
+    """Build the vectorised environment of a training, with one row for each learner of each world."""
+    recipe = training.recipe
+    appended: dict[Scheme, Appended] = {"independent": "number", "centralised": "state"}
+    return make_sb3_vec_env(
+        training.scenario,
+        recipe.n_envs,
+        recipe.seed,
+        reward=recipe.reward,
+        observation=training.observation,
+        horizon_is_end=recipe.horizon_is_end,
+        appended=appended.get(training.scheme),
+    )
+
+
+def make_model(algorithm: Algorithm, training: Training, environment: EthBrakeVecEnv) -> Model:
+    """Build the model of a training, with optimisers that refuse gradients which are not finite.
+
+    Args:
+        algorithm: the algorithm of the training's recipe.
+        training: recipe and scenario.
+        environment: the environment to learn in, from ``make_environment``.
+
+    Raises ``InvalidInput`` for a model that normalises observations by ``VecNormalize``.
+
+    """
+    model = algorithm.build(training, environment)
+    if getattr(model, "get_vec_normalize_env", lambda: None)() is not None:
+        raise InvalidInput(
+            f"algorithm {training.recipe.algorithm!r}: its model is trained under VecNormalize, whose statistics are no"
+            " part of a policy bundle; observations here are scaled already"
+        )
+    refuse_gradients(model, algorithm)
+    return model
+
+
+def make_policies(
+    training: Training, steps: int, tensors: Callable[[int, NetworkSpec], Mapping[str, Float32s]]
+) -> Trained:
+    """Return one policy for all learners, or one for each learner in the scheme ``independent``.
+
+    Args:
+        training: recipe and scenario.
+        steps: number of decisions after which these weights were learned, which is recorded.
+        tensors: function that returns the weights of the k-th policy (0 = foremost learner), by name, for a network.
+
+    """
+    recipe, scenario = training.recipe, training.scenario
+    names = tuple(training.drivers)
+    apart = training.scheme == "independent"
+    policies = []
+    for k, learners in enumerate([(name,) for name in names] if apart else [names]):
+        observation = training.observations[learners[0]]
+        network = recipe.network_spec(observation.size)
+        if training.scheme == "centralised":
+            network = network.model_copy(update={"value_hidden": ()})  # a vehicle cannot use the central critic
+        policy = Policy.make(
+            tensors(k, network),
+            algorithm=recipe.algorithm,
+            network=network,
+            observation=observation,
+            learners=learners,
+            scenario=scenario.model_dump(mode="json"),
+            reward=recipe.reward.model_dump(mode="json"),
+            seeds={"training": recipe.seed, "evaluation": recipe.evaluation.seed},
+            steps=steps,
+        )
+        policies.append(policy)
+    return PolicyTeam(dict(zip(names, policies, strict=True))) if apart else policies[0]

@@ -1,0 +1,79 @@
+"""Networks of Stable-Baselines3's models, and the conversion of their weights to the tensors of a policy bundle."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.policies import BasePolicy
+from torch import Tensor, nn
+
+from ethbrake_marl.policies.network_spec import Activation, Float32s, NetworkSpec
+from ethbrake_marl.training.recipe import NetworkShape
+
+ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh}
+
+
+def tensors_of(policy: BasePolicy, spec: NetworkSpec) -> dict[str, Float32s]:
+    """Return a copy of the weights of Stable-Baselines3's PPO or SAC policy, by their names in a policy bundle.
+
+    ``spec`` is the bundle's network, which has the same layers as ``policy``.
+    """
+    state = policy.state_dict()
+    return {name: copy_of(state[theirs]) for name, theirs in sb3_names(spec).items()}
+
+
+def sb3_names(spec: NetworkSpec) -> dict[str, str]:
+    """Return name of a tensor in a policy bundle -> its name in Stable-Baselines3's policy.
+
+    ``spec`` is the bundle's network: of PPO if its ``output`` is ``clip``, else of SAC. Stable-Baselines3 also numbers
+    the activations, so a hidden layer's number there is twice ours.
+    """
+    if spec.output == "clip":
+        ours = {"policy": ("mlp_extractor.policy_net", "action_net"), "value": ("mlp_extractor.value_net", "value_net")}
+        noise = "log_std"
+    else:
+        ours, noise = {"policy": ("actor.latent_pi", "actor.mu")}, "actor.log_std"
+
+    def theirs(name: str) -> str:
+        network, layer, *kind = name.split(".")
+        hidden, output = ours[network]
+        layers = {"log_std": noise, "output": output}
+        return ".".join([layers.get(layer) or f"{hidden}.{2 * int(layer)}", *kind])
+
+    return {row.name: theirs(row.name) for row in spec.tensors}
+
+
+def tensors_of_layers(name: str, layers: nn.Sequential) -> dict[str, Float32s]:
+    """Return a copy of the weights of a perceptron, by their names in a policy bundle.
+
+    Args:
+        name: name of this network in the bundle, with which the tensors' names begin: ``policy``, ``gate``.
+        layers: linear layers, possibly with activations between them; the last linear layer is the output.
+
+    """
+    linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
+    numbers = [*map(str, range(len(linear) - 1)), "output"]
+    pairs = {f"{name}.{k}": layer for k, layer in zip(numbers, linear, strict=True)}
+    return {
+        f"{where}.{kind}": copy_of(tensor)
+        for where, layer in pairs.items()
+        for kind, tensor in (("weight", layer.weight), ("bias", layer.bias))
+    }
+
+
+def copy_of(tensor: Tensor) -> Float32s:
+    return tensor.detach().cpu().numpy().astype(np.float32)
+
+
+def ppo_arguments(shape: NetworkShape) -> dict[str, Any]:
+    """Return ``policy_kwargs`` of Stable-Baselines3's PPO for a recipe's key ``network``.
+
+    Actor and critic are separate, with orthogonal initial weights.
+    """
+    return {
+        "net_arch": {"pi": list(shape.policy), "vf": list(shape.value)},
+        "activation_fn": ACTIVATIONS[shape.activation],
+        "ortho_init": True,
+        "log_std_init": shape.initial_log_std,
+    }

@@ -1,0 +1,121 @@
+"""The learners of a run as a team: ``team.json`` says which policy drives which vehicle."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.protocol import Team
+from ethbrake_marl.errors import CorruptBundle, InvalidInput
+from ethbrake_marl.files.model import FileModel, Wording, read_model, refuse
+from ethbrake_marl.files.plain import parse_strict_json, read_plain
+from ethbrake_marl.files.yaml import Document
+from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.training.recipe import Scheme
+from ethbrake_marl.training.run_folder import RunDirectory
+
+
+def bundle_of(scheme: Scheme, vehicle: str) -> str:
+    """Return the folder, relative to the run's folder, of the policy that drives a learner in this scheme.
+
+    ``vehicle`` is the learner's name, such as ``vehicle_2``.
+    """
+    return f"policy/{vehicle}" if scheme == "independent" else "policy"
+
+
+_RIGHT_TEAM = (
+    'right is, for instance, {"scheme": "shared", "vehicles": 3, "drivers": {"vehicle_2": "policy", "vehicle_3":'
+    ' "policy"}}'
+)
+
+
+class TeamFile(FileModel):
+    """Content of ``team.json`` in a run's folder, which says which policy drives which vehicle."""
+
+    format: Literal["ethbrake-team"] = "ethbrake-team"  # mark of this kind of file
+    format_version: Literal[1] = 1  # version of the format
+    scheme: Scheme  # how the learners trained together
+    vehicles: Annotated[int, Field(ge=2, le=64)]  # number of vehicles of the line
+    drivers: Annotated[dict[str, str], Field(min_length=1)]  # learner's name -> folder of its policy in the run
+
+    @model_validator(mode="after")
+    def _drivers_of_the_line_and_scheme(self) -> TeamFile:
+        line = [f"vehicle_{i + 1}" for i in range(self.vehicles)]
+        for name, bundle in self.drivers.items():
+            if name not in line:
+                refuse(("drivers",), name, f"must be one of {line[0]} to {line[-1]}")
+            if bundle != bundle_of(self.scheme, name):
+                refuse(("drivers", name), bundle, f"must be {bundle_of(self.scheme, name)} under scheme {self.scheme}")
+        alone = len(self.drivers) == 1
+        if (self.scheme == "single" and not alone) or (self.scheme == "independent" and alone):
+            right = "two vehicles or more" if alone else "one vehicle"
+            refuse(("drivers",), self.drivers, f"must be {right} under scheme {self.scheme}")
+        return self
+
+
+def read_team(file: Path) -> TeamFile:
+    """Read and check the file ``team.json`` of a run; raise ``CorruptBundle`` naming what is wrong with it."""
+    data = read_plain(file, 1 << 20)
+    try:
+        document = Document(str(file), parse_strict_json(data), {})
+    except ValueError as error:
+        raise CorruptBundle(f"{file}: is not JSON ({error}); {_RIGHT_TEAM}") from None
+    try:
+        return read_model(document, TeamFile, Wording(TeamFile, _RIGHT_TEAM), f"of keys to values; {_RIGHT_TEAM}")
+    except InvalidInput as error:
+        raise CorruptBundle(str(error)) from None
+
+
+def has_policy_each(run: RunDirectory) -> bool:
+    """Return whether the learners of a run have different policies; False if it holds no ``team.json``."""
+    return os.path.lexists(run.team) and len(set(read_team(run.team).drivers.values())) > 1
+
+
+def load_team(
+    folder: str | os.PathLike[str],
+    scenario: str | Path | Scenario,
+    name: str = "team",
+    vehicles: Collection[int] | None = None,
+) -> Team:
+    """Load the policies of a run as a team in which each vehicle is driven by the policy that it was trained with.
+
+    Args:
+        folder: folder of the run.
+        scenario: scenario to drive in, its name or its path.
+        name: name of the team.
+        vehicles: indices (0 = front) of the vehicles to drive; None: the scenario's learners. Other learners of the run
+            are omitted.
+
+    Raises ``InvalidInput`` if the folder holds no team, or if the team has another line length or lacks one of the
+    vehicles; ``CorruptBundle`` for a damaged team.
+
+    """
+    path, scenario = Path(folder), scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+    file = RunDirectory(path).team
+    if not os.path.lexists(file):
+        raise InvalidInput(f"{path}: holds no team ({file.name}); give the folder of a run, or a bundle as ppo@{path}")
+    team = read_team(file)
+    if team.vehicles != scenario.vehicles:
+        shared = len(set(team.drivers.values())) == 1
+        raise InvalidInput(
+            f"{path}: is a team for a line of {team.vehicles} vehicles, scenario {scenario.name!r} has"
+            f" {scenario.vehicles}; "
+            + (
+                f"its one policy can drive other lines: policy@{path}"
+                if shared
+                else "only a shared policy can drive others"
+            )
+        )
+    wanted = {scenario.vehicle_names[i]: i for i in (scenario.learners if vehicles is None else vehicles)}
+    missing = [each for each in wanted if each not in team.drivers]
+    if missing or not wanted:
+        who = ", ".join(missing) or "nobody"
+        raise InvalidInput(f"{path}: drives {', '.join(team.drivers)}; scenario {scenario.name!r} has {who} to drive")
+    return Team({i: LearnedAgent(load_policy(path / team.drivers[each]), name) for each, i in wanted.items()}, name)

@@ -1,0 +1,122 @@
+"""``docs/layout.md``, made from the package: ``python -m tests.docs.layout`` writes it, a test compares it."""
+
+import ast
+import tomllib
+from collections import defaultdict
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "ethbrake_marl"
+PAGE = ROOT / "docs" / "layout.md"
+BEGINNING = """# How the code is laid out
+
+Where does something live? The package is a core and extensions. The core is what the paper needs,
+and what training, scenarios and levels of cooperation need. An extension is a folder that can be
+deleted: it registers itself by entry points (`pyproject.toml`), and no module of the core names
+it. To delete one, delete its folder, its folder in `tests/extensions/`, its lines in
+`pyproject.toml`, and likewise what uses it; then `make venv`. `make core` does so with all of
+them in a copy, and runs the core's tests there.
+
+A module imports from its own folder, or from what stands below it. `make lint` checks it.
+This page is made from the code: `python -m tests.docs.layout`.
+
+## Where to look
+
+| question | file |
+|---|---|
+| How does one step of an episode go? | `engine/engine.py`, `step`; [the game](game.md) |
+| What does one impact cost? | `physics/impact.py`, `record_impacts`; summed in `game/harm.py` |
+| Where does a number in a table come from? | `evaluation/`: `measure_sets.py` (columns), `outcome.py`, `rollout.py` |
+| Why did the shield replace an action? | `shield/certify.py`, `decide_world`; the proof is in `shield/step.py` |
+| What is a reward term? | `game/`: `step_outcome.py` (formulas), `rewards.py` (weights), `measures.py` (names) |
+| Which agents are there? | `pyproject.toml`, `agents/scripts.py`; [add one](extending.md#an-agent) |
+| What can a scenario file say? | `scenario/declared.py` (keys), `fields.py` (quantities); [scenarios](scenarios.md) |
+| How does a training run? | `training/session.py`, `train`; algorithms in `ppo.py` and `sac.py` |
+| How do I add a column to every evaluation? | [a set of measures](extending.md#a-set-of-measures) |
+"""
+END = """
+`scenarios/` holds one YAML file per scenario, `train/` the training recipes; those of an extension
+stand in a folder of its name. Both are also inside the wheel. [How the tests are run](tests.md).
+"""
+
+
+def first_sentence(path: Path) -> str:
+    """What a folder or a file says it is, in its first sentence."""
+    text = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
+    return " ".join(text.partition("\n\n")[0].split()).rstrip(".").replace("``", "`")
+
+
+def files(place: Path) -> list[Path]:
+    return sorted(place.rglob("*.py")) if place.is_dir() else [place]
+
+
+def room_of(module: str) -> str | None:
+    """The folder or file of the core, or the extension, that a module of the package belongs to."""
+    parts = module.split(".")
+    if parts[0] != PACKAGE.name or len(parts) == 1:
+        return None
+    return ".".join(parts[1:3]) if parts[1] == "extensions" else parts[1]
+
+
+def arrows() -> dict[str, set[str]]:
+    """Each room -> the rooms from which it imports, for types too."""
+    found = defaultdict[str, set[str]](set)
+    for path in sorted(PACKAGE.rglob("*.py")):
+        own = room_of(".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"))
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if own and isinstance(node, ast.ImportFrom) and node.module:
+                named = (
+                    [node.module] if node.module != PACKAGE.name else [f"{node.module}.{a.name}" for a in node.names]
+                )
+                found[own] |= {room for each in named if (room := room_of(each)) and room != own}
+    return found
+
+
+def layers(contract: int) -> list[list[str]]:
+    """The layers of a contract of import-linter, from the top down."""
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]["contracts"]
+    return [layer.split(" | ") for layer in contracts[contract]["layers"]]
+
+
+def table(rooms: list[list[str]], inside: str, uses: dict[str, set[str]]) -> list[str]:
+    """A table of rooms: their files, what they are, and which others they use."""
+    folder = PACKAGE / inside.rstrip(".").replace(".", "/") if inside else PACKAGE
+    lines = [f"| in `{folder.relative_to(ROOT).as_posix()}/` | what it holds | uses |", "|---|---|---|"]
+    order = [room for layer in rooms for room in layer]
+    for room in order:
+        place = folder / room
+        path = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
+        name = f"{room}/" if place.is_dir() else f"{room}.py"
+        others = sorted(each.removeprefix(inside) for each in uses[inside + room] if each.startswith(inside))
+        others = [each for each in order if each in others]
+        lines.append(f"| `{name}` | {first_sentence(path)} | {', '.join(others) or '–'} |")
+    return lines
+
+
+def page() -> str:
+    uses = arrows()
+    core = [[room for room in layer if not room.startswith("__")] for layer in layers(0)]
+    core = [[room for room in layer if room != "extensions"] for layer in core]
+    drawing = [f"    {' · '.join(layer)}" for layer in core if layer]
+    extensions = layers(1)
+    beside = [f"    {' · '.join(layer)}" for layer in extensions]
+    return "\n".join(
+        [
+            BEGINNING,
+            "## The core\n",
+            "From the top down; each line uses only lines below it:\n",
+            *drawing,
+            "",
+            *table([layer for layer in core if layer], "", uses),
+            "\n## Extensions\n",
+            "Every extension may use the core. Among themselves, each line uses only lines below it:\n",
+            *beside,
+            "",
+            *table(extensions, "extensions.", uses),
+            END,
+        ]
+    )
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), "utf-8")

@@ -1,0 +1,139 @@
+"""Sets of measures: what an evaluation says without any installed one, and what a set of one's own adds to it."""
+
+import csv
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl import registry
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.evaluation.chunks import Lineup, summarise_tally, tally_list
+from ethbrake_marl.evaluation.evaluation import Evaluation
+from ethbrake_marl.evaluation.measure_sets import MEASURE_SETS, Measure, MeasureSet, Silent, register_measure_set
+from ethbrake_marl.evaluation.per_world import results_to_json, write_per_world
+from ethbrake_marl.evaluation.summary import summarise
+from ethbrake_marl.evaluation.summary_row import SummaryRow
+
+PAPER = eb.load_scenario("paper-random")
+AGENTS = ["full_brake", "coast"]
+
+
+@pytest.fixture
+def core_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No package gives a set of measures."""
+    given = registry.points
+    monkeypatch.setattr(registry, "points", lambda group: {} if group == MEASURE_SETS.group else given(group))
+    MEASURE_SETS.loaded.clear()
+
+
+@pytest.fixture
+def driven(core_alone: None) -> Evaluation:
+    return eb.evaluate(agents=AGENTS, scenario=PAPER, episodes=20)
+
+
+def rows_of(folder: Path, evaluation: Evaluation) -> list[dict[str, str]]:
+    write_per_world(folder / "worlds.csv", evaluation)
+    return list(csv.DictReader(io.StringIO((folder / "worlds.csv").read_text())))
+
+
+def test_core__alone_shows_the_episode_in_table_json_and_files(driven: Evaluation, tmp_path: Path) -> None:
+    table = summarise(driven)
+    assert [row.agent for row in table] == AGENTS and table[0].more == {} and table[0].bounds == frozenset()
+    for text in (str(table), table.markdown(), table._repr_html_()):
+        assert "coast" in text and "otal" in text and "egret" not in text and "best known" not in text
+    assert "Decrease" in str(table)  # also in a narrow terminal
+    (row, _) = json.loads(json.dumps(results_to_json(table), allow_nan=False))
+    assert row["total_harm"] == driven.outcome("full_brake").total_harm.mean()
+    assert not [key for key in row if "regret" in key or "best_known" in key or "proven" in key]
+    assert "no_limits_because" not in row["parameters"] and row["parameters"]["seed"] == 7
+    lines = rows_of(tmp_path, driven)
+    assert len(lines) == 40 and float(lines[0]["total_harm"]) == driven.outcome("full_brake").total_harm[0]
+    assert not {"avoidable", "proven_harm", "regret_total_harm"} & lines[0].keys()
+    lineup = Lineup.of(AGENTS, PAPER)
+    long = summarise_tally(lineup, tally_list(lineup, 20, 7), 7)
+    assert [each.to_json() for each in long] == [each.to_json() for each in table]
+
+
+class Hardest(MeasureSet):
+    """Harm as a share of the hardest first impact in the same world; silent where nobody collides."""
+
+    measures = (
+        Measure("share_of_hardest", lambda o, most: o.first_impact_harm / most, "Of the hardest", about="A share."),
+        Measure("hardest_decrease", "share_of_hardest", against="decrease"),
+    )
+    counted = (Measure("is_hard", lambda o, most: o.first_impact_harm > 1.0),)
+    baseline, whole, narrow, notebook = "coast", "is_hard", ("share_of_hardest",), ("share_of_hardest",)
+    per_world: Mapping[str, Any] = {"hardest": lambda o, most: most}
+    because_key, not_in_long_lists = "no_hardest_because", "the hardest is not asked there"
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def prepare(self, evaluation: Evaluation) -> Any:
+        self.asked += 1
+        most = sum(outcome.first_impact_harm for outcome in evaluation.outcomes.values())
+        return most if (most > 0.0).all() else Silent("nobody collides in some world")
+
+    def row(self, tally: Any, worlds: int, context: Any) -> dict[str, Any]:
+        return {"hard_share": tally.share("is_hard", worlds)}
+
+    def warnings(self, rows: Any) -> list[str]:
+        return ["this is a test"]
+
+    def notes(self, rows: list[SummaryRow]) -> list[str]:
+        return [f"{rows[0].agent}: {rows[0].more['hardest']['hard_share']}."]
+
+
+def test_set__adds_to_table_json_conditions_and_files(driven: Evaluation, tmp_path: Path) -> None:
+    hardest = Hardest()
+    register_measure_set("hardest", hardest)
+    colliding = driven.take(driven.outcome("full_brake").collided)
+    table, lines = summarise(colliding), rows_of(tmp_path, colliding)
+    assert hardest.asked == 1  # once for everybody who asks
+    harm = [colliding.outcome(agent).first_impact_harm for agent in AGENTS]
+    assert table[0]["share_of_hardest"].value == pytest.approx((harm[0] / sum(harm)).mean())
+    assert table[0]["hardest_decrease"].value > 0.0 == table[1]["hardest_decrease"].value  # compared with coast
+    assert float(lines[0]["hardest"]) == sum(harm)[0]
+    row = table[0].to_json()
+    assert row["hard_share"] == 1.0 and row["parameters"]["no_hardest_because"] is None
+    for text in (str(table), table.markdown()):
+        assert "full_brake: 1.0." in text and "WARNING: this is a test." in text
+    assert "WARNING: this is a test." in table._repr_html_() and "Of the hardest" in table._repr_html_()
+    assert "Decrease" not in str(table)  # the set's columns stand in a narrow terminal in the place of the decreases
+    assert table.meanings()["Of the hardest"] == "A share."
+
+
+def test_set__is_silent_with_its_reason(driven: Evaluation, tmp_path: Path) -> None:
+    register_measure_set("hardest", Hardest())
+    apart = eb.evaluate(agents=["full_brake"], scenario=PAPER.replace(gaps_m=300.0), episodes=3)
+    (row,) = summarise(apart)
+    assert row["share_of_hardest"] is None and row.to_json()["hard_share"] is None
+    assert row.parameters["no_hardest_because"] == "nobody collides in some world"
+    assert {line["hardest"] for line in rows_of(tmp_path, apart)} == {""}
+    lineup = Lineup.of(["coast"], PAPER)
+    (long,) = summarise_tally(lineup, tally_list(lineup, 20, 7), 7)
+    assert long.parameters["no_hardest_because"] == "the hardest is not asked there"
+
+
+def test_set__whose_comparison_does_not_hold_everywhere_gives_bounds(driven: Evaluation) -> None:
+    register_measure_set("hardest", Hardest())
+    table = summarise(driven.take(driven.outcome("coast").first_impact_harm > 0.0))
+    hard = table[0].more["hardest"]["hard_share"]
+    assert hard is not None and hard < 1.0 and table[0].bounds == {"share_of_hardest"}
+    assert table[0]["hardest_decrease"] is None and "≥ " in table.markdown()
+
+
+def test_set__that_is_none_or_has_a_name_twice_is_refused(core_alone: None) -> None:
+    with pytest.raises(InvalidInput, match="must be a MeasureSet"):
+        register_measure_set("none", "none")  # type: ignore[arg-type]
+
+    class Twice(MeasureSet):
+        measures = (Measure("total_harm", lambda o, _: o.total_harm),)
+
+    with pytest.raises(AlreadyExists, match="another set has total_harm"):
+        register_measure_set("twice", Twice())

@@ -1,0 +1,143 @@
+"""Agents of the field, by hand: car following, RSS, UN R157's models and AEB."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.agents.driving import record_commands
+from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.extensions.field.controllers import LAWS, Parameters, Seen, fuzzy
+from tests.refused import refused
+
+
+def seen(gap, speed, front, front_force=0.0, own=0.0):
+    columns = (np.atleast_1d(np.asarray(each, float)) for each in (gap, speed, front, front_force, own))
+    return Seen(*np.broadcast_arrays(*columns), 0.1)
+
+
+def called(name, *given, **parameters):
+    law = LAWS[name]
+    return np.round(law.command(seen(*given), Parameters(**{**law.parameters, **parameters})), 6).tolist()
+
+
+TWO = eb.Scenario(
+    name="two",
+    vehicles=2,
+    gaps_m=50,
+    speeds_mps=30,
+    braking_capacity_mps2=[6, 9],
+    driving_capacity_mps2=3,
+    mass_t=1,
+    latency_s=[0, 0.05],
+    restitution=0,
+)
+
+
+def driven(spec, scenario=TWO, steps=22):
+    worlds = scenario.sample(1, 7).worlds
+    return np.round(record_commands(eb.make_agent(spec), worlds, scenario, 1, steps)[0], 3).tolist()
+
+
+def test_idm__calls_for_nothing_at_its_equilibrium_gap() -> None:
+    # IDM: at its equilibrium gap (s0 + v T) / sqrt(1 - (v / v0)^4) it calls for nothing, at rest at s0, too. Closing
+    # with 2 m/s at 20 m it wants s* = 2 + 30 + 40 / (2 sqrt 2.8) = 43.952286 m: 1.4 (1 - 0.130118 - 4.829509).
+    assert called("idm", [32 / np.sqrt(1 - (20 / 33.3) ** 4), 2.0], [20.0, 0.0], [20.0, 0.0]) == [-0.0, 0.0]
+    assert called("idm", 20, 20, 18) == [-5.54348]
+
+
+def test_acc_and_cacc__by_hand() -> None:
+    # ACC: 0.23 (30 - 1.1 x 20) - 0.07 x 2; beyond 2 s of headway 0.4 (33.3 - 20). CACC gives the speed at the next
+    # decision, 0.1 s on: too near (-2.5 m) 0.45 x -2.5 - 0.05 x 2, right (0.1 m) 0.45 x 0.1 - 0.0125 x 2, far (10 m)
+    # 0.05 - 0.1.
+    assert called("acc", [30, 41], 20, [18, 20]) == [1.7, 5.32]
+    assert called("cacc", [20, 22.6, 32.5], 20, 18) == [-12.25, 0.2, -0.5]
+
+
+def test_rss__brakes_within_the_safe_distance() -> None:
+    # RSS: at 20 m/s behind 20 m/s the safe distance is 20 + 1.75 + 23.5^2 / 8 - 400 / 16 = 65.78125 m.
+    assert called("rss", [65.78, 65.79], 20, 20) == [-4.0, 0.0]
+
+
+def test_aeb__brakes_by_time_to_collision_and_required_deceleration() -> None:
+    # AEB: 10 m/s closing over 14 m is 1.4 s; 12 m/s over 19 m is 1.58 s, but asks for 144 / 38 = 3.8 m/s2.
+    assert called("aeb", [14, 16, 19, 19], [20, 20, 22, 24], 10) == [-np.inf, 0.0, 0.0, -np.inf]
+    assert called("aeb", 19, 22, 10, required=3.7) == [-np.inf]
+
+
+def test_fuzzy_model__by_hand() -> None:
+    # The fuzzy criteria, 20 m/s behind 20 m/s: safe beyond 15 + 50 - 200/7 + 2 + 2 = 40.43 m of gap, unsafe within 15
+    # + 33.33 - 28.57 + 2 = 21.76 m; 2 m/s closing adds the critical one: 1.5 + 4 / 8 = 2 m and 1.5 + 4 / 12 = 1.83 m.
+    p = Parameters(**LAWS["r157_fsm"].parameters)
+    assert [np.round(each, 4).tolist() for each in fuzzy(seen([41, 31.0952381, 21], 20, 20), p)] == [
+        [0.0, 0.5, 1.0],
+        [0.0, 0.0, 0.0],
+    ]
+    assert [np.round(each, 4).tolist() for each in fuzzy(seen([2.1, 1.9166667, 1.8], 20, 18), p)] == [
+        [1.0, 1.0, 1.0],
+        [0.0, 0.5, 1.0],
+    ]
+    # Braking with 4 m/s2 it will be slower than its front one after 0.75 s: what matters is 4 / 8 = 0.5 m.
+    assert fuzzy(seen([0.49, 0.51], 20, 18, 0, -4), p)[1].tolist() == [1.0, 0.0]
+
+
+def test_human_driver__reacts_eases_off_and_brakes_with_a_jerk() -> None:
+    # He sees at once that Vehicle 1 brakes with 6 m/s2 at less than 2 s ahead: nothing for 0.4 s, then 0.4 m/s2 for
+    # 0.75 s, and then 12.65 m/s3 up to 0.774 g. He stays with it.
+    jerk = [-1.665, -2.93, -4.195, -5.46, -6.725]
+    assert driven("r157_human") == [0.0] * 4 + [-0.4] * 7 + jerk + [-7.593] * 6
+    assert driven("r157_human:reaction=0.15:jerk=100", steps=8) == [0.0] * 4 + [-0.4] + [-7.593] * 3
+
+
+def test_fuzzy_model__waits_and_lets_go_where_nothing_is_near() -> None:
+    assert driven("r157_fsm", steps=12) == [-0.0] * 7 + [-1.265, -2.53, -3.795, -4.0, -4.0]
+
+
+def test_human_driver__notices_gentle_braking_by_the_time_to_collision() -> None:
+    gentle = TWO.replace(braking_capacity_mps2=[4.9, 9])
+    assert driven("r157_human", gentle, 34)[-8:] == [0.0] * 7 + [-0.4]
+
+
+@pytest.mark.parametrize(
+    ("spec", "command"),
+    [("idm", 0.478), ("acc", 1.32), ("cacc", 1.32), ("rss", 0), ("r157_human", 0), ("r157_fsm", 0), ("aeb", 0)],
+)
+def test_vehicle_1__brakes_for_nothing_without_an_obstacle(spec: str, command: float) -> None:
+    worlds, agent = TWO.sample(1, 7).worlds, eb.make_agent(spec, scenario=TWO)
+    commands, _ = agent.act(worlds, agent.begin(worlds, 0, {}), 0)
+    assert commands.round(3).tolist() == [command]
+    assert (agent.name, agent.knows.value) == (spec, "messages")
+
+
+def test_old_news__are_moved_on_until_their_sender_stands() -> None:
+    # Behind a front vehicle that brakes fully the gap is the true one.
+    late = TWO.replace(speeds_mps=15, v2x={"preset": "nominal", "persistence": "periodic", "sensing_s": [3, 4]})
+    engine = eb.make_engine(late, 20, seed=3)
+    while not engine.ended.all():
+        engine.step(np.full((20, 1), -0.3))
+        assert np.abs(Seen.of(engine.worlds, 1, 0.1).gap_m - engine.worlds.gaps_m[:, 0]).max() < 1e-6
+
+
+def test_agent__that_is_made_for_another_time_step_is_refused() -> None:
+    with refused("agent 'cacc' was made for decisions every 0.1 s; scenario 'two' has one every 0.4 s"):
+        eb.evaluate(agents={"cacc": eb.make_agent("cacc")}, scenario=TWO.replace(time_step_s=0.4), episodes=2)
+
+
+REFUSED: dict[str, Callable[[], object]] = {
+    "agent 'idm:a=0': a must be a number above 0, for instance a=1.4": lambda: make_agent("idm:a=0"),
+    "agent 'idm:T=1:T=2': T is given twice": lambda: make_agent("idm:T=1:T=2"),
+    "agent 'acc:T': T must be a number 0 or more, for instance T=1.1": lambda: make_agent("acc:T"),
+    "agent 'r157_fsm:b_min=7': b_min 7 must not be above b_max 6": lambda: make_agent("r157_fsm:b_min=7"),
+    "unknown agent 'idm:t=1': parameter 't'": lambda: make_agent("idm:t=1"),
+    "vehicle_3 is driven by 'idm', whose command is not fixed at the alert": lambda: make_agent("e_v2x_bm").begin(
+        eb.load_scenario("paper-random").sample(12, 7).worlds, 1, {2: make_agent("idm")}
+    ),
+}
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_controller__is_refused(message: str) -> None:
+    with refused(message, UnknownName if message.startswith("unknown") else InvalidInput):
+        REFUSED[message]()

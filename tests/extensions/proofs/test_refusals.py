@@ -1,0 +1,133 @@
+"""What proofs and searches of the least harm refuse."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.engine.profiles import ProfileProblem, Profiles, profile_problem
+from ethbrake_marl.errors import CorruptBundle
+from ethbrake_marl.extensions.proofs.avoidability import avoidability
+from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
+from ethbrake_marl.extensions.proofs.team_bound import team_bound
+from ethbrake_marl.extensions.search.best_harm import best_harm
+from ethbrake_marl.extensions.search.shipped import TABLES
+from ethbrake_marl.extensions.search.tables import BestHarmTable
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.task import Task
+from tests.fixtures.lines import line, wide_worlds
+from tests.programmes.archives import good, packed
+from tests.refused import refused
+
+PAPER, PAIR = load_scenario("paper-random"), load_scenario("cooperation-3-pair")
+WORLDS, TEAM = PAPER.sample(1, 11).worlds, PAIR.sample(2, 7).worlds
+THREE = line([7, 7], [20, 18, 20], [6, 7, 6], [0, 0.5, 0.8])
+
+
+@cache
+def problem() -> ProfileProblem:
+    return profile_problem(WORLDS, [1])
+
+
+PROOFS: dict[str, Callable[[], object]] = {
+    "avoidability: vehicle_1 of 3 vehicles; it is decided for vehicle_2 of 3 and for either vehicle of 2": lambda: (
+        avoidability(wide_worlds(2, 3, seed=1), 0)
+    ),
+    "avoidability: vehicle = -1: must be a whole number in 0..2": lambda: avoidability(wide_worlds(2, 3, seed=1), -1),
+    "avoidability: vehicle_3 follows 'coast'; must be 'full_brake'": lambda: avoidability(
+        wide_worlds(2, 3, seed=1), scripts={2: "coast"}
+    ),
+    "avoidability: latency_s[0, 0] = 1: must be not above vehicle_2's": lambda: avoidability(
+        line([5, 5], [9, 9, 9], 5, [1, 0.5, 0])
+    ),
+    "avoidability: speeds_mps[0, 1] = nan: must be >= 0": lambda: avoidability(
+        replace(line([5], [9, 9], 5), speeds_mps=np.array([[9, np.nan]])), 1
+    ),
+    "harm_count 'worst': must be 'first' or 'total'": lambda: lower_bound(THREE, harm_count="worst"),
+    "lower_bound: horizon_s 0.2: must be finite and at least 0.5 s": lambda: lower_bound(THREE, horizon_s=0.2),
+    "lower_bound: horizon_s inf: must be finite and at least 0.5 s": lambda: lower_bound(THREE, horizon_s=float("inf")),
+    "lower_bound: horizon_s '8': must be a number of seconds": lambda: lower_bound(THREE, horizon_s="8"),
+    "lower_bound: time_step_s 0.0: must be a number of seconds from 0.001 on, or None": lambda: lower_bound(
+        THREE, time_step_s=0.0
+    ),
+    "lower_bound: time_step_s True: must be a number of seconds from 0.001 on, or None": lambda: lower_bound(
+        THREE, time_step_s=True
+    ),
+    "lower_bound: time_step_s nan: must be a number of seconds from 0.001 on, or None": lambda: lower_bound(
+        THREE, time_step_s=float("nan")
+    ),
+    "team_bound: vehicles (): at least one is needed, each once": lambda: team_bound(TEAM, ()),
+    "team_bound: a vehicle = 3: must be a whole number in 0..2": lambda: team_bound(TEAM, (1, 3)),
+    "team_bound: vehicles 1: must be a list of vehicles": lambda: team_bound(TEAM, 1),
+    "team_bound: a vehicle of scripts = 'vehicle_1': must be a whole number in 0..2": lambda: team_bound(
+        TEAM, (1, 2), scripts={"vehicle_1": "coast"}
+    ),
+    "team_bound: vehicle_1 follows 'coast'; must be 'full_brake'": lambda: team_bound(
+        TEAM, (1, 2), scripts={0: "coast"}
+    ),
+    "avoidability: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and nothing exact": lambda: (
+        avoidability(PAPER.replace(brake_rate_mps3=9).sample(2, 7).worlds)
+    ),
+    "avoidability: a vehicle of world 0 brakes in pieces (profile), and nothing exact is known for these": lambda: (
+        avoidability(PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"}).sample(2, 7).worlds)
+    ),
+}
+
+
+@pytest.mark.parametrize("message", PROOFS)
+def test_proof__is_refused_where_nothing_exact_is_known(message: str) -> None:
+    with refused(message):
+        PROOFS[message]()
+
+
+SEARCHES: dict[str, Callable[[], object]] = {
+    "horizon_s 0.4: must be after the first decision at 0.5 s": lambda: profile_problem(WORLDS, [1], horizon_s=0.4),
+    "task: vehicles (3,): must be indices from 0 to 2, each once": lambda: Task(PAPER, (3,)),
+    "task: vehicles (0, 0): must be indices from 0 to 2, each once": lambda: Task(PAPER, (0, 0)),
+    "scenario 'paper-random': needs one driven vehicle; driven are: vehicle_1": lambda: Task(PAPER, (0, 1)).vehicle,
+    "vehicles (): at least one is needed, each once, from 0 to 2": lambda: best_harm(PAPER, WORLDS, vehicles=()),
+    "budget = 0: must be a whole number, at least 1": lambda: best_harm(PAPER, WORLDS, budget=0),
+    "threads = 0: must be a whole number, at least 1": lambda: best_harm(PAPER, WORLDS, budget=10, threads=0),
+    "counts (): must be first, total, or both": lambda: best_harm(PAPER, WORLDS, budget=10, counts=()),
+    "profiles: command -7.1 m/s2 is beyond a vehicle's capacity": lambda: problem().follow(
+        problem().constant(np.array([[[-7.1]]]))
+    ),
+    "profiles: phases must end in order, the last one at the last step": lambda: problem().follow(
+        Profiles(np.array([[9, 5, 75]]), np.zeros((1, 3, 1)))
+    ),
+    "t.npz: there is no such table of best known harm": lambda: BestHarmTable.load(Path("t.npz")),
+    "a profile: the pieces in which vehicles brake in these worlds are not those of its scripts": lambda: best_harm(
+        PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"}), PAPER.sample(2, 7).worlds
+    ),
+}
+
+
+@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.parametrize("message", SEARCHES)
+def test_search__is_refused(message: str) -> None:
+    with refused(message):
+        SEARCHES[message]()
+
+
+def test_file__is_no_table(empty_folder: Path) -> None:
+    Path("t.npz").write_bytes(b"no table")
+    with refused("t.npz: is not a table of best known harm: not a plain .npz archive", CorruptBundle):
+        BestHarmTable.load(Path("t.npz"))
+    Path("t.npz").write_bytes(packed({**good(), "first_harm": np.zeros(4)}))
+    with refused("array 'first_harm' is <f8 [4], should be <f8 [3]", CorruptBundle):
+        BestHarmTable.load(Path("t.npz"))
+
+
+def test_table__is_improved_by_a_harm_of_each_world() -> None:
+    table = BestHarmTable.load(TABLES / "paper-random.npz")
+    with refused("improve: (3,) harms for (2,) worlds"):
+        table.improved(table.identity[:2], "first", np.zeros(3))
+
+
+def test_table__of_other_worlds_is_refused() -> None:
+    table = BestHarmTable.load(TABLES / "paper-delay-low.npz")
+    with refused("table of best known harm (scenario paper-delay-low, list_seed 7, episodes 2000"):
+        table.check_holds_any(problem().identity)

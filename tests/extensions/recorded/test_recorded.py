@@ -1,0 +1,169 @@
+"""Scenarios of recorded traffic: rows by hand, three formats, hostile files, flat memory, and the table of the page."""
+
+import re
+import tracemalloc
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.recorded import traffic as recorded
+from ethbrake_marl.extensions.recorded.traffic import DataDraw, scenario_from_data
+from tests.docs.site import DOCS
+from tests.fixtures.recordings import HIGHD, write_files, write_highd, write_ngsim, write_openacc
+
+
+def track(frame: int, who: int, x: float, width: float, v: float, ahead: int, lane: int = 6) -> str:
+    """A row of highD."""
+    return f"{frame},{who},{x},8,{width},2,{v},0,0,0,0,0,0,0,0,0,{ahead},0,0,0,0,0,0,0,{lane}"
+
+
+def recording(folder: Path, rows: list[str], directions: str = "2222222") -> Path:
+    """A folder of highD with these rows, and the direction of each vehicle in turn."""
+    meta = ["id,drivingDirection", *(f"{k},{direction}" for k, direction in enumerate(directions, 1))]
+    return write_files(folder, {"01_tracks.csv": [HIGHD, *rows], "01_tracksMeta.csv": meta})
+
+
+def test_rows__are_bumper_to_bumper_in_both_directions_and_no_vehicle_is_in_two(tmp_path: Path) -> None:
+    rows = [track(1, k, 100 - 20 * k, 4, 30 - k, k - 1) for k in range(1, 6)]  # to the right, a queue of five
+    rows += [track(1, 6, 50, 5, -20, 0, 3), track(1, 7, 65, 4, -21, 6, 3)]  # to the left
+    rows += [track(2, k, 0, 4, 0, 0) for k in range(1, 6)]  # at no moment that is looked at
+    rows += [track(26, 1, 100, 4, 20, 0), track(26, 2, 80, 4, 20, 1, 5), track(26, 3, 60, 4, -0.1, 2, 5)]  # no queue
+    rows += [track(51, k, 500 - 20 * k, 4, 0, k - 1 if k > 1 else 0) for k in (1, 2, 3)]  # these stand
+    text, csv, told = scenario_from_data("mine", recording(tmp_path, rows, "2222211"), "highd")
+    assert csv.splitlines()[1:] == ["16.0,16.0,29.0,28.0,27.0", "16.0,16.0,0.0,0.0,0.0"]
+    assert told[1:] == [
+        "left out: 2 links to another lane, or of a vehicle that rolls backwards",
+        "left out: 7 vehicles that were too few, or left over, at the end of a queue",
+    ]
+    two = "braking_capacity_mps2: 6, driving_capacity_mps2: 3, mass_t: 2, latency_s: 0, roles: {vehicle_2: learner}}"
+    write_files(tmp_path, {"two.yaml": [f"{{name: two, vehicles: 2, gaps_m: 9, speeds_mps: 9, {two}"]})
+    text, csv, _ = scenario_from_data("mine", tmp_path, "highd", based_on=f"{tmp_path}/two.yaml")
+    assert csv.splitlines()[1:] == ["16.0,29.0,28.0", "16.0,27.0,26.0", "10.0,20.0,21.0", "16.0,0.0,0.0"]
+    assert "must not be passed on" in text
+
+
+def test_formats__same_queues_in_metres_and_in_feet_are_the_same_rows(tmp_path: Path) -> None:
+    one, two = (
+        np.loadtxt(scenario_from_data("mine", write(tmp_path / of, 20), of)[1].splitlines(), delimiter=",", skiprows=1)
+        for of, write in (("highd", write_highd), ("ngsim", write_ngsim))
+    )
+    assert one.shape == (40, 5) and np.abs(one - two).max() < 0.02  # feet have been rounded
+
+
+def test_platoon__gaps_are_as_recorded_and_a_blank_ends_a_queue(tmp_path: Path) -> None:
+    folder = write_openacc(tmp_path / "openacc", 40)
+    text, csv, told = scenario_from_data("mine", folder, "openacc")
+    assert told == [
+        "30 chains of 3 vehicles, every 1 s, each vehicle in one of them at most",
+        "left out: 100 vehicles that were too few, or left over, at the end of a queue",
+    ]
+    cells = (folder / "platoon.csv").read_text().splitlines()[6].split(",")
+    assert csv.splitlines()[1] == ",".join(f"{float(cells[k])}" for k in (16, 17, 1, 4, 7))
+    assert "read its terms" in text and scenario_from_data("mine", folder, "openacc", every_s=0.1)[1].count("\n") == 301
+    (folder / "later.csv").write_text((folder / "platoon.csv").read_text())
+    assert scenario_from_data("mine", folder, "openacc")[2][0].startswith("60 chains")
+    with pytest.raises(InvalidInput, match=r"gaps change 0\.31 times as much as speeds say .*OpenACC has m and m/s"):
+        scenario_from_data("mine", write_openacc(tmp_path / "feet", 100, unit=0.3048), "openacc")
+
+
+def scaled(text: str, lengths: float, speeds: float) -> str:
+    """The recording with other units of x, width and xVelocity."""
+    head, *rows = (line.split(",") for line in text.splitlines())
+    units = {2: lengths, 4: lengths, 6: speeds}
+    changed = ([f"{float(cell) * units.get(k, 1):g}" for k, cell in enumerate(row)] for row in rows)
+    return "\n".join(",".join(row) for row in (head, *changed)) + "\n"
+
+
+REFUSED = {
+    "a column is missing": (lambda t: t.replace("precedingId", "-"), "no column precedingId, as files of highD have"),
+    "semicolons": (lambda t: t.replace(",", ";"), "columns are separated by commas"),
+    "a column twice": (lambda t: t.replace("ttc", "width"), "line 1: frame, id, .*: each column must be there once"),
+    "text": (lambda t: t.replace("4.50", "long", 1), "line 2, column width: 'long' is not a number"),
+    "nan": (lambda t: t.replace("4.50", "nan", 1), "line 2, column width: nan must be a finite number"),
+    "no length": (lambda t: t.replace("4.50", "0.00", 1), r"line 2, column width: 0 m of length: must be in \(0, 40\]"),
+    "a huge id": (lambda t: t.replace("\n1,1,", "\n1,1e300,", 1), r"column id: 1e\+300 must have the drivingDirection"),
+    "half an id": (lambda t: t.replace("\n1,1,", "\n1,1.5,", 1), r"column id: 1.5 must be a whole number, 0 or above"),
+    "half written": (lambda t: t[:-20], "values, but the header has 25 columns; is the file whole?"),
+    "no rows": (lambda t: t.splitlines()[0] + "\n", "has no rows"),
+    "empty": (lambda t: "", "has no column frame, id"),
+    "no UTF-8": (lambda t: "\udcff" + t, "cannot be read .*utf-8"),
+    "half a frame": (lambda t: t.replace("\n2,1,", "\n2.5,1,", 1), "column frame: 2.5 must be a multiple of 0.04 s"),
+    "twice": (lambda t: t + t.splitlines()[1] + "\n", "line 3122: vehicle 1 is there at that time in line 2, too"),
+    "nobody ahead": (lambda t: re.sub(r",1,0,0,0,0,0,0,0,3\n", ",77,0,0,0,0,0,0,0,3\n", t), "vehicle 77, which is not"),
+    "feet": (lambda t: scaled(t, 2.8, 1.5), "long, fewer than a third; its lengths and speeds must be"),
+    "long lorries": (lambda t: scaled(t, 3.281, 3.281), r"m of length: must be in \(0, 40\]; highD has m and m/s"),
+    "half as fast": (lambda t: scaled(t, 1.0, 0.4), r"gaps change 2\.\d\d times as much as speeds say"),
+    "too fast": (lambda t: t.replace("-27.879", "-127.879"), "127.879 m/s; must be at most 75; highD has m and m/s"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_hostile_file__is_refused_with_one_line(what: str, tmp_path: Path) -> None:
+    file = write_highd(tmp_path / "a folder\nwith it", 40) / "01_tracks.csv"
+    file.write_bytes(REFUSED[what][0](file.read_text()).encode("utf-8", "surrogateescape"))
+    with pytest.raises(InvalidInput, match=REFUSED[what][1]) as told:
+        scenario_from_data("mine", file.parent, "highd")
+    assert "01_tracks.csv" in str(told.value) and "\n" not in str(told.value)
+
+
+def test_overlaps__are_refused_but_few_of_noisy_data_are_left_out(tmp_path: Path) -> None:
+    rows = [track(1, 1, 100, 4, 20, 0), track(1, 2, 97, 4, 20, 1)]
+    with pytest.raises(InvalidInput, match=r"line 3: vehicle 2 overlaps vehicle 1 ahead by 1.00 m"):
+        scenario_from_data("mine", recording(tmp_path / "h", rows), "highd")
+    file = write_ngsim(tmp_path / "n", 20) / "trajectories.csv"
+    text = file.read_text()
+    head = next(line for line in text.splitlines() if line.startswith("4,"))  # of the second queue, twice
+    file.write_text(re.sub(r"(?m)^(2,0,11,\d+,20),[^,]+", r"\1,99", text) + head + "\n")
+    _, csv, told = scenario_from_data("mine", file.parent, "ngsim")
+    assert csv.count("\n") == 40 and "left out: 2 vehicles that overlap" in told[1]
+    file.write_text(re.sub(r"(?m)^((?:2|5|8|11|14|17),\d+,11,\d+,20),[^,]+", r"\1,99", text))
+    with pytest.raises(InvalidInput, match=r"line \d+: vehicle 2 overlaps .*; 12 of 120 are like that"):
+        scenario_from_data("mine", file.parent, "ngsim")
+
+
+def test_memory__does_not_grow_with_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorded, "PIECE", 2000)
+    monkeypatch.setattr(recorded, "MOST_NUMBERS", 500)
+    most = []
+    for number in (60, 60, 600):  # the first imports what is needed
+        folder = write_highd(tmp_path / f"h{len(most)}", number)
+        tracemalloc.start()
+        told = scenario_from_data("mine", folder, "highd")[2]
+        most.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert told[1] == "left out: 1,108 chains: a table holds 500 numbers, so one in 13 is kept"
+    assert most[2] < 1.3 * most[1]
+
+
+def test_command__writes_both_files_or_none_and_evaluates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_openacc(tmp_path / "platoon; rm *")
+    write_files(tmp_path, {"taken.csv": []})
+    command = ["scenario", "from-data", "platoon; rm *", "--format", "openacc", "--output"]
+    drive = ["evaluate", "--scenario", "mine.yaml", "--agents", "full_brake", "--episodes", "20"]
+    assert [run_command(each) for each in ([*command, "mine.yaml"], drive)] == [0, 0]
+    before = sorted((path.name, path.read_bytes()) for path in tmp_path.glob("*.*"))
+    bad = (["mine.yaml"], ["taken.yaml"], ["Not A Name.yaml"], ["x.csv"], ["new.yaml", "--every", "nan"])
+    assert {run_command([*command, *each]) for each in bad} == {2}
+    monkeypatch.setattr("ethbrake_marl.cli.scenario.Out.write", lambda *_, **__: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run_command([*command, "new.yaml"])
+    assert sorted((path.name, path.read_bytes()) for path in tmp_path.glob("*.*")) == before
+    fits = [*command, "mine.yaml", "--draw", "normal", "--every", "0.1", "--force"]
+    assert run_command(fits) == 0 and not Path("mine.csv").exists()
+
+
+def test_page__shows_the_harm_of_rows_and_of_fits(tmp_path: Path) -> None:
+    folder, shown = write_highd(tmp_path / "highd"), []
+    for draw in get_args(DataDraw):
+        text, csv, _ = scenario_from_data(draw, folder, "highd", draw=draw)
+        write_files(tmp_path, {f"{draw}.yaml": text.splitlines(), f"{draw}.csv": csv.splitlines()})
+        result = eb.evaluate(scenario=tmp_path / f"{draw}.yaml", agents="full_brake,e_v2x_bm", episodes=10_000, seed=7)
+        harms = (f"{each.first_impact_harm.mean():.2f} |" for each in result.outcomes.values())
+        shown.append(" ".join([f"| `{draw}` |", *harms]))
+    assert "\n".join(shown) in (DOCS / "recorded.md").read_text("utf-8")

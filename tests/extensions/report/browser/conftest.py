@@ -1,0 +1,87 @@
+"""Debian's or the machine's own Chromium, driven by Playwright; skipped, and said so, where either is missing."""
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.evaluation.lineup import make_lineup
+from ethbrake_marl.extensions.report.page import Part
+from ethbrake_marl.extensions.report.report import Report
+from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+AGENTS = ("full_brake", "e_v2x_bm", "constant:3+step", "ppo@shipped")
+PAPER = eb.load_scenario("paper-random")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """One browser for the tests of a module: while it is open, its event loop runs, and other tests have their own."""
+    api = pytest.importorskip("playwright.sync_api", reason="no Playwright: pip install 'ethbrake-marl[dev]'")
+    path = os.environ.get("ETHBRAKE_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
+    if path is None:
+        pytest.skip("no Chromium: apt-get install chromium, or name one by ETHBRAKE_CHROMIUM")
+    with api.sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", "--disable-gpu"])
+        yield started
+        started.close()
+
+
+@pytest.fixture
+def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
+    """Opens an address; by the end of the test the console was told nothing, and nobody else was asked for anything."""
+    told: list[str] = []
+    contexts = []
+
+    def open_address(address: str, *, width: int = 1280, **settings: Any) -> Any:
+        context = browser.new_context(viewport={"width": width, "height": 900}, **settings)
+        contexts.append(context)
+        page = context.new_page()
+        page.on("console", lambda each: told.append(f"console: {each.text}"))
+        page.on("pageerror", lambda error: told.append(f"error: {error}"))
+        page.on("dialog", lambda dialog: told.append(f"dialog: {dialog.message}"))
+        page.on("request", lambda each: None if each.url.startswith(address) else told.append(each.url))
+        page.goto(address)
+        return page
+
+    yield open_address
+    for context in contexts:
+        context.close()
+    assert told == []
+
+
+def wait_until(page: Any, condition: str) -> None:
+    """Wait up to two minutes.
+
+    The pages' own policy forbids what Playwright would run there to wait.
+    """
+    for _ in range(4_800):
+        if page.evaluate(condition):
+            return
+        page.wait_for_timeout(25)
+    raise AssertionError(condition)
+
+
+@pytest.fixture(scope="session")
+def compared() -> eb.Evaluation:
+    """Four agents in 120 worlds, one of them behind a shield."""
+    return eb.evaluate(PAPER.sample(120, 7), make_lineup(AGENTS, PAPER), scenario=PAPER, seed=7)
+
+
+@pytest.fixture(scope="session")
+def report_file(compared: eb.Evaluation, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of ``compared``."""
+    figure = Part.drawing(harm_against_total_gap(compared), "Harm against the gap", "Mean harm by gap.")
+    report = Report(
+        "paper-random: four agents", eb.summarise(compared), compared, figures=[figure],
+        summary="A report for the tests.", settings={"Seed": 7}, versions={"numpy": "2"},
+    )  # fmt: skip
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    replace(report.driven(make_lineup(AGENTS, PAPER)), shield=None).write(path)
+    return path

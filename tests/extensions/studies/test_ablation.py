@@ -1,0 +1,476 @@
+"""``study ablate``: levels, trainings, joint optima, what is compared and shown."""
+
+import json
+import shutil
+import signal
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+import ethbrake_marl as eb
+from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.extensions.cooperation.comparison import compare
+from ethbrake_marl.extensions.cooperation.figures import ablation_figures
+from ethbrake_marl.extensions.cooperation.joint_optimum import (
+    Goal,
+    Harms,
+    LevelOptimum,
+    Measured,
+    best_known,
+    measure,
+    questions,
+    search_all,
+)
+from ethbrake_marl.extensions.cooperation.levels import (
+    FIGURES,
+    STANDARD,
+    Level,
+    Plan,
+    common_worlds,
+    read_levels,
+    with_scheme,
+)
+from ethbrake_marl.extensions.cooperation.page import ablation_page, interval_words, levels_csv, markdown
+from ethbrake_marl.extensions.report.style import ALARM
+from ethbrake_marl.extensions.search.best_harm import best_harm, chunks_left
+from ethbrake_marl.extensions.studies.trainings import TrainingJob
+from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.scenario.catalogue import load_scenario, scenario_path
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.shield.episodes import Shielded
+from ethbrake_marl.training.callback import RunCallback
+from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, load_recipe
+from ethbrake_marl.training.training import Training
+from tests.extensions.studies.conftest import ABLATE, LEVELS, study
+from tests.extensions.studies.counting import PROGRAM, end_when
+from tests.fixtures.page import Page
+from tests.fixtures.snapshots import check_snapshot
+from tests.learning.tiny import TINY_PPO
+
+SNAPSHOTS = Path(__file__).parent / "snapshots"
+
+
+def content(folder: Path) -> dict:
+    found = json.loads((folder / "ablation.json").read_text())
+    return found | {"settings": {k: v for k, v in found["settings"].items() if k not in ("machine", "date")}}
+
+
+def ablate(folder: Path, recipe: Path, *options: object) -> int:
+    return study("ablate", "--output", folder, "--recipes", recipe, *ABLATE, *options)
+
+
+def test_ablate__writes_tables_and_figures(finished_ablation: Path) -> None:
+    names = {"ablation.json", "ablation.csv", "ablation.md", "ablation.png", "ablation-changes.png",
+             "ablation-who-pays.png", "ablation.html"}  # fmt: skip
+    assert names <= {path.name for path in finished_ablation.iterdir()}
+    found = content(finished_ablation)
+    levels = found["levels"]
+    assert [(each["level"], each["seeds"]) for each in levels] == list(zip(LEVELS.split(","), (1, 2, 2), strict=True))
+    assert {found["kind"], *(level["kind"] for level in levels)} == {"ablate"}
+    policies = [{seed.get("vehicle_2") for seed in level["policy_sha256"]} for level in levels]
+    assert len({level["scenario_sha256"] for level in levels}) == 3 and list(map(len, policies)) == [1, 2, 2]
+    assert len(levels[1]["worlds_sha256"]) == 64 and levels[1]["versions"]["numpy"] and policies[0] == {None}
+    (step,) = found["channels"]
+    assert (step["from"], step["to"]) == ("cooperation-3-pair", "cooperation-3-congested")
+    searched = levels[1]["total"]["searched"]
+    assert searched["best_known"]["value"] <= searched["full_brake"]["value"]
+
+
+@pytest.mark.slow
+def test_ablate__the_shield_goes_around_what_was_trained(finished_ablation, tmp_path, tiny_total, capsys) -> None:
+    """The trainings of the other ablation are used, in a copy without its settings."""
+    copied = Path(shutil.copytree(finished_ablation, tmp_path / "copy"))
+    (copied / "settings.json").unlink()
+    assert ablate(copied, tiny_total, "--shield", "step") == 0
+    assert "to do: 0 trainings" in capsys.readouterr().err
+    found, alone = content(copied), content(finished_ablation)
+    assert (found["settings"]["shield"], alone["settings"]["shield"]) == ("step", None)
+    assert found["levels"][0]["first"]["shielded"] is None
+    for level, before in zip(found["levels"][1:], alone["levels"][1:], strict=True):
+        for count in ("first", "total"):
+            told = level[count].pop("shielded")
+            assert told["above_bound"] == 0 and told["harm"]["value"] <= told["bound"]["value"]
+            difference = told["harm"]["value"] - level[count]["harm"]["value"]
+            assert told["difference"]["value"] == pytest.approx(difference) and difference < -1.0
+            assert 0.1 < told["replaced"] == pytest.approx(sum(told["replaced_vehicles"]) / 2)
+            assert before[count].pop("shielded") is None
+    assert found["levels"][1:] == alone["levels"][1:]  # without the shield as before
+    assert "Behind the step shield" in (copied / "ablation.html").read_text("utf-8")
+
+
+def test_page__plays_the_same_worlds_at_every_level(finished_ablation: Path) -> None:
+    html = (finished_ablation / "ablation.html").read_text("utf-8")
+    told = html.split('<script type="application/json" id="episode_data">')[1].partition("</script>")[0]
+    content = json.loads(told)
+    assert content["agents"] == LEVELS.split(",") and len(html) <= 5 << 20 and 3 <= len(content["worlds"]) <= 7
+    assert [episode["driven"] for episode in content["worlds"][0]["episodes"]] == [[], [1, 2], [1, 2]]
+
+
+@pytest.mark.slow
+def test_ablate__goes_on_where_it_was_stopped_to_the_same_result(
+    finished_ablation, tmp_path, tiny_total, monkeypatch, capsys
+) -> None:
+    """Stopped in the middle of a later training; ended by two processes."""
+    folder, original = tmp_path / "stopped", RunCallback._between_updates
+
+    def after_update(self, **options):
+        original(self, **options)
+        if self.run.path.name == "cooperation-3-congested-tiny-shared-seed0" and self.updates == 1:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RunCallback, "_between_updates", after_update)
+        assert ablate(folder, tiny_total) == 130
+    statuses = [json.loads(path.read_text())["status"] for path in folder.glob("trainings/*/run.json")]
+    assert sorted(statuses) == ["finished", "interrupted"] and not (folder / "ablation.json").exists()
+    capsys.readouterr()
+    words = ["--output", str(folder), "--recipes", str(tiny_total), *ABLATE, "--jobs", "2"]
+    assert run_command(["study", "ablate", *words]) == 0
+    assert "to do: 3 trainings" in capsys.readouterr().err
+    assert content(folder) == content(finished_ablation)
+
+
+def planned(recipe: TrainingRecipe, scheme: Scheme | None) -> list[tuple[str, TrainingJob, TrainingRecipe]]:
+    """Algorithm, training and its recipe, level by level."""
+    levels = tuple(read_levels(["cooperation-2-paper", "cooperation-3-pair"]))
+    plan = Plan(levels, (with_scheme(recipe, scheme),), 1, 300, 10, 7, 5, 10, Path("any"))
+    return [(algorithm, job, job.training.recipe) for _, algorithm, job in plan.trainings()]
+
+
+def test_plan__one_learner_is_trained_alone_several_by_their_scheme_and_turns(tiny_total):
+    recipe = load_recipe(str(tiny_total))
+    for scheme in (None, "shared"):
+        (name, job, alone), (_, other, pair) = planned(recipe, scheme)
+        assert (alone.scheme, alone.total_steps, pair.scheme, pair.total_steps) == (None, 300, "shared", 600)
+        names = [each.folder.name for each in (job, other)]
+        assert (
+            names == ["cooperation-2-paper-tiny-seed0", "cooperation-3-pair-tiny-shared-seed0"]
+            and name == "tiny-shared"
+        )
+    assert [own.scheme for *_, own in planned(recipe.replace(scheme="shared"), None)] == [None, "shared"]
+    (*_, alone), (*_, pair) = planned(recipe.replace(scheme="independent", turns=2), None)
+    assert (alone.turns, pair.turns) == (None, 2)
+
+
+@pytest.mark.slow
+def test_ablate__an_interruption_ends_the_trainings_of_other_processes(tmp_path: Path, tiny_total: Path) -> None:
+    folder = tmp_path / "stopped"
+    options = ["--levels", "cooperation-0-sensors,cooperation-2-paper", "--steps", "1000000", "--jobs", "2"]
+    command = [*PROGRAM, "study", "ablate", "--output", folder, "--recipes", tiny_total, *ABLATE, *options]
+    status, told = end_when(command, lambda _: len([*folder.glob("trainings/*/checkpoints")]) == 2, signal.SIGINT)
+    assert status == 130 and "interrupted; the same command goes on" in told
+    runs = [*folder.glob("trainings/*")]
+    before = [(run / "progress.csv").read_bytes() for run in runs]
+    time.sleep(2.0)
+    assert len(runs) == 2 and [(run / "progress.csv").read_bytes() for run in runs] == before
+
+
+def test_tables_figures_and_page__show_what_was_found(levels, behind, found) -> None:
+    """What stands there follows from the harms above by hand; a change shows in the snapshot."""
+    other = measured("cooperation-2-paper", "sac", harms((5.0, 3.0, 2.0)), 6.0)
+    shielded = compare(behind, SEARCHED)
+    shown = [
+        markdown(found, "40 worlds."),
+        markdown(shielded, "40 worlds."),
+        markdown(compare([*levels[:2], other], SEARCHED), ""),
+        levels_csv(behind, SEARCHED),
+        *(interval_words(seeds) for seeds in (1, 2, 3)),
+    ]
+    for told in (found, shielded):
+        for figure in ablation_figures(told, "40 worlds"):
+            texts = [text.get_text() for axes in figure.axes for text in axes.texts]
+            labels = [
+                label.get_text() for axes in figure.axes for label in axes.get_xticklabels() + axes.get_yticklabels()
+            ]
+            legends = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+            shown.append(repr([texts, labels, legends, figure.get_supxlabel()]))
+    check_snapshot(SNAPSHOTS / "ablation.txt", "\n\n".join(shown) + "\n")
+    check_snapshot(SNAPSHOTS / "ablation.json", json.dumps(shielded, indent=1) + "\n")
+    figures = dict(zip(FIGURES, ablation_figures(found, "40 worlds"), strict=True))
+    html = ablation_page({**found, "settings": {"seeds": 2, "machine": "</script><b>"}}, "40 worlds.", figures)
+    page = Page(html)
+    assert page.open == [] and not {"script", "b", "img"} & {tag for tag, _ in page.tags}
+    assert "cooperation-2-paper 100.0 % [91.2, 100.0] 20.00 11.00 [10.00, 12.00]" in page.text
+    assert "`" not in page.text and html.count("<figure>") == 3 and "</script><b>" in page.text
+
+
+WORLDS, SEARCHED = 40, 10
+
+
+def harms(*seeds: tuple[float, float, float]) -> Harms:
+    """The same harm of each vehicle in every world, one triple per seed; total harm is twice the first."""
+    first = np.repeat(np.array(seeds)[:, np.newaxis, :], WORLDS, axis=1)
+    vehicle = {"first": first, "total": 2.0 * first}
+    world = {count: each.sum(axis=2) for count, each in vehicle.items()}
+    return Harms(world, vehicle, first.sum(axis=2) > 0.0)
+
+
+def measured(
+    name: str, algorithm: str | None, reached: Harms, best: float | None, clear: str | None = None
+) -> Measured:
+    braking = harms((4.0, 8.0, 8.0))
+    limit = (
+        None if best is None else {"first": np.full((1, SEARCHED), best), "total": np.full((1, SEARCHED), 2.0 * best)}
+    )
+    return Measured(Level(load_scenario(name), clear), algorithm, reached, braking, limit)
+
+
+@pytest.fixture(scope="module")
+def levels() -> list[Measured]:
+    return [
+        measured("cooperation-0-sensors", None, harms((4.0, 8.0, 8.0)), None),
+        measured("cooperation-2-paper", "ppo", harms((5.0, 3.0, 2.0), (5.0, 5.0, 2.0)), 6.0),
+        measured("cooperation-3-pair", "ppo", harms((1.0, 1.0, 3.0), (1.0, 1.0, 3.0)), 5.0),
+        measured("cooperation-2-blocked", "ppo", harms((5.0, 4.0, 2.0)), 6.0, "cooperation-2-paper"),
+    ]
+
+
+@pytest.fixture(scope="module")
+def found(levels) -> dict:
+    return compare(levels, SEARCHED)
+
+
+def test_compare__the_share_follows_from_what_stands_beside_the_joint_optimum(levels):
+    """The searched worlds are milder than the rest: nothing of the rest may stand in their row."""
+    one = levels[1]
+    mild = np.where(np.arange(WORLDS) < SEARCHED, 0.75, 1.0)
+    reached = replace(one.reached, world={count: harm * mild for count, harm in one.reached.world.items()})
+    braking = replace(one.full_brake, world={count: harm * mild for count, harm in one.full_brake.world.items()})
+    level = compare([replace(one, reached=reached, full_brake=braking)], SEARCHED)["levels"][0]["first"]
+    row = level["searched"]
+    assert (row["full_brake"]["value"], row["harm"]["value"], row["best_known"]["value"]) == (15.0, 8.25, 6.0)
+    assert row["share_of_possible_reduction"]["value"] == pytest.approx((15.0 - 8.25) / (15.0 - 6.0))
+    assert row["each_seed"] == [7.5, 9.0] and row["worlds"] == SEARCHED
+    assert level["full_brake"]["value"] == pytest.approx(20.0 * mild.mean())
+
+
+def test_undertrained__full_braking_does_better_is_said_in_table_page_and_figures(levels) -> None:
+    told = "cooperation-3-pair (ppo) is not trained enough to say anything: its total harm is 38.20, and 24.20 if"
+    told += " everybody brakes fully."
+    worse, better = Goal("total harm", 38.2, 24.2), Goal("total harm", 24.2, 24.2)
+    found = compare([levels[0], replace(levels[1], goal=better), replace(levels[2], goal=worse)], SEARCHED)
+    assert found["undertrained"] == [told]
+    assert [level["goal"] and level["goal"]["missed"] for level in found["levels"]] == [None, False, True]
+    assert markdown(found, "Conditions.").startswith(f"**{told}**\n\n## Levels")
+    page = ablation_page({**found, "settings": {}}, "Conditions.", {})
+    assert page.index(f'<p class="alarm">{told}</p>') < page.index("<nav")
+    for figure in ablation_figures(found, "Conditions."):
+        FigureCanvasAgg(figure).draw()
+        texts = [legend.get_title() for legend in figure.legends] or [figure._suptitle]
+        assert [" ".join(text.get_text().split()) for text in texts] == [told] and texts[0].get_color() == ALARM
+        assert texts[0].get_window_extent().y0 >= max(axes.get_tightbbox().y1 for axes in figure.axes) - 1.0
+    silent = compare(levels, SEARCHED)
+    assert silent["undertrained"] == [] and "not trained enough" not in markdown(silent, "Conditions.")
+
+
+@pytest.mark.parametrize(
+    ("level", "harm_count", "name"),
+    [("cooperation-2-paper", "first", "first-impact harm"), ("cooperation-1-front", "total", "objective")],
+)
+def test_goal__is_what_the_reward_counts(level: str, harm_count: HarmCount, name: str) -> None:
+    """In ``cooperation-1-front`` Vehicle 2 looks after itself."""
+    scenario = load_scenario(level)
+    ledgers = [
+        eb.evaluate(scenario.sample(30, 7), {agent: eb.make_agent(agent)}, scenario=scenario).outcome(agent).ledger
+        for agent in ("coast", "full_brake")
+    ]
+    reached, braking = (
+        Harms({harm_count: each.world_harm(harm_count)[np.newaxis]}, {}, each.collided[np.newaxis], (), (each,))
+        for each in ledgers
+    )
+    recipe = TINY_PPO.replace(reward={"harm": 1.0, "harm_count": harm_count})
+    goal = Goal.of(Training.of(recipe, scenario), reached, braking)
+    means = [
+        each.vehicle_harm(harm_count)[:, 1].mean() if name == "objective" else each.world_harm(harm_count).mean()
+        for each in ledgers
+    ]
+    assert goal.name == name and [goal.reached, goal.full_brake] == pytest.approx(means)
+    assert goal.missed and not goal._replace(reached=goal.full_brake).missed
+
+
+def test_ablate__goals_are_those_of_the_recipe(finished_ablation: Path) -> None:
+    found = content(finished_ablation)
+    goals = [level.pop("goal") for level in found["levels"]]
+    assert goals[0] is None
+    for goal, level in zip(goals[1:], found["levels"][1:], strict=True):
+        assert goal["name"] == "total harm"
+        assert goal["reached"] == pytest.approx(level["total"]["harm"]["value"])
+        assert goal["full_brake"] == pytest.approx(level["total"]["full_brake"]["value"])
+        said = any(line.startswith(f"{level['level']} (") for line in found["undertrained"])
+        assert said == goal["missed"] == (goal["reached"] > goal["full_brake"] + 1e-6)
+
+
+@pytest.fixture(scope="module")
+def behind(levels) -> list[Measured]:
+    """The shield takes 2 from Vehicle 2 and gives 0.5 to Vehicle 3, in the first seed alone, in every second world."""
+    shielded = {}
+    for count in ("first", "total"):
+        after = levels[2].reached.vehicle[count].copy()
+        after[0, ::2] += [0.0, -2.0, 0.5]
+        replaced = np.zeros((2, WORLDS, 2), np.int64)
+        replaced[0, ::2] = [10, 0]
+        shielded[count] = Shielded(
+            after.sum(axis=2), after, after.sum(axis=2) + 1.0, after, replaced, np.full((2, WORLDS), 50),
+            np.zeros((2, WORLDS), np.bool_),
+        )  # fmt: skip
+    shielded["total"].bound[1, 3] = 0.0
+    return [*levels[:2], replace(levels[2], shielded=shielded), levels[3]]
+
+
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_figures__texts_and_captions_have_room_and_the_colour_bar_reaches_its_end(levels, found):
+    _, figure, pays = ablation_figures(found, "40 worlds")
+    FigureCanvasAgg(figure).draw()
+    for axes in figure.axes:
+        inside = axes.get_window_extent()
+        boxes = [text.get_window_extent() for text in axes.texts]
+        assert all(inside.x0 <= box.x0 and box.x1 <= inside.x1 and box.y1 <= inside.y1 for box in boxes)
+    bar = pays.axes[-1]
+    assert max(bar.get_yticks()) >= 0.3 * bar.get_ylim()[1]
+    found = compare(levels[:2], SEARCHED)  # a single change
+    for figure in ablation_figures(found, "Conditions of this figure, in many words. " * 14):
+        FigureCanvasAgg(figure).draw()
+        bottom = min(axes.get_tightbbox().y0 for axes in figure.axes)
+        assert figure._supxlabel.get_window_extent().y1 <= bottom + 1.0
+
+
+LINES = 30
+
+
+NAMES = ("cooperation-1-front", "cooperation-2-paper", "cooperation-3-pair", "cooperation-4-all")
+
+
+def answer(level: Level, budget: int, agent: str = "full_brake") -> LevelOptimum:
+    worlds = level.scenario.sample(LINES, 7).worlds
+    table = best_harm(level.scenario, worlds, budget=budget, threads=1)
+    return LevelOptimum(level, worlds, table, (eb.Team.of(eb.make_agent(agent), level.scenario.learners),))
+
+
+@pytest.fixture(scope="module")
+def answers() -> dict[str, LevelOptimum]:
+    """Front does well by its policy alone, the paper by a long search, the pair and all three by neither."""
+    front, paper, pair, everybody = read_levels(NAMES)
+    found = [answer(front, 1, "e_v2x_bm"), answer(paper, 500), answer(pair, 1), answer(everybody, 1)]
+    return {each.level.name: each for each in found}
+
+
+def test_best_known__is_one_for_levels_that_ask_one_question(answers):
+    front, paper = (best_known(answers[name], list(answers.values())) for name in NAMES[:2])
+    scenario = answers[NAMES[0]].level.scenario
+    policy = eb.evaluate(answers[NAMES[0]].worlds, {"e": eb.make_agent("e_v2x_bm")}, scenario=scenario).outcome("e")
+    for count, harm in paper.items():
+        np.testing.assert_array_equal(front[count], harm)
+        assert (harm <= np.minimum(answers[NAMES[1]].searched.best[count].harm, policy.ledger.world_harm(count))).all()
+
+
+def test_best_known__more_learners_are_never_worse_world_by_world(answers):
+    """With the obstacle so far away that nobody reaches it."""
+    far = load_scenario("cooperation-4-all").replace(obstacle_gap_m=200)
+    every = [*list(answers.values())[:3], answer(Level(far), 1)]
+    paper, pair, everybody = (best_known(each, every) for each in every[1:])
+    for harm_count, harm in pair.items():
+        assert (harm <= paper[harm_count] + 1e-9).all() and (everybody[harm_count] <= harm + 1e-9).all()
+        assert harm.mean() < every[2].searched.best[harm_count].harm.mean() - 0.01
+    with_obstacle = best_known(answers["cooperation-4-all"], list(answers.values()))
+    for harm_count, best in answers["cooperation-4-all"].searched.best.items():
+        assert with_obstacle[harm_count].mean() < best.harm.mean() - 0.1
+
+
+def test_best_known__other_latencies_scripts_learners_or_times_count_for_nothing(answers):
+    """Vehicle 3 of ``early`` may act 0.05 s before Vehicle 2: its decisions fall between those of Vehicle 2 alone."""
+    pair, early = answers["cooperation-3-pair"], load_scenario("cooperation-3-pair").replace(latency_s=[0, 0.5, 0.45])
+    late = replace(answers[NAMES[1]].worlds.vehicles, latency_s=pair.worlds.vehicles.latency_s + 0.1)
+    coasting = load_scenario("cooperation-2-paper").replace(
+        name="mine", roles={"vehicle_1": "coast", "vehicle_2": "learner"}
+    )
+    better = answer(Level(early.with_learners(["vehicle_2"])), 500)
+    for own, others in (
+        (pair, [replace(answers[NAMES[1]], worlds=replace(answers[NAMES[1]].worlds, vehicles=late))]),
+        (pair, [answer(Level(coasting), 1), answers["cooperation-4-all"]]),
+        (answer(Level(early), 1), [better]),
+    ):
+        alone = best_known(own, [own])
+        for count, harm in best_known(own, [own, *others]).items():
+            np.testing.assert_array_equal(harm, alone[count])
+            assert own is pair or better.searched.best[count].harm.mean() < harm.mean()
+
+
+def left(plan: Plan, level: Level, part: Sample) -> tuple[int, list[Path]]:
+    return chunks_left(level.scenario, part, budget=plan.budget, chunks=plan.optimum_folder(level))
+
+
+def test_questions__each_is_searched_once_and_what_is_kept_is_not_searched_again(tmp_path, tiny_total):
+    levels = tuple(read_levels(NAMES))
+    recipe = with_scheme(load_recipe(str(tiny_total)), None)
+    plan = Plan(levels, (recipe,), 1, 300, 10, 7, 5, 10, tmp_path)
+    samples = common_worlds(levels, 10, 7)
+    asked = questions(plan, samples)
+
+    def all_left() -> list[tuple[int, list[Path]]]:
+        return [left(plan, level, part) for level, part, _ in asked]
+
+    assert [[level.name for level in alike] for *_, alike in asked] == [list(NAMES[:2]), [NAMES[2]], [NAMES[3]]]
+    assert all_left() == [(5, [])] * 3
+    told = []
+    search_all(plan, samples, 1, told.append)
+    assert told == [eb.Progress(f"joint optimum of {name}", 5, 5) for name in (NAMES[0], *NAMES[2:])]
+    assert all_left() == [(0, [])] * 3 and left(replace(plan, budget=11), *asked[0][:2]) == (5, [])
+    fewer = questions(replace(plan, search_episodes=4), samples)[0]
+    assert left(plan, *fewer[:2]) == (4, [])
+    damaged = tmp_path / "optimum" / NAMES[2] / "0000000.npz"
+    damaged.write_bytes(b"no table")
+    assert all_left() == [(0, []), (5, [damaged]), (0, [])]
+
+
+def test_measure__all_brake_fully_whatever_their_roles():
+    braking = load_scenario("paper-random").replace(name="braking", roles={"vehicle_1": "full_brake"})
+    coasting = braking.replace(name="coasting", roles={"vehicle_1": "full_brake", "vehicle_3": "coast"})
+    plan = Plan((Level(braking), Level(coasting)), (), 1, 1, 20, 7, 5, 10, Path("unused"))
+    first, second = measure(plan)
+    worlds = coasting.sample(20, 7)
+    told = eb.evaluate(worlds, {"b": eb.make_agent("full_brake")}, scenario=braking, vehicle="vehicle_2").outcome("b")
+    np.testing.assert_allclose(second.full_brake.world["total"][0], told.total_harm, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(first.reached.world["total"], second.full_brake.world["total"])
+    assert second.reached.world["total"].mean() > 2.0 * told.total_harm.mean()
+
+
+PAIR = load_scenario("cooperation-3-pair")
+
+
+def test_standard_levels__are_a_ladder_and_its_worse_channels(empty_folder: Path) -> None:
+    assert [
+        (level.name, [vehicle + 1 for vehicle in level.scenario.learners], level.clear)
+        for level in read_levels([*STANDARD, "cooperation-3-congested"])
+    ] == [
+        ("cooperation-0-sensors", [], None),
+        ("cooperation-1-front", [2], None),
+        ("cooperation-2-paper", [2], None),
+        ("cooperation-3-pair", [2, 3], None),
+        ("cooperation-4-all", [1, 2, 3], None),
+        ("cooperation-2-blocked", [2], "cooperation-2-paper"),
+        ("cooperation-3-congested", [2, 3], "cooperation-3-pair"),
+    ]
+    text = scenario_path("cooperation-2-paper").read_text().replace("v2x: paper", "v2x: nominal")
+    Path("mine.yaml").write_text(text.replace("name: cooperation-2-paper", "name: mine"))
+    assert [level.clear for level in read_levels(["cooperation-2-paper", "mine.yaml"])] == [None, "cooperation-2-paper"]
+    assert [level.clear for level in read_levels(["mine.yaml", "cooperation-2-paper"])] == [None, "mine"]
+
+
+def test_levels__are_compared_in_the_same_gaps_and_speeds() -> None:
+    every = [sample.worlds for sample in common_worlds(read_levels(STANDARD), 50, 7)]
+    assert len(every) == 6
+    assert {worlds.gaps_m.tobytes() for worlds in every} == {every[0].gaps_m.tobytes()}
+    assert {worlds.speeds_mps.tobytes() for worlds in every} == {every[0].speeds_mps.tobytes()}
+
+
+def test_best_known__counts_an_obstacle_that_is_reached() -> None:
+    # All brake fully: without an obstacle it is harmless; one 20 m ahead stands where Vehicle 1 runs into it.
+    pair = load_scenario("cooperation-3-pair").replace(gaps_m=60)
+    near = pair.replace(name="near", roles=dict.fromkeys(pair.vehicle_names, "learner"), obstacle_gap_m=20)
+    answers = [answer(Level(pair), 1), answer(Level(near), 1)]
+    assert best_known(answers[0], answers)["total"].max() == 0.0
+    assert best_known(answers[1], answers)["total"].min() > 0.0
