@@ -46,7 +46,8 @@ class StepMemory(NamedTuple):
         old, new = self.running, begun.running
         assert new is not None
         if old is None or new.n >= old.n:
-            ordered = begun._replace(enclosure=None, episode=self.episode.max(initial=-1) + 1 + 0 * rows)
+            episode = np.full(len(rows), self.episode.max(initial=-1) + 1)
+            ordered = begun._replace(enclosure=None, episode=episode)
             return ordered.take(np.argsort(rows))._replace(enclosure=begun.enclosure, logged=self.logged)
         at = old.rows_of(rows)
         running = Running(
