@@ -118,6 +118,23 @@ def _sigterm_as_ctrl_c() -> Iterator[None]:
 
 
 @contextmanager
+def own_signals() -> Iterator[None]:
+    """Context manager: restore the caller's signal handlers after the block, in which Ray sets handlers of its own.
+
+    Ray and Ray Tune leave their handlers behind; Tune's would swallow the caller's next Ctrl-C. Does nothing outside
+    the main thread, where no handler can be set.
+    """
+    in_main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.getsignal(number) for number in signal.valid_signals()} if in_main else {}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            if handler is not None and signal.getsignal(number) != handler:  # None: not set by Python
+                signal.signal(number, handler)
+
+
+@contextmanager
 def _backend(ray: str | None, jobs: int | None) -> Iterator[tuple[dict[str, Any], int]]:
     """Context manager: start joblib's backend; yield its settings and the number of calls that run at once.
 
@@ -126,7 +143,8 @@ def _backend(ray: str | None, jobs: int | None) -> Iterator[tuple[dict[str, Any]
     if ray is None:
         yield {"backend": "loky", "inner_max_num_threads": 1}, jobs or 1
         return
-    connected = connect_ray(ray, jobs)
+    with own_signals():
+        connected = connect_ray(ray, jobs)
     from ray.util.joblib import register_ray
 
     register_ray()
