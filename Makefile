@@ -26,7 +26,7 @@ unexport PYTHONDONTWRITEBYTECODE
 help:
 	@echo "make venv             the environment alone: $(VENV)"
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
-	@echo "make core              a copy without any extension passes the core's tests, trains, evaluates and shields"
+	@echo "make core [ARGS=...]   a copy without any extension passes the core's tests, trains, evaluates and shields"
 	@echo "make test [ARGS=...]  the test suite, without the tests marked slow or long (.ci/run runs the slow ones, too)"
 	@echo "make lint             ruff, ruff format --check, mypy --strict, deptry, import-linter"
 	@echo "make docs             the documentation site, its notebooks run: docs/_build/html; a warning is an error"

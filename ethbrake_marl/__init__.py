@@ -1,10 +1,10 @@
-"""Research environment for ethical emergency braking: exact physics, multi-agent, with a shield whose bound holds.
+"""Research environment for ethical emergency braking: exact multi-vehicle physics, shielded by a proven bound on harm.
 
-Importing it registers ``EthBrake-v0`` with Gymnasium and ``ethbrake/ethbrake-v0`` with PettingZoo, and nothing more: a
-public name is imported when it is first used, so torch and matplotlib are loaded only by what needs them.
+Importing the package registers ``EthBrake-v0`` with Gymnasium and ``ethbrake/ethbrake-v0`` with PettingZoo. Everything
+else is imported when its public name is first used, so torch and matplotlib are loaded only if they are needed.
 
-The imports below are the table of public names, each once. Type checkers read them as imports; at run time they are
-read from this file, and each is made on first use.
+The ``if TYPE_CHECKING`` block below lists every public name once. Type checkers read it as imports. At run time the
+package reads the list from this file and imports each name on first use.
 """
 
 from __future__ import annotations
@@ -54,11 +54,9 @@ if TYPE_CHECKING:
     from ethbrake_marl.agents.foreign import policy_agent as policy_agent
     from ethbrake_marl.agents.learned import LearnedAgent as LearnedAgent
     from ethbrake_marl.agents.protocol import Agent as Agent, Team as Team
-    from ethbrake_marl.agents.registry import (
-        AgentSettings as AgentSettings,
-        agent_names as agent_names,
-        make_agent as make_agent,
-    )
+    from ethbrake_marl.agents.making import make_agent as make_agent
+    from ethbrake_marl.agents.registry import agent_names as agent_names
+    from ethbrake_marl.agents.settings import AgentSettings as AgentSettings
     from ethbrake_marl.policies.bundle import load_policy as load_policy
     from ethbrake_marl.policies.policy import Policy as Policy
     from ethbrake_marl.policies.shipped import load_shipped as load_shipped
@@ -94,11 +92,10 @@ if TYPE_CHECKING:
 
     # Your own parts
     from ethbrake_marl.agents.registry import register_agent as register_agent
-    from ethbrake_marl.evaluation.own_measures import register_measure as register_measure
+    from ethbrake_marl.game.measures import register_measure as register_measure
     from ethbrake_marl.training.recipe import register_algorithm as register_algorithm
     from ethbrake_marl.game.objectives import register_objective as register_objective
     from ethbrake_marl.game.features import register_feature as register_feature
-    from ethbrake_marl.game.rewards import register_term as register_term
     from ethbrake_marl.scenario.catalogue import register_scenarios as register_scenarios
     from ethbrake_marl.scenario.channel import register_preset as register_preset
     from ethbrake_marl.registry import Part as Part
@@ -114,13 +111,16 @@ _NEED_TRAIN = ("EthBrakeVecEnv", "ShieldedVecEnv", "TrainResult", "make_sb3_vec_
 
 
 def _usable() -> list[str]:
-    """The public names that can be imported here; each of the others says which extra it needs when it is used."""
+    """Return the public names that can be imported with the installed packages.
+
+    Importing one of the other public names raises an error that says which optional extra it needs.
+    """
     missing = _NEED_TRAIN if find_spec("stable_baselines3") is None else ()
     return [name for name in _HOMES if name not in missing]
 
 
 def _import_public(name: str) -> Any:
-    """Import a public name from the file it lives in, once."""
+    """Import the public name ``name`` from its module, on first use (the ``__getattr__`` of the package)."""
     if name == "__all__":
         return ["__version__", *_usable()]
     if name not in _HOMES:
@@ -130,12 +130,12 @@ def _import_public(name: str) -> Any:
     register_environments()
     with naming_extras():
         value = getattr(import_module(_HOMES[name]), name)
-    value = sys.modules.get(f"{__name__}.{name}", value)  # a folder of that name, as ``shield``, is called like it
+    value = sys.modules.get(f"{__name__}.{name}", value)  # a callable folder: ``shield``
     globals()[name] = value
     return value
 
 
-if not TYPE_CHECKING:  # type checkers would take any name for a public one
+if not TYPE_CHECKING:  # a type checker that sees __getattr__ accepts any name
     __getattr__ = _import_public
 
 
@@ -143,6 +143,6 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *_usable(), "__all__"})
 
 
-# The command `ethbrake` registers them when it calls a command: Gymnasium takes longer to import than --help may take.
+# The command line registers the environments only when a command runs: importing Gymnasium would slow down --help.
 if Path(sys.argv[0] if sys.argv else "").name != "ethbrake":
     register_environments()

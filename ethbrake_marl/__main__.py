@@ -1,4 +1,4 @@
-"""``python -m ethbrake_marl``: the command line, where its script is not on the path."""
+"""Entry point of ``python -m ethbrake_marl``: the command line, for when the script ``ethbrake`` is not on the path."""
 
 from ethbrake_marl.cli.app import main
 

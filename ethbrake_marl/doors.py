@@ -1,7 +1,7 @@
-"""Front doors: a folder's ``__init__`` lists what other folders use of it, and imports each name on first use.
+"""Lazy imports for a folder: its ``__init__`` lists the names that other folders use, each imported on first use.
 
-The list is a table of imports under ``if TYPE_CHECKING``. Type checkers read it as imports; at run time it is read from
-the file, so that what a caller does not use (torch, matplotlib, scipy) is not loaded.
+The list is a block of imports under ``if TYPE_CHECKING``. Type checkers read it as imports. At run time it is read from
+the source file, so packages that a caller does not need (torch, matplotlib, scipy) are not loaded.
 """
 
 from __future__ import annotations
@@ -17,7 +17,10 @@ from typing import Any
 
 @cache
 def names_behind(file: str) -> dict[str, str]:
-    """Name -> the module that it lives in, as the table in an ``__init__`` file says."""
+    """Return name -> module for every import in the ``if TYPE_CHECKING`` block of an ``__init__``.
+
+    ``file``: path of the ``__init__`` file.
+    """
     content = ast.parse(Path(file).read_text("utf-8")).body
     table = next(part for part in content if isinstance(part, ast.If)).body
     lines = [line for line in table if isinstance(line, ast.ImportFrom)]
@@ -25,7 +28,15 @@ def names_behind(file: str) -> dict[str, str]:
 
 
 def front_door(package: str, file: str) -> Callable[[str], Any]:
-    """The ``__getattr__`` of a folder. It raises ``AttributeError`` for what the folder's table does not name."""
+    """Return the ``__getattr__`` of a folder's ``__init__``, and set the folder's ``__all__`` and ``__dir__``.
+
+    The returned function raises ``AttributeError`` for a name that the folder's list does not contain.
+
+    Args:
+        package: the folder's ``__name__``.
+        file: the folder's ``__file__``.
+
+    """
     folder, names = sys.modules[package], names_behind(file)
     vars(folder).update(__all__=[*names], __dir__=lambda: sorted({*vars(folder), *names}))
 

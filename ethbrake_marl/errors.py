@@ -1,4 +1,4 @@
-"""One family of exceptions. Every message says what is wrong, where, and what would be right."""
+"""All exceptions of this package. Every message says what is wrong, where, and what would be right."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-_NAMED = 5  # failed worlds that a message names one by one
+_NAMED = 5  # largest number of failed worlds that a message lists one by one
 
-LINE_LIMIT = 1_500  # characters of a message; of a longer one the beginning and the end are shown
+LINE_LIMIT = 1_500  # characters of a message; a longer message is shortened in the middle
 
 _KEPT_BEGINNING, _KEPT_END = 1_000, 400
 
 
 def plain_text(text: str, keep: str = "") -> str:
-    """``text`` as a terminal may have it: what is not printable is written as in Python's own escapes.
+    """Return ``text`` with unprintable characters written as Python escapes, safe to show in a terminal.
 
-    That is every control, direction and separator character but the blank and those in ``keep``. Names, keys and paths
-    come from files and command lines: shown as they are, they could move the cursor or turn a line around.
+    Control, direction and separator characters are escaped, except the space and the characters in ``keep``. Names,
+    keys and paths come from files and command lines: printed as they are, they could move the cursor or reverse a line.
     """
     if text.isprintable():
         return text
@@ -35,9 +35,9 @@ def plain_text(text: str, keep: str = "") -> str:
 
 
 def one_line(text: str) -> str:
-    """``text`` as one line of at most ``LINE_LIMIT`` characters of ``plain_text``, its middle left out if need be.
+    """Return ``text`` as one line of ``plain_text``; text longer than ``LINE_LIMIT`` is shortened in the middle.
 
-    A message begins with where and what, and ends with what would be right.
+    The beginning of a message says what is wrong and where, its end what would be right, so both are kept.
     """
     blanks = text if len(text) <= 2 * LINE_LIMIT else text[:LINE_LIMIT] + text[-LINE_LIMIT:]
     line = plain_text(blanks)
@@ -47,14 +47,18 @@ def one_line(text: str) -> str:
 
 
 def count_of(n: int, thing: str) -> str:
-    """A number and what it counts, as a message has it: ``1 world``, ``10,000 worlds``."""
+    """Return the number ``n`` with its noun, as messages write it: ``1 world``, ``10,000 worlds``.
+
+    ``thing``: the noun in the singular.
+    """
     return f"{n:,} {thing}{'' if n == 1 else 's'}"
 
 
 def describe_error(error: BaseException, path: str | None = None) -> str:
-    """An exception of somebody's code in a few words, and the last line that was run, of the file at ``path`` if given.
+    """Describe an exception from the user's code in a few words, with the line of code that raised it.
 
-    Ours speak for themselves.
+    ``path``: the user's file; the line is then the last one of that file in the traceback. None: the innermost line.
+    Errors of this package are returned as their own message.
     """
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -66,13 +70,13 @@ def describe_error(error: BaseException, path: str | None = None) -> str:
         return f"line {lines[-1]}: {text}" if lines else text
     if isinstance(error, EthBrakeError) or not frames:
         return text
-    if frames[-1].filename.startswith(os.path.dirname(__file__)):  # it was not even called: other parameters
+    if frames[-1].filename.startswith(os.path.dirname(__file__)):  # the call itself failed: wrong parameters
         return text
     return f"{text} ({os.path.basename(frames[-1].filename)}, line {frames[-1].lineno})"
 
 
 class EthBrakeError(Exception):
-    """Base of every error that this package raises on purpose; its text is one line, whatever it tells of.
+    """Base class of every error that this package raises on purpose; its message is always one line.
 
     >>> import ethbrake_marl as eb
     >>> try:
@@ -84,24 +88,24 @@ class EthBrakeError(Exception):
     """
 
     def __str__(self) -> str:
-        """The message as ``one_line``."""
+        """Return the message, shortened by ``one_line``."""
         return one_line(super().__str__())
 
 
 class InvalidInput(EthBrakeError, ValueError):
-    """A value given by the user cannot be used: the message names it, its value and what would be right."""
+    """A value from the user cannot be used; the message names the argument, its value and what would be right."""
 
 
 class UnknownName(InvalidInput):
-    """A name (scenario, agent, key, run) is not known; the message lists or suggests those that are."""
+    """A name (scenario, agent, key, run) is unknown; the message suggests a similar name or lists the known ones."""
 
 
 class AlreadyExists(EthBrakeError, FileExistsError):
-    """Something would be overwritten; pass ``force`` (``--force``) to allow it."""
+    """A file or a registered name exists already. ``force`` (``--force``) allows overwriting a file."""
 
 
 class CorruptBundle(EthBrakeError, ValueError):
-    """A policy bundle is damaged, or is not one; nothing of it was used."""
+    """A policy bundle is damaged, or the file is not a policy bundle; nothing was loaded from it."""
 
 
 _EXTRA_OF = {
@@ -116,7 +120,7 @@ _EXTRA_OF = {
 
 
 class MissingExtra(EthBrakeError, ImportError):
-    """Something needs a package that the plain install leaves out; the message holds the line that installs it.
+    """A package of an optional extra is not installed; the message contains the command that installs it.
 
     >>> import ethbrake_marl as eb
     >>> issubclass(eb.MissingExtra, ImportError)
@@ -127,7 +131,10 @@ class MissingExtra(EthBrakeError, ImportError):
 
 @contextmanager
 def naming_extras() -> Iterator[None]:
-    """An import inside that lacks a package of an extra raises ``MissingExtra``; any other fails as it would."""
+    """Context manager: raise ``MissingExtra`` if an import in the block fails for want of an optional extra.
+
+    Any other import error passes unchanged.
+    """
     try:
         yield
     except ModuleNotFoundError as error:
@@ -138,7 +145,7 @@ def naming_extras() -> Iterator[None]:
 
 
 def need(package: str) -> None:
-    """Raise ``MissingExtra`` unless a package of an extra is installed; nothing is imported."""
+    """Raise ``MissingExtra`` unless ``package``, a package of an optional extra, is installed. Imports nothing."""
     if find_spec(package) is None:
         raise _missing(package)
 
@@ -149,10 +156,14 @@ def _missing(package: str) -> MissingExtra:
 
 
 class PhysicsError(EthBrakeError, ArithmeticError):
-    """Some worlds of a batch could not be advanced: a defect of the kernel, never of the input.
+    """Some worlds of a batch could not be advanced. This is a defect of the physics kernel, never of the input.
 
-    ``worlds``: what is wrong, by the world's row in the batch that was given. All others are well, and a world's result
-    does not depend on its batch: who has a list may leave these out and go on (``physics.leaving_out_failed``).
+    All other worlds of the batch are valid, and a world's result does not depend on its batch, so a caller may drop the
+    failed worlds and go on (``physics.left_out.leaving_out_failed``).
+
+    Args:
+        worlds: row of each failed world in the batch -> reason.
+
     """
 
     def __init__(self, worlds: Mapping[int, str]) -> None:
@@ -165,14 +176,18 @@ class PhysicsError(EthBrakeError, ArithmeticError):
         return one_line("; ".join([*named, f"and {count_of(more, 'more world')}"] if more else named))
 
     def renumbered(self, rows: Sequence[int] | NDArray[np.int64]) -> PhysicsError:
-        """The same of the batch from which the worlds of this one were taken: world k was its world ``rows[k]``."""
+        """Return this error with rows of a larger batch: world k here is world ``rows[k]`` there."""
         return PhysicsError({int(rows[row]): reason for row, reason in self.worlds.items()})
 
 
 class AgentFailed(InvalidInput):
-    """An agent that somebody gave us raised an exception, or gave no actions; the message names world and step.
+    """A user's agent raised an exception or returned no valid actions; the message names the agent, world and step.
 
-    ``row``: of the world in the batch that was given; None where it is not known.
+    Args:
+        agent: name of the agent.
+        row: row of the world in the batch; None if it is unknown.
+        reason: what went wrong, with the step.
+
     """
 
     def __init__(self, agent: str, row: int | None, reason: str) -> None:
@@ -184,15 +199,15 @@ class AgentFailed(InvalidInput):
         return one_line(f"agent {self.agent!r}{where}, {self.reason}")
 
     def renumbered(self, rows: Sequence[int] | NDArray[np.int64]) -> AgentFailed:
-        """The same of the batch from which the worlds of this one were taken, as ``PhysicsError.renumbered``."""
+        """Return this error with the row of a larger batch: world k here is world ``rows[k]`` there."""
         return AgentFailed(self.agent, None if self.row is None else int(rows[self.row]), self.reason)
 
     @staticmethod
     @contextmanager
     def naming(name: str, others: Collection[str] = ()) -> Iterator[None]:
-        """Name an agent that fails inside the block as the user does: on the command line, or in a mapping.
+        """Context manager: raise an ``AgentFailed`` from the block again under ``name``, the user's name for the agent.
 
-        ``others``: names of who drives the other vehicles, which stay.
+        ``others``: names of the agents of the other vehicles; an error that carries one of these passes unchanged.
         """
         try:
             yield
@@ -203,12 +218,15 @@ class AgentFailed(InvalidInput):
 
 
 class Unfamiliar(UserWarning):
-    """A trained policy drives in worlds beyond those that it was trained in."""
+    """Warning: a trained policy is used in worlds unlike those it was trained in."""
 
 
 @contextmanager
 def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
-    """Worlds that fail inside are told by the rows of the batch from which they were taken."""
+    """Context manager: a ``PhysicsError`` or ``AgentFailed`` raised in the block is raised again with other rows.
+
+    For a block that works on part of a batch: world k of the part is row ``rows[k]`` of the whole batch.
+    """
     try:
         yield
     except (PhysicsError, AgentFailed) as error:
@@ -216,13 +234,18 @@ def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
 
 
 class UncertifiedStep(EthBrakeError):
-    """An engine that a shield follows was made to do something else than was certified; the step was not made."""
+    """A step of the engine differs from the step that its shield certified; the step was not made."""
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
-    """Build the error for an unknown ``name``, with a suggestion when one is close.
+    """Return the error for an unknown name: it suggests a similar known name, or lists the known ones.
 
-    ``may_be_own``: users have some of their own, so that a package may not be installed.
+    Args:
+        kind: what the name stands for, for example ``scenario``.
+        name: the unknown name.
+        known: the known names.
+        may_be_own: users can register names of this kind, so the message adds that theirs may not be registered yet.
+
     """
     names = sorted(known)
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
@@ -232,7 +255,10 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
 
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
-    """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most`` (None: no end)."""
+    """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most`` (None: no upper limit).
+
+    ``what`` names the value in the message.
+    """
     whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not (whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole
         right = f", at least {least}" if most is None else f" in {least}..{most}"
@@ -240,9 +266,13 @@ def check_whole_number(what: str, value: object, least: int, most: int | None = 
 
 
 def check_one_learner(scenario: str, learners: Sequence[str], advice: str) -> None:
-    """Raise ``InvalidInput``, ending in ``advice``, unless exactly one vehicle of the named scenario learns.
+    """Raise ``InvalidInput``, with ``advice`` at the end of the message, unless the scenario has exactly one learner.
 
-    ``learners``: names of those that do.
+    Args:
+        scenario: name of the scenario.
+        learners: names of its learners.
+        advice: what the user can do.
+
     """
     if len(learners) != 1:
         raise InvalidInput(

@@ -1,4 +1,4 @@
-"""PettingZoo's module: ``from ethbrake_marl import ethbrake_v0``, then ``ethbrake_v0.parallel_env()`` or ``.env()``."""
+"""Environment module in PettingZoo's style, with ``ethbrake_v0.parallel_env()`` and, for the AEC API, ``.env()``"""
 
 from __future__ import annotations
 

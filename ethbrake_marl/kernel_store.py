@@ -1,4 +1,4 @@
-"""The folder of compiled kernels, and who is told that one is compiled; unlike what compiles, it imports no numba."""
+"""Folder in which compiled kernels are cached, and callbacks for the first compilation. Does not import numba."""
 
 from __future__ import annotations
 
@@ -16,33 +16,37 @@ _tellers: list[Callable[[Path, bool], None]] = []
 
 @cache
 def cache_folder() -> Path:
-    """Folder of the compiled kernels: the user's cache; if that cannot be written, one for this process."""
+    """Return the folder of the compiled kernels: in the user's cache, or a temporary one if that is not writable."""
     try:
         home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         folder = Path(home) / "ethbrake_marl"
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             return folder
-    except (OSError, RuntimeError):  # RuntimeError: without HOME, for a user id that has no name
+    except (OSError, RuntimeError):  # RuntimeError: no HOME, and the user id has no name
         temporary = Path(tempfile.mkdtemp(prefix=_TEMPORARY))
         atexit.register(shutil.rmtree, temporary, ignore_errors=True)
         return temporary
 
 
 def is_temporary(folder: Path) -> bool:
-    """Whether a ``cache_folder`` goes when this process ends."""
+    """Return whether ``folder``, a result of ``cache_folder``, is deleted when this process ends."""
     return folder.name.startswith(_TEMPORARY)
 
 
 def on_first_compilation(tell: Callable[[Path, bool], None]) -> None:
-    """Call ``tell`` once, when this process begins to compile: the store's folder, and whether it had nothing for it.
+    """Call ``tell(folder, was_empty)`` once, just before this process compiles its first kernel.
 
-    Kernels that are loaded are not compiled. It had nothing if none was loaded before the first one is compiled.
+    ``folder`` is the cache folder. ``was_empty`` is true if this process has loaded no kernel from it before. Loading a
+    cached kernel is not compiling.
     """
     _tellers.append(tell)
 
 
 def tell_compilation(nothing_kept: bool) -> None:
-    """Call whom ``on_first_compilation`` has noted: a kernel is about to be compiled."""
+    """Call the callbacks of ``on_first_compilation``, once each: a kernel is about to be compiled.
+
+    ``nothing_kept``: this process has loaded no kernel from the cache so far.
+    """
     while _tellers:
         _tellers.pop()(cache_folder(), nothing_kept)

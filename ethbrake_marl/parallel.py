@@ -1,4 +1,4 @@
-"""Independent calls, several at a time: joblib's processes of this machine, or a Ray; one thread each."""
+"""Independent function calls in parallel: joblib processes on this machine or on Ray, with one thread each."""
 
 from __future__ import annotations
 
@@ -18,38 +18,40 @@ from typing import Any
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
 
 LOCAL = "local"
-_WORKERS = {  # environment of a Ray's processes: one thread each, in the folder of the command
+_WORKERS = {  # environment variables of Ray's workers: one thread each, in the folder of the command
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
     "RAY_CHDIR_TO_TRIAL_DIR": "0",
 }
 _DRIVER = {
     "RAY_USAGE_STATS_ENABLED": "0",
-    "RAY_raylet_start_wait_time_s": "300",  # much else may run here; Ray gives up after 30 s
+    "RAY_raylet_start_wait_time_s": "300",  # the machine may be busy; by default Ray gives up after 30 s
     "RAY_AIR_NEW_OUTPUT": "0",
     "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
     "TUNE_PRINT_ALL_TRIAL_ERRORS": "0",
 }
 _WATCH_S = 1.0
-_AGAIN = 10  # times that a Ray begins a lost worker, and makes its call, anew
-_ON_RAY = 16  # calls per core that are handed to a Ray together
+_AGAIN = 10  # how often Ray restarts a lost worker and repeats its call
+_ON_RAY = 16  # calls per core in one batch for Ray
 
-Call = tuple[Callable[..., Any], *tuple[Any, ...]]  # a function that stands in a module, and its arguments
+Call = tuple[Callable[..., Any], *tuple[Any, ...]]  # a module-level function and its arguments
 
 
 class WorkerLost(EthBrakeError):
-    """A worker process ended in the middle of a call."""
+    """A worker process was killed during a call."""
 
 
 def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = None) -> Iterator[Any]:
-    """Give the result of each call, in the order of the calls, whatever order they end in.
+    """Run function calls in parallel and yield their results in the order of the calls.
 
     Args:
-        calls: each is taken shortly before its turn.
-        jobs: calls at a time; None: one, or as many as a Ray has cores. One call at a time runs in this process.
-        ray: ``local``, a Ray of this machine alone, or the address of a cluster.
+        calls: tuples (function, argument, ...), functions of a module; each is taken from the iterable shortly before
+            it starts.
+        jobs: number of calls that run at once. None: one, or as many as Ray has cores. One call at a time runs in this
+            process.
+        ray: ``local`` for a Ray on this machine alone, or the address of a Ray cluster. None: no Ray.
 
-    Raises what a call raises, ``WorkerLost`` where a process is killed (a call that a node of a cluster loses is made
-    again), ``MissingExtra`` without joblib or Ray, and ``InvalidInput`` where no cluster answers at the address.
+    Raises what a call raises; ``WorkerLost`` if a worker process is killed (Ray repeats a call that a node has lost);
+    ``MissingExtra`` without joblib or Ray; ``InvalidInput`` if no cluster answers at the address.
 
     """
     if ray is None and jobs in (None, 1):
@@ -63,23 +65,26 @@ def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = N
     with _backend(ray, jobs) as (backend, at_once), _sigterm_as_ctrl_c():
         with parallel_config(**backend):
             parallel = Parallel(at_once, batch_size=1, return_as="generator" if ray is None else "list")
-        if ray is not None:  # its backend gives lists
+        if ray is not None:  # joblib's Ray backend returns lists
             while part := list(islice(work, _ON_RAY * at_once)):
                 yield from parallel(part)
             return
         results = parallel(work)
         try:
-            for result in results:  # noqa: UP028  # `yield from` would close them outside of what stands below
+            for result in results:  # noqa: UP028  # `yield from` would close `results` outside the except clause below
                 yield result
         except BrokenProcessPool:
             raise WorkerLost("a worker process was killed, perhaps for memory; do fewer at once (--jobs)") from None
         finally:
-            with warnings.catch_warnings(action="ignore"):  # of calls whose results nobody wants any more
+            with warnings.catch_warnings(action="ignore"):  # warnings about calls that are cancelled
                 results.close()
 
 
 def _answer(call: bytes) -> Any:
-    """Make a call in a worker; what it prints is no result."""
+    """Run the pickled call ``(function, argument, ...)`` in a worker and return its result.
+
+    Text that the call prints goes to stderr.
+    """
     _end_with_parent()
     with redirect_stdout(sys.stderr):
         function, *given = pickle.loads(call)
@@ -88,7 +93,7 @@ def _answer(call: bytes) -> Any:
 
 @cache
 def _end_with_parent() -> None:
-    """A worker ends with the process that began it, also in the middle of a call."""
+    """Make this worker exit when its parent process has ended, even in the middle of a call."""
 
     def watch(parent: int) -> None:
         while os.getppid() == parent:
@@ -100,7 +105,7 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _sigterm_as_ctrl_c() -> Iterator[None]:
-    """Nothing of joblib is left behind when a signal ends the process, unless somebody else answers the signal."""
+    """Handle SIGTERM like Ctrl-C in the block, so joblib cleans up; does nothing if SIGTERM already has a handler."""
     before = signal.getsignal(signal.SIGTERM)
     if threading.current_thread() is not threading.main_thread() or before is not signal.SIG_DFL:
         yield
@@ -113,17 +118,38 @@ def _sigterm_as_ctrl_c() -> Iterator[None]:
 
 
 @contextmanager
+def own_signals() -> Iterator[None]:
+    """Context manager: restore the caller's signal handlers after the block, in which Ray sets handlers of its own.
+
+    Ray and Ray Tune leave their handlers behind; Tune's would swallow the caller's next Ctrl-C. Does nothing outside
+    the main thread, where no handler can be set.
+    """
+    in_main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.getsignal(number) for number in signal.valid_signals()} if in_main else {}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            if handler is not None and signal.getsignal(number) != handler:  # None: not set by Python
+                signal.signal(number, handler)
+
+
+@contextmanager
 def _backend(ray: str | None, jobs: int | None) -> Iterator[tuple[dict[str, Any], int]]:
-    """Joblib's backend with its settings, and how many calls are made at once."""
+    """Context manager: start joblib's backend; yield its settings and the number of calls that run at once.
+
+    Arguments are those of ``run_each``.
+    """
     if ray is None:
         yield {"backend": "loky", "inner_max_num_threads": 1}, jobs or 1
         return
-    connected = connect_ray(ray, jobs)
+    with own_signals():
+        connected = connect_ray(ray, jobs)
     from ray.util.joblib import register_ray
 
     register_ray()
     try:
-        # A worker that is lost begins anew, and its call is made again.
+        # Ray restarts a lost worker and repeats its call.
         again = {"num_cpus": 1, "max_restarts": _AGAIN, "max_task_retries": _AGAIN}
         yield {"backend": "ray", "ray_remote_args": again}, jobs or int(connected.cluster_resources().get("CPU", 1))
     finally:
@@ -131,20 +157,20 @@ def _backend(ray: str | None, jobs: int | None) -> Iterator[tuple[dict[str, Any]
 
 
 def connect_ray(address: str, cores: int | None = None) -> Any:
-    """Ray itself, connected.
+    """Connect to Ray and return the module ``ray``.
 
     Args:
-        address: of a cluster that runs, as Ray takes it, or ``local``: a Ray of this machine on loopback sockets,
-            without a dashboard.
-        cores: of the local one; None: all that this process may use.
+        address: address of a running cluster in Ray's own format, or ``local``: start a Ray on this machine, on
+            loopback sockets and without a dashboard.
+        cores: number of cores of the local Ray; None: all that this process may use.
 
-    Raises ``MissingExtra`` without Ray, ``InvalidInput`` where there is no cluster at the address.
+    Raises ``MissingExtra`` without Ray, ``InvalidInput`` if Ray cannot be started or no cluster answers at the address.
 
     """
     os.environ |= _DRIVER
     if address == LOCAL:
-        # What Ray reads, once, when it is loaded: no cluster can be made of this, and 127.0.0.1 is its address. An
-        # address that is given to ray.init would be changed to that of a network card.
+        # Ray reads this once, when it is imported. With "0" it uses 127.0.0.1 and other machines cannot join. Ray
+        # would replace an address that is passed to ray.init by the address of a network card.
         os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
     with naming_extras():
         import ray
@@ -154,7 +180,7 @@ def connect_ray(address: str, cores: int | None = None) -> Any:
         ray.init(
             address=address, log_to_driver=False, configure_logging=False, runtime_env={"env_vars": _WORKERS}, **own
         )
-    except Exception as error:  # where a Ray cannot start it raises just that
+    except Exception as error:  # Ray raises a plain Exception if it cannot start
         raise InvalidInput(
             f"ray {address!r}: cannot be started, or no cluster can be reached there ({error})"
         ) from None

@@ -1,4 +1,4 @@
-"""Progress of a long piece of work, for whoever asks to see it."""
+"""Progress reports of a long computation, as a value and as a line on stderr."""
 
 from __future__ import annotations
 
@@ -10,28 +10,27 @@ from typing import Literal
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """``done`` of ``total`` of the part called ``name``.
+    """State of a long computation: ``done`` of ``total`` units of the part called ``name``.
 
-    Of a training ``done`` counts decisions of learners, and ``total`` is what they come to in whole updates.
+    In training a unit is a decision of a learner, and ``total`` is rounded up to whole updates.
 
     >>> import ethbrake_marl as eb
     >>> eb.Progress("full_brake", 500, 1000)
     Progress(name='full_brake', done=500, total=1000, metrics={}, note='', updates=0, wall_s=0.0)
-
     """
 
-    name: str  # "training", an agent that drives, "figures", ...
-    done: int  # worlds, or decisions of learners
-    total: int  # the same when it is done
-    metrics: Mapping[str, float] = field(default_factory=dict)  # of a policy while it is trained: its last evaluation
-    note: str = ""  # to be told once
-    updates: int = 0  # of a training
-    wall_s: float = 0.0  # of a training
-    objective: str = field(default="", repr=False)  # what ``metrics["objective"]`` is, in words
+    name: str  # "training", the name of an agent, "figures", ...
+    done: int  # number of worlds, or of decisions by learners
+    total: int  # value of ``done`` at the end
+    metrics: Mapping[str, float] = field(default_factory=dict)  # in training: results of the last evaluation
+    note: str = ""  # message to print once
+    updates: int = 0  # in training: policy updates so far
+    wall_s: float = 0.0  # in training: seconds so far
+    objective: str = field(default="", repr=False)  # name of the quantity in ``metrics["objective"]``
 
     @property
     def harm(self) -> str:
-        """The harm that a training is for, in words: that of ``metrics`` which stands first; empty without one."""
+        """Harm in the last evaluation, as text with its name: ``total harm 24.19``; empty without an evaluation."""
         if self.objective and "objective" in self.metrics:
             return f"{self.objective} {self.metrics['objective']:.2f}"
         words = {"first_impact_harm": "first-impact harm", "total_harm": "total harm"}
@@ -40,7 +39,10 @@ class Progress:
 
     @staticmethod
     def listener(told: Told) -> OnProgress | None:
-        """The function to tell; for ``show`` one that writes on stderr."""
+        """Return the function to call with each ``Progress``; None: nobody is informed.
+
+        ``told`` is this function itself, ``"show"`` for one that prints on stderr, or None.
+        """
         return ShownProgress() if told == "show" else told
 
 
@@ -51,14 +53,17 @@ Told = OnProgress | Literal["show"] | None
 
 
 class ShownProgress:
-    """Shows on stderr how far a training is: on a terminal in one line, else one for each tenth and evaluation."""
+    """Prints progress on stderr.
+
+    On a terminal it rewrites one line. Otherwise it prints one line for each tenth of the work and for each evaluation.
+    """
 
     def __init__(self) -> None:
         self._terminal = sys.stderr.isatty()
         self._last: tuple[str, int] | None = None  # harm and tenth of the last line
 
     def __call__(self, progress: Progress) -> None:
-        """Show it, if it is news."""
+        """Print the progress if it changed."""
         ended, harm = progress.done >= progress.total, progress.harm
         news = (harm, 10 * progress.done // max(progress.total, 1))
         if not (self._terminal or progress.note or news != self._last):

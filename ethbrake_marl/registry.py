@@ -1,12 +1,13 @@
-"""Names that stand for parts: agents, shields, measures, terms, features, objectives, algorithms and commands.
+"""Registries of parts by name: agents, shields, measures, features, objectives, algorithms, commands.
 
-One registry for each kind. A running program gives a name with ``register_...``; an installed package, ours among them,
-with an entry point in its ``pyproject.toml``, which goes through the same function when the name is first used:
+There is one registry per kind of part. A running program adds a part with a ``register_...`` function. An installed
+package adds one with an entry point in its ``pyproject.toml``; this package registers its own extensions in the same
+way. The entry point is loaded, and passed to the same function, when its name is first used:
 
     [project.entry-points."ethbrake_marl.agents"]
     gentle = "my_package.agents:make_gentle"
 
-So what is installed and not used is not imported, and cannot break what does not use it.
+So a part that is installed but not used is never imported, and cannot break anything.
 """
 
 from __future__ import annotations
@@ -27,22 +28,22 @@ from ethbrake_marl.errors import (
     unknown_name,
 )
 
-OURS = "ethbrake-marl"  # our own distribution
-_VERSIONS: dict[str, str] = {}  # of the others that gave a part to this process
+OURS = "ethbrake-marl"  # name of this distribution
+_VERSIONS: dict[str, str] = {}  # distribution -> version, for other packages with a part loaded in this process
 
 T = TypeVar("T")
 
 
 class Part:
-    """What an entry point names where it is more than a function or a class.
+    """Value of an entry point: all arguments for a ``register_...`` function but the name, which the entry point has.
 
-    It holds what the ``register_...`` function of its kind takes behind the name:
+    An entry point in the group ``ethbrake_marl.measures`` that names the part below has the effect of
+    ``register_measure(name, closing, unit="m/s")``.
 
     >>> import ethbrake_marl as eb
     >>> def closing(episodes):
     ...     '''Largest closing speed of an impact in the line.'''
     >>> part = eb.Part(closing, unit="m/s")
-
     """
 
     def __init__(self, *given: Any, **settings: Any) -> None:
@@ -51,7 +52,12 @@ class Part:
 
 @cache
 def points(group: str) -> dict[str, list[EntryPoint]]:
-    """The entry points of a group by name, ours first: several of a name where several distributions give it."""
+    """Return name -> entry points with this name in a group; a list, because several packages may use one name.
+
+    This package's own names come first.
+
+    ``group``: its name without the prefix ``ethbrake_marl.``, for example ``agents``.
+    """
     found: dict[str, list[EntryPoint]] = {}
     in_order = sorted(entry_points(group=f"ethbrake_marl.{group}"), key=lambda each: (giver(each) != OURS, each.name))
     for point in in_order:
@@ -60,26 +66,29 @@ def points(group: str) -> dict[str, list[EntryPoint]]:
 
 
 def giver(point: EntryPoint) -> str:
-    """The distribution that gives an entry point."""
+    """Return the name of the distribution that defines an entry point; ``?`` if it is unknown."""
     return "?" if point.dist is None else point.dist.name
 
 
 def versions_used() -> dict[str, str]:
-    """Name -> version of the distributions, but ours, that gave a part to this process."""
+    """Return name -> version of every other installed package that has added a part, such as an agent, to this process.
+
+    Parts that are registered by entry points but were not loaded do not count.
+    """
     return dict(sorted(_VERSIONS.items()))
 
 
 class Registry(Mapping[str, T]):
-    """The parts of one kind by name, each loaded when it is first asked for.
+    """The parts of one kind by name; each is loaded when it is first looked up.
 
-    ``name in`` and going through the names load nothing. What is asked for raises ``InvalidInput`` where it cannot be
-    loaded, or where two distributions give its name; ``MissingExtra`` where a package of an extra is missing.
+    Testing for a name and iterating over the names load nothing. Looking up a name raises ``InvalidInput`` if its part
+    cannot be loaded or two distributions define it, and ``MissingExtra`` if a package of an extra is missing.
 
     Args:
-        kind: of its parts, in words.
-        group: of its entry points, behind ``ethbrake_marl.``.
-        register: is called with a name and what the entry point names, and puts it here with ``add``.
-        built_in: parts that stand in the code beside it.
+        kind: what the parts are called in messages, for example ``agent``.
+        group: group of the entry points, without the prefix ``ethbrake_marl.``.
+        register: called with a name and the value of its entry point; it calls ``add`` on this registry.
+        built_in: name -> part, for parts that are defined in code rather than by entry points.
 
     """
 
@@ -95,7 +104,7 @@ class Registry(Mapping[str, T]):
         return name in self.loaded or name in points(self.group)
 
     def __iter__(self) -> Iterator[str]:
-        """Those that are built in, those of entry points, then those that this process registered."""
+        """Yield the names: built-in parts first, then entry points, then parts that this process registered."""
         built_in = (name for name in self.loaded if name in self._built_in)
         return iter(dict.fromkeys([*built_in, *points(self.group), *self.loaded]))
 
@@ -109,8 +118,12 @@ class Registry(Mapping[str, T]):
             raise InvalidInput(f"{self.kind} {name!r}: {why}")
         return self.loaded[name]
 
-    def load(self, name: str) -> None:
-        """Load what has this name, once; raises ``UnknownName``."""
+    def load(self, name: str) -> list[str]:
+        """Load the part called ``name`` if it is not loaded yet, and return the names of all parts that it defines.
+
+        An entry point usually defines the one part; it may define several by a dictionary. Raises ``UnknownName`` if
+        there is none, and ``InvalidInput`` or ``MissingExtra`` if it cannot be loaded.
+        """
         given = points(self.group).get(name, [])
         givers = [OURS] * (name in self._built_in) + [giver(point) for point in given]
         if len(givers) > 1:
@@ -118,16 +131,16 @@ class Registry(Mapping[str, T]):
                 f"{self.kind} {name!r}: the installed packages {' and '.join(givers)} give it; uninstall all but one"
             )
         if name in self.loaded or name in self._loading:
-            return
+            return [name]
         if not given:
             raise self.unknown(name)
         self._loading.add(name)
         try:
-            self._load(name, given[0])
+            return self._load(name, given[0])
         finally:
             self._loading.discard(name)
 
-    def _load(self, name: str, point: EntryPoint) -> None:
+    def _load(self, name: str, point: EntryPoint) -> list[str]:
         where = f"{self.kind} {name!r}, {point.value} of the installed package {giver(point)}"
         try:
             with naming_extras():
@@ -137,17 +150,23 @@ class Registry(Mapping[str, T]):
         except (Exception, SystemExit) as error:
             raise InvalidInput(f"{where}: cannot be imported: {describe_error(error)}") from error
         try:
-            # Several parts under one name are a mapping.
-            for each, part in (found if isinstance(found, dict) else {name: found}).items():
+            # An entry point that defines several parts is a dictionary of them.
+            parts = found if isinstance(found, dict) else {name: found}
+            for each, part in parts.items():
                 given, settings = (part.given, part.settings) if isinstance(part, Part) else ((part,), {})
                 self._register(each, *given, **settings)
         except (EthBrakeError, TypeError) as error:
             raise InvalidInput(f"{where}: {error}") from error
         if point.dist is not None and giver(point) != OURS:
             _VERSIONS[giver(point)] = point.dist.version
+        return list(parts)
 
     def add(self, name: str, part: T, is_same: Callable[[T], bool]) -> None:
-        """Put a part here; raises ``AlreadyExists`` where another one has its name."""
+        """Add ``part`` under ``name``; raise ``AlreadyExists`` if the name belongs to another part.
+
+        ``is_same`` is called with the part that has the name and returns whether it equals the new one; if so, nothing
+        changes.
+        """
         if name not in self.loaded and name in self and name not in self._loading:
             self.load(name)
         if not is_same(self.loaded.setdefault(name, part)):
@@ -158,11 +177,11 @@ class Registry(Mapping[str, T]):
             )
 
     def usable(self) -> dict[str, T]:
-        """All that can be loaded, which is done; for lists that have to say more than names."""
+        """Load all parts and return those that could be loaded, by name."""
         return {name: self.loaded[name] for name in self if self.why_not(name) is None and name in self.loaded}
 
     def why_not(self, name: str) -> str | None:
-        """Why a name cannot be loaded; None if it is."""
+        """Load the part called ``name``; return the error message if that fails, otherwise None."""
         try:
             self.load(name)
         except (InvalidInput, MissingExtra) as error:
@@ -170,7 +189,10 @@ class Registry(Mapping[str, T]):
         return None
 
     def unknown(self, name: object, known: Iterable[str] | None = None) -> UnknownName:
-        """The error for a name that nothing has; ``known``: names to tell of in the place of all."""
+        """Return the error for a ``name`` that no part has.
+
+        ``known``: names to suggest or list; None: all names of this registry.
+        """
         if not points("agents"):
             return UnknownName(
                 f"unknown {self.kind} {name!r}: of the package {OURS} no entry points are installed; install it, or"

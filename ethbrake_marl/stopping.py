@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a question that is asked between two steps, in the place of an exception inside one."""
+"""Ctrl-C and SIGTERM as a flag to check between two steps, instead of an exception in the middle of one."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @contextmanager
 def stop_on_signal() -> Iterator[Callable[[], bool]]:
-    """Give a function that says whether to stop; the second signal acts as if nobody listened.
+    """Context manager: yield a function that returns whether Ctrl-C or SIGTERM has asked to stop.
 
-    Outside the main thread, where Python delivers no signals, the function always says no.
+    A second Ctrl-C or SIGTERM has its usual effect. Outside the main thread, where Python delivers no signals, the
+    function always returns False.
     """
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():

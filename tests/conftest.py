@@ -21,15 +21,10 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM
 
 # `installed` comes first: what it finds is what the others, and all processes that they start, find.
 pytest_plugins = [
-    f"tests.fixtures.{name}" for name in ("installed", "evaluation", "pictures", "policies", "registered")
+    f"tests.fixtures.{name}" for name in ("installed", "pictures", "commands", "evaluation", "policies", "registered")
 ]
-TESTS = Path(__file__).parent
-if (TESTS / "extensions").exists():
+if (Path(__file__).parent / "extensions" / "proofs").exists():
     pytest_plugins.append("tests.extensions.proofs.remembered")
-else:  # the core alone: what imports an extension is not tested
-    collect_ignore = [
-        str(file) for file in TESTS.rglob("test_*.py") if "from ethbrake_marl.extensions" in file.read_text()
-    ]
 
 # Typer builds all commands for each command line, 100 ms; the suite has a thousand in one process.
 typer.main.get_command_from_info = functools.cache(typer.main.get_command_from_info)
@@ -69,3 +64,15 @@ def _one_torch_thread() -> None:
     torch = sys.modules.get("torch")
     if torch is not None and torch.get_num_threads() != 1:
         torch.set_num_threads(1)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--first-case", action="store_true", help="of each parametrised test the first case alone")
+
+
+@pytest.hookimpl(trylast=True)  # behind the choice by marks
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("first_case"):
+        first = {item.nodeid.partition("[")[0]: item for item in reversed(items)}
+        config.hook.pytest_deselected(items=[item for item in items if item not in first.values()])
+        items[:] = [item for item in items if item in first.values()]

@@ -30,7 +30,7 @@ def make_cautious(argument: str | None, settings: eb.AgentSettings) -> eb.Agent:
 def register(recipe: type[eb.TrainingRecipe], algorithm: type[Any]) -> tuple[str, ...]:
     eb.register_agent("cautious", make_cautious)
     eb.register_algorithm("own", recipe, algorithm)
-    eb.register_term("smooth", lambda step: -np.abs(step.command_mps2), unit="m/s2")
+    eb.register_measure("smooth", lambda step: -np.abs(step.command_mps2), unit="m/s2", by="step")
     eb.register_feature("load", lambda worlds, i: worlds.vehicles.mass_t[:, i], unit="t", scale=10.0, low=0.0, high=6.0)
     eb.register_preset("deaf", {"preset": "nominal", "lost": 0.5})
     eb.register_objective("front", lambda harm, vehicle: harm.borne[:, 0])

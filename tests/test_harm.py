@@ -13,8 +13,10 @@ import ethbrake_marl as eb
 from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.game.actions import action_to_command, checked_action, command_to_action
 from ethbrake_marl.game.harm import Ledger, empty_ledger, split
+from ethbrake_marl.game.measures import BUILT_IN
 from ethbrake_marl.game.objectives import STANDARD, objective_harm, objectives_of, scored
-from ethbrake_marl.game.rewards import REWARDS, RewardParams, StepOutcome, WithoutEffect, reward_params
+from ethbrake_marl.game.rewards import REWARDS, RewardParams, WithoutEffect, reward_params
+from ethbrake_marl.game.step_outcome import StepOutcome
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.forecast import forecast
 from ethbrake_marl.physics.left_out import Impacts
@@ -119,8 +121,12 @@ def terms_of(
     step = StepOutcome(*harm_of_count, end, *motion, 0.5, after.time_s, *constants, np.array([1]))
     harm = step.first_impact_harm if params.harm_count == "first" else step.total_harm
     shared = params.shared(harm, step.safe_end.astype(np.float64))
-    spread = {name: np.repeat(term[:, np.newaxis], after.N, axis=1) for name, term in shared.items()}
-    return spread | step.built_in(params.moving, params)
+    counted = [BUILT_IN[name] for name in params.counted if BUILT_IN[name].function]
+    every = shared | {measure.name: measure.built_in(step, params) for measure in counted}
+    return {
+        name: np.repeat(term[:, np.newaxis], after.N, axis=1) if term.ndim == 1 else term
+        for name, term in every.items()
+    }
 
 
 def moved(gaps_m: list[float], speeds_mps: list[float], seconds: float, command: Any = 0.0) -> Any:
@@ -446,7 +452,7 @@ def test_rewards__are_those_of_the_page() -> None:
 )
 def test_term_of_ones_own__counts_where_a_reward_says_so(reward, terms) -> None:
     for _ in range(2):  # registered twice it is one
-        eb.register_term("mine", one)
+        eb.register_measure("mine", one, by="step")
     assert reward_params(reward).terms == terms
     settled = RewardParams(harm=1.0, terms={"mine": 3.0})
     assert RewardParams(**settled.model_dump()) == settled

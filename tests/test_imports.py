@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 
 from ethbrake_marl.errors import _EXTRA_OF, MissingExtra, naming_extras
-from tests.docs import layout
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -52,10 +51,6 @@ def imported_by_text(tree: ast.AST) -> Iterator[tuple[int, str]]:
 @cache
 def tree_of(path: Path) -> ast.Module:
     return ast.parse(path.read_text("utf-8"))
-
-
-def test_page_of_the_layout__is_made_of_the_code() -> None:
-    assert layout.PAGE.read_text("utf-8") == layout.page()
 
 
 @pytest.mark.parametrize(
@@ -132,7 +127,7 @@ def test_start__version_every_help_and_completion_import_nothing_heavy() -> None
     status, out, err = ended(STARTS)
     assert (status, err) == (0, "")
     assert out.endswith("\n--scenario\n")
-    assert "Train a policy, or those of several learners." in out
+    assert "Train a policy, or the policies of several learners." in out
 
 
 @pytest.mark.parametrize("use", ["ethbrake_marl.Scenario", "run_command(['scenario', 'show', 'paper-random'])"])
@@ -162,7 +157,6 @@ for name in {absent}:
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import MissingExtra
-from ethbrake_marl.extensions import report
 
 for name in eb.__all__:
     getattr(eb, name)

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ethbrake_marl.scenario.observed import observation_for
 from numpy.typing import NDArray
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
+from ethbrake_marl.game.observed import observation_for
 from ethbrake_marl.policies.network_spec import NetworkSpec
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.training.recipe import load_recipe

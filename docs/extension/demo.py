@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from markupsafe import Markup
 
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.evaluation.motion import EpisodeMotion
 from ethbrake_marl.extensions.report.page import Part, read_file
 from ethbrake_marl.extensions.report.player import Played

@@ -12,12 +12,13 @@ from ethbrake_marl import ethbrake_v0
 from ethbrake_marl.agents.protocol import Source
 from ethbrake_marl.agents.registry import agent_entries
 from ethbrake_marl.cli.app import Installed, whole_command
-from ethbrake_marl.evaluation.measures import measures
+from ethbrake_marl.evaluation.measure_sets import measures
 from ethbrake_marl.game.features import Feature
 from ethbrake_marl.game.full_state import state_features
+from ethbrake_marl.game.measures import BUILT_IN
 from ethbrake_marl.game.objectives import OBJECTIVES
 from ethbrake_marl.game.observations import ObservationSpec, choose_observation
-from ethbrake_marl.game.rewards import REWARDS, TERMS, RewardParams
+from ethbrake_marl.game.rewards import REWARDS, RewardParams
 from ethbrake_marl.policies.shipped import load_shipped, shipped_policies
 from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 from ethbrake_marl.scenario.channel import CHANNELS, V2X
@@ -238,7 +239,7 @@ def features() -> str:
 def rewards() -> str:
     """Terms, the named rewards, and objectives."""
     settings = {name: params.model_dump() for name, params in REWARDS.items()}
-    told = dict.fromkeys(TERMS, "weight of the term")
+    told = dict.fromkeys(BUILT_IN, "weight of the term")
     arguments = (inspect.getdoc(RewardParams) or "").partition("Args:\n")[2].partition("\n\n")[0].replace("``", "`")
     told |= dict(re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)\.$", arguments, re.MULTILINE))
     rows = [
@@ -247,7 +248,7 @@ def rewards() -> str:
         if field != "terms"
     ]
     return sections(
-        Terms=table(("term", "unit", "meaning"), [(f"`{t.name}`", t.unit, t.meaning) for t in TERMS.values()]),
+        Terms=table(("term", "unit", "meaning"), [(f"`{t.name}`", t.unit, t.meaning) for t in BUILT_IN.values()]),
         Named_rewards=table(("setting", "meaning", *(f"`{name}`" for name in settings)), rows),
         Objectives=table(("objective", "counts"), [(f"`{kind.form}`", kind.about) for kind in OBJECTIVES.values()]),
     )

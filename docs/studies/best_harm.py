@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.registry import split_specs
+from ethbrake_marl.agents.spec import split_specs
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.identity import result_identity
 from ethbrake_marl.evaluation.lineup import make_agents

@@ -10,7 +10,7 @@ import warnings
 import numpy as np
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.physics.advance import advance
 

@@ -14,7 +14,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.training.recipe import load_recipe

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import mean, paired_difference, rate

@@ -15,7 +15,7 @@ import torch
 from stable_baselines3 import PPO
 
 import ethbrake_marl as eb
-from ethbrake_marl.game.rewards import StepOutcome
+from ethbrake_marl.game.step_outcome import StepOutcome
 from ethbrake_marl.physics.state import Floats
 
 SHAPED = {"harm": 0.05, "shaping": 0.05, "shaping_discount": 0.99}
@@ -69,6 +69,6 @@ def line(block: str, seeds: list[dict[str, float]]) -> str:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    eb.register_term("speed", speed, unit="m/s")
+    eb.register_measure("speed", speed, unit="m/s", by="step")
     rows = [line(block, [measure(block, train(block, seed)) for seed in SEEDS]) for block in sys.argv[1:]]
     print("\n".join([f"| {' | '.join(['block', *MEASURES])} |", "| --- |" + " ---: |" * len(MEASURES), *rows]))

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.engine.memory import ask_script, begin_script
 from ethbrake_marl.evaluation.identity import result_versions, scenario_sha256, worlds_sha256
 from ethbrake_marl.extensions.report.style import GREY, add_caption, new_figure, series_style, style_axes, write_picture

@@ -30,10 +30,10 @@ def batch_rate(intervals: str | None, n: int) -> tuple[float, int]:
     rng = np.random.default_rng(0)
     shield.decide(rng.uniform(-1.0, 1.0, n))
     done, begun = 0, time.process_time()
-    while not shield.running.finished.all():
-        done += int((~shield.running.finished).sum())
+    while not shield.memory.running.finished.all():
+        done += int((~shield.memory.running.finished).sum())
         shield.decide(rng.uniform(-1.0, 1.0, n))
-    return done / (time.process_time() - begun), shield.running.members
+    return done / (time.process_time() - begun), shield.memory.running.members
 
 
 def single_times(decisions: int) -> list[float]:
@@ -42,12 +42,12 @@ def single_times(decisions: int) -> list[float]:
     while len(took) < decisions:
         shield = StepShield(SCENARIO, 1)
         shield.begin(SCENARIO.sample(1, 3, first=len(took)).worlds, np.arange(1))
-        while not shield.running.finished.all():
+        while not shield.memory.running.finished.all():
             proposed = rng.uniform(-1.0, 1.0, 1)
             begun = time.perf_counter()
-            decision = certify(shield.running, proposed, shield.backup, shield.bound)
+            decision = certify(shield.memory.running, proposed, shield.memory.backup, shield.bound)
             took.append(time.perf_counter() - begun)
-            shield.running, shield.backup = decision.after, decision.backup
+            shield.memory = shield.memory._replace(running=decision.after, backup=decision.backup)
     return took
 
 

@@ -1,72 +1,118 @@
-"""Letting agents drive through whole episodes: the loop of every evaluation and of every prediction."""
+"""Run agents through whole episodes: the loop of every evaluation and every prediction."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 
+from ethbrake_marl.agents.making import make_role
 from ethbrake_marl.agents.protocol import Agent, Driver, Team
-from ethbrake_marl.agents.registry import around_one_vehicle, make_role
+from ethbrake_marl.agents.registry import around_one_vehicle
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.memory import Memory
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.game.harm import Ledger
+from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.state import Bools, Floats, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 
 
 @dataclass(frozen=True, slots=True)
 class Episodes:
-    """How the episodes of a batch went."""
+    """Result of running a batch of n episodes (worlds) to their ends."""
 
-    ledger: Ledger
-    final: Worlds  # each world as its episode left it
-    at_rest: Bools  # [n] the line came to rest; else the horizon cut the episode off
-    guarded: Any  # what the shield remembers at their end; None without one
-    memories: Mapping[int, Memory]  # by driven vehicle, what its agent remembers at their end
+    ledger: Ledger  # harm and impacts of every pair of vehicles over the whole episode
+    final: Worlds  # each world at the end of its episode
+    at_rest: Bools  # [n] whether the line came to rest; otherwise the episode ended at the horizon
+    guarded: Any  # memory of the shield at the end; None without a shield
+    memories: Mapping[int, Memory]  # index of a controlled vehicle -> memory of its agent at the end
+    terms: Mapping[str, Floats] = field(default_factory=dict)  # name of a reward term -> its sum, [n] or [n, N]
 
     @classmethod
-    def of(cls, engine: Engine, worlds: Worlds, watched_by: Sequence[Watch] = ()) -> Episodes:
-        """Those of an ``episode_engine``, still at the first decision in ``worlds``; raises ``PhysicsError``."""
+    def of(
+        cls, engine: Engine, worlds: Worlds, watched_by: Sequence[Watch] = (), summed: Sequence[str] = ()
+    ) -> Episodes:
+        """Run an engine from the first decision to the end of every episode.
+
+        Args:
+            engine: an engine made by ``episode_engine``, not stepped yet.
+            worlds: the engine's worlds at the alert; observers get them as ``before`` of the first step.
+            watched_by: observers that are called after every step.
+            summed: names of reward terms to sum over the episodes.
+
+        Raises ``PhysicsError`` naming the worlds that could not be advanced.
+
+        """
         at_rest = np.zeros(worlds.n, np.bool_)
+        terms: dict[str, Floats] = {}
         now = _show(watched_by, worlds, engine, engine.worlds.command_mps2)
-        while not engine.ended.all():
-            at_rest |= engine.step({}).terminated
+        standing = engine.ended
+        while not standing.all():
+            step = engine.step({})
+            at_rest |= step.terminated
+            for name in summed:
+                term = step.terms[name]
+                running = np.where(standing if term.ndim == 1 else standing[:, np.newaxis], 0.0, term)
+                terms[name] = terms.get(name, 0.0) + running
             now = _show(watched_by, now, engine, engine.wanted_mps2.copy())
+            standing = engine.ended
         if engine.roster.failed:
             raise PhysicsError(engine.roster.failed)
         memories = {i: memory for i, memory in engine.memories.items() if i in engine.deciders}
-        return cls(engine.ledger, engine.worlds, at_rest, engine.guarded, memories)
+        return cls(engine.ledger, engine.worlds, at_rest, engine.guarded, memories, terms)
 
 
 class Watch(Protocol):
-    """Sees every step of a batch of episodes."""
+    """Observer of every step of a batch of episodes."""
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """``before`` moved to the times ``until_s`` [n] under ``command_mps2`` [n, N]; ended worlds stay at theirs.
+        """Receive one step, or a part of it, of all n worlds.
 
-        The first step is from the alert to the first decision; where a script decides on the way, a step is seen in
-        parts. Nothing of what is given may be changed.
+        The first step is from the alert to the first decision. A step within which a script decides arrives in parts.
+
+        Args:
+            before: the worlds at the start of the step. Do not change any of the arguments.
+            command_mps2: command of every vehicle during the step, [n, N] m/s2.
+            until_s: time of each world at the end of the step, [n] s. A world whose episode has ended keeps its time.
+
         """
         ...
 
 
 def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | None = None) -> dict[int, Agent]:
-    """Agents for the scenario's scripts, by vehicle."""
+    """Return the agents of the scenario's scripts: vehicle index (0 = front) -> agent.
+
+    Args:
+        scenario: the scenario.
+        except_for: index or indices of vehicles to leave out; None: none.
+
+    """
     left_out = (except_for,) if isinstance(except_for, int) else except_for or ()
     return {i: make_role(scenario, i) for i in scenario.scripts if i not in left_out}
 
 
-def episode_engine(worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None) -> Engine:
-    """An engine over ``worlds`` in which ``agent`` drives ``vehicle``, or a team its vehicles; the others are scripted.
+def episode_engine(
+    worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None, reward: Reward = "harm"
+) -> Engine:
+    """Return an engine in which agents drive whole episodes; step it with ``engine.step({})`` until all have ended.
 
-    They decide when their first vehicle's latency has elapsed and every time step from then on, as learners do; their
-    commands are applied unrounded. Behind a shield they propose, and learn as far as the engine knows. One that looks
-    ahead knows the scripts, and takes the other driven vehicles to
-    brake fully. Raises ``InvalidInput`` for a learner that nobody drives.
+    The agents decide when the latency of the first of their vehicles has elapsed and every time step after that, like
+    learners; their commands are applied without rounding. Behind a shield they propose commands, and the engine treats
+    their vehicles as learners. An agent that looks ahead knows the scripts, and assumes that other controlled vehicles
+    brake fully.
+
+    Args:
+        worlds: n worlds at the alert.
+        agent: an agent for ``vehicle``, or a team, which has its own vehicles.
+        scenario: scenario whose scripts drive the other vehicles.
+        vehicle: index of the agent's vehicle (0 = front); None for a team.
+        reward: reward whose terms the engine computes.
+
+    Raises ``InvalidInput`` if one of the scenario's learners gets no agent.
+
     """
     team = agent if isinstance(agent, Team) else Team.of(agent, () if vehicle is None else (vehicle,))
     drivers = team.drivers
@@ -82,34 +128,54 @@ def episode_engine(worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: i
     shield = team.shield
     if shield is None:
         engine = Engine(
-            scenario, worlds.n, learners=(), scripts={**scripts, **drivers}, deciders=tuple(drivers), worlds=worlds
-        )
+            scenario, worlds.n, learners=(), scripts={**scripts, **drivers}, reward=reward, deciders=tuple(drivers),
+            worlds=worlds,
+        )  # fmt: skip
     else:
         engine = Engine(
-            scenario, worlds.n, learners=tuple(drivers), scripts=scripts, worlds=worlds,
+            scenario, worlds.n, learners=tuple(drivers), scripts=scripts, reward=reward, worlds=worlds,
             guard=lambda engine: shield.guard(engine, drivers),
         )  # fmt: skip
         engine.check_time_step(drivers)
-    engine.roster.warns = False  # who drives looks
+    engine.roster.warns = False  # the caller of the loop checks for failed worlds
     return engine
 
 
 def drive(
-    worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None, *, watched_by: Sequence[Watch] = ()
-) -> Episodes:
-    """Let ``agent`` drive ``vehicle``, or a team its vehicles, through every world (at t = 0) to its episode's end.
+    worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None, *,
+    watched_by: Sequence[Watch] = (), summed: Sequence[str] = (),
+) -> Episodes:  # fmt: skip
+    """Let an agent or a team drive in every world from the alert (t = 0) to the end of its episode.
 
-    Raises ``PhysicsError`` naming all worlds that could not be advanced; the others are well without them.
+    Args:
+        worlds: n worlds at the alert.
+        agent: an agent for ``vehicle``, or a team, which has its own vehicles.
+        scenario: scenario whose scripts drive the other vehicles.
+        vehicle: index of the agent's vehicle (0 = front); None for a team.
+        watched_by: observers that are called after every step.
+        summed: names of reward terms to sum over the episodes, with the default settings of ``RewardParams``.
+
+    Raises ``PhysicsError`` naming all worlds that could not be advanced; the others can be driven without them.
+
     """
-    engine = episode_engine(worlds, agent, scenario, vehicle)
-    return Episodes.of(engine, scenario.play_pieces(worlds, engine.deciders), watched_by)
+    reward: Reward = {"harm": 1.0} | dict.fromkeys(summed, 1.0) if summed else "harm"
+    engine = episode_engine(worlds, agent, scenario, vehicle, reward)
+    return Episodes.of(engine, scenario.play_pieces(worlds, engine.deciders), watched_by, summed)
 
 
 def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_mps2: Floats) -> Worlds:
-    """Show the step that the engine has just made; gives the worlds as they are now."""
+    """Pass the step that the engine has just made to the observers; return the worlds after it.
+
+    Args:
+        watched_by: the observers; without any, ``before`` is returned.
+        before: the worlds at the start of the step.
+        engine: the engine, after the step.
+        command_mps2: command of every vehicle during the step, [n, N] m/s2.
+
+    """
     if not watched_by:
         return before
-    now = engine.packed.worlds(before.vehicles)  # the episodes are the same, and so are their vehicles
+    now = engine.packed.worlds(before.vehicles)  # same episodes, same vehicles
     for part in engine.segments(before, command_mps2):
         for watch in watched_by:
             watch.see(*part)
@@ -117,10 +183,10 @@ def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_m
 
 
 def record_commands(agent: Driver, worlds: Worlds, scenario: Scenario, vehicle: int, steps: int) -> Floats:
-    """The commands that ``agent`` gives ``vehicle`` in the first ``steps`` decisions of its episodes, [n, steps] m/s2.
+    """Return the first ``steps`` commands that ``agent`` gives ``vehicle`` (index, 0 = front), [n, steps] m/s2.
 
-    ``worlds`` are at the alert. After an episode's end its last command goes on. Raises ``PhysicsError`` naming the
-    worlds that it cannot drive to the end.
+    ``worlds`` are n worlds at the alert. Once an episode has ended, its last command is repeated. Raises
+    ``PhysicsError`` naming the worlds that cannot be driven to the end.
     """
     engine = episode_engine(worlds, agent, scenario, vehicle)
     commands = write_down(engine, steps, lambda: engine.wanted_mps2[:, [vehicle]])[:, :, 0]
@@ -130,9 +196,16 @@ def record_commands(agent: Driver, worlds: Worlds, scenario: Scenario, vehicle: 
 
 
 def write_down(engine: Engine, steps: int, column: Callable[[], Floats]) -> Floats:
-    """Play such an engine to the end; the ``column`` [n, K] after each of the first steps, [n, steps, K].
+    """Run an engine to the end of all episodes and record a value after each of the first ``steps`` steps.
 
-    NaN after an episode's end. Raises ``PhysicsError``.
+    Args:
+        engine: an engine made by ``episode_engine``.
+        steps: number of steps to record.
+        column: returns the present values of the engine's n worlds, [n, K].
+
+    Returns [n, steps, K], NaN after the end of an episode. Raises ``PhysicsError`` naming worlds that could not be
+    advanced.
+
     """
     columns = np.full((steps, *column().shape), np.nan)
     while not engine.ended.all():

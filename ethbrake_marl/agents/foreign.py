@@ -1,4 +1,4 @@
-"""Policies of other libraries, each as one function: ``(observation, state) -> (action, state)``."""
+"""Policies of other libraries as agents; each becomes one function ``(observation, state) -> (action, state)``."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
 
-State = Any  # arrays whose first axis is the world, or tuples, lists and mappings of such
+State = Any  # memory of a policy: arrays whose first axis is the world, or tuples, lists and mappings of such arrays
 
-Infer = Callable[[Observations, State], tuple[Any, State]]
+Infer = Callable[[Observations, State], tuple[Any, State]]  # (observations [n, F], memory) -> (actions, new memory)
 
-Begin = Callable[[int], State]  # the memory of n episodes that begin
+Begin = Callable[[int], State]  # number of episodes -> memory at their start
 
 _KINDS = (
     "a function of observations, an object with predict, a torch module, an ONNX session or the path of an .onnx file"
@@ -37,7 +37,17 @@ _KINDS = (
 
 
 def adapt_policy(policy: Any, name: str, features: int, initial_state: Begin | None) -> tuple[Infer, Begin | None]:
-    """The policy as such a function, and what makes its memory; raises ``InvalidInput`` for what is none."""
+    """Return two functions for a policy: ``(observations, state) -> (actions, state)``, and ``n -> initial state``.
+
+    Args:
+        policy: a policy of one of the kinds that ``policy_agent`` accepts.
+        name: name of the agent in error messages.
+        features: number F of features in an observation.
+        initial_state: for a function or torch module with a memory: makes the memory of n episodes at their start.
+
+    The second result is None for a policy without a memory. Raises ``InvalidInput`` if ``policy`` is not a policy.
+
+    """
     if isinstance(policy, str | os.PathLike):
         policy = _open_onnx(Path(policy), name)
     if not (hasattr(policy, "run") and hasattr(policy, "get_inputs")) and not hasattr(policy, "predict"):
@@ -65,9 +75,16 @@ def _without_memory(action: Any) -> Any:
 
 
 def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | None]:
-    """A model with ``predict``; where that gives a state, too (sb3-contrib's recurrent ones), the agent keeps it.
+    """Adapt a model with a method ``predict`` (Stable-Baselines3, sb3-contrib), as ``adapt_policy`` does.
 
-    Which axis of the state is that of the worlds is found by asking for two worlds and for three.
+    A memory that it returns (recurrent models) is kept. Which axis of the memory counts the worlds is found by
+    predicting for two worlds and for three.
+
+    Args:
+        model: the model.
+        name: name of the agent in error messages.
+        features: number of features in an observation.
+
     """
 
     def predict(seen: Observations, **memory: Any) -> tuple[Any, State]:
@@ -132,7 +149,7 @@ def _ask_torch(module: Any, name: str, with_state: bool) -> Infer:
 
 
 def _is_torch_module(policy: Any) -> bool:
-    """Never imports torch: whoever has a module has it already."""
+    """Return whether ``policy`` is a torch module. Never imports torch: without torch in memory, nothing is one."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(policy, torch.nn.Module)
 
@@ -149,9 +166,10 @@ def _open_onnx(path: Path, name: str) -> Any:
 
 
 def weights_sha256(policy: Any) -> str | None:
-    """SHA-256 of an .onnx file, or of the weights of a torch module or a Stable-Baselines3 model as they are now.
+    """Return the SHA-256 of an .onnx file (given by its path), or of the present weights of a torch or SB3 model.
 
-    What a ``VecNormalize`` has counted belongs to the weights. None for anything else, whose weights nobody can find.
+    The statistics of a ``VecNormalize`` count as weights. Returns None for any other policy, whose weights cannot be
+    read.
     """
     if isinstance(policy, str | os.PathLike):
         return hashlib.sha256(Path(policy).read_bytes()).hexdigest() if Path(policy).is_file() else None
@@ -171,7 +189,7 @@ def weights_sha256(policy: Any) -> str | None:
 
 
 def to_array(value: Any) -> NDArray[Any]:
-    """An array, of a tensor too; what is masked is no number."""
+    """Return an array, torch tensor or sequence as a NumPy array; masked entries become NaN."""
     if isinstance(value, np.ma.MaskedArray):
         return np.ma.filled(value.astype(np.float64), np.nan)
     return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
@@ -188,30 +206,30 @@ def policy_agent(
     appended: Appended | None = None,
     ignore_wrappers: bool = False,
 ) -> PolicyAgent:
-    """An agent that drives by a policy of any library: observations [n, F] float32 -> actions [n, 1] in [-1, 1].
+    """Return an agent for a policy of any library: observations [n, F] float32 -> actions [n, 1] in [-1, 1].
 
     A policy with a memory is a function ``(observation, state) -> (action, state)`` with an ``initial_state``, or a
-    model whose ``predict`` gives a state.
+    model whose ``predict`` returns a state.
 
     Args:
-        policy: a function, a model with ``predict`` (Stable-Baselines3; asked deterministically, its state kept world
-            by world, its observations normalised by its ``VecNormalize``), a torch module (called as it is, without
-            gradients), an ONNX session, or the path of an ``.onnx`` file. Copies share it.
-        name: in tables and messages; None: the name of the function or class.
-        scenario: the policy observes what learners of it do; or its name.
-        observation: what it observes instead, as ``choose_observation`` reads it; None: that of the scenario, or of the
-            policy itself, or of the environment that a Stable-Baselines3 model has, or the usual one.
-        initial_state: makes the memory of ``n`` episodes that begin: an array whose first axis is the world, or tuples
-            and mappings of such. None: a function has no memory.
-        clip: actions beyond -1 and 1 mean -1 and 1; otherwise they are refused.
-        appended: ``number`` or ``state`` of ``make_sb3_vec_env``, where the policy was trained on such rows; needs the
-            scenario with its learners. None: as in the environment that the model has. Who sees the ``state`` knows
-            the true state of the line.
-        ignore_wrappers: drive a model as it is, although wrappers of its training may have changed what it saw or did,
-            its actions have other bounds, or the statistics of its ``VecNormalize`` are missing.
+        policy: a function; a model with ``predict`` (Stable-Baselines3: called deterministically, its state kept world
+            by world, its observations normalised by its ``VecNormalize``); a torch module (called without gradients);
+            an ONNX session; or the path of an ``.onnx`` file. Copies of the agent share it.
+        name: name in tables and messages; None: the name of the function or class.
+        scenario: scenario, or its name, whose learners' observation the policy takes.
+        observation: the observation instead, as for ``choose_observation``. None: the scenario's; without a scenario,
+            that of the policy itself, of a Stable-Baselines3 model's environment, or the default.
+        initial_state: makes the memory of ``n`` episodes at their start: an array whose first axis is the world, or
+            tuples and mappings of arrays. None: a function has no memory.
+        clip: clip actions to [-1, 1]; by default an action beyond is an error.
+        appended: what training appended to each observation: ``number`` (the learner's number) or ``state`` (the true
+            state of the line), as for ``make_sb3_vec_env``; needs the scenario with its learners. None: as in the
+            model's training environment, or nothing.
+        ignore_wrappers: accept a model even if wrappers of its training may have changed observations or actions, if
+            its actions have other bounds, or if the statistics of its ``VecNormalize`` are missing.
 
-    Raises ``InvalidInput`` for what is no such policy, one for another number of features, and a model that was trained
-    under wrappers that may change what it sees or does.
+    Raises ``InvalidInput`` for anything else, for a policy with another number of features, and for a model that was
+    trained under wrappers that may change observations or actions.
 
     >>> import ethbrake_marl as eb
     >>> agent = eb.policy_agent(lambda observation: -observation[:, :1].clip(0, 1), name="mine")
@@ -258,7 +276,11 @@ def policy_agent(
 
 
 def _appending(appended: Appended, scenario: Scenario) -> Callable[[Worlds, int], Observations]:
-    """What stands behind the own observation of one learner, from worlds and vehicle: [n, features]."""
+    """Return a function ``(worlds, vehicle)`` that computes the K features appended to a vehicle's observation, [n, K].
+
+    ``appended`` is ``number`` (the vehicle's number among the scenario's learners) or ``state`` (the true state of the
+    whole line).
+    """
 
     def number(worlds: Worlds, vehicle: int) -> Observations:
         if vehicle not in scenario.learners:
@@ -278,7 +300,7 @@ def _observation_of(policy: Any, scenario: Scenario | None, given: Observation |
 
 
 class PolicyAgent:
-    """Drives one vehicle by a policy of any library; made by ``policy_agent``."""
+    """Agent that drives one vehicle by a policy of any library; made by ``policy_agent``."""
 
     knows = Source.MESSAGES
 
@@ -293,17 +315,24 @@ class PolicyAgent:
         more: Callable[[Worlds, int], Observations] | None = None,
     ) -> None:
         self.name = name
-        self.weights_sha256 = weights_sha256  # of the policy as it is now; None where nobody can find its weights
+        self.weights_sha256 = weights_sha256  # hash of the policy's present weights; None if they cannot be read
         self.observation = observation
         self._infer, self._initial_state, self._clip = infer, initial_state, clip
-        self._more = more  # what stands behind the own observation
+        self._more = more  # what follows the own observation
 
     def policy_sha256(self) -> str | None:
-        """Hash of the policy's weights as they are now; None where they cannot be found."""
+        """Return the hash of the policy's present weights; None if they cannot be read."""
         return self.weights_sha256()
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """No decision was made yet; the policy's own state is the initial one."""
+        """Return the agent's memory before the first decision, with the policy's initial state.
+
+        Args:
+            alert: n worlds at the alert.
+            vehicle: index of the controlled vehicle (0 = front).
+            scripts: the scripts of the line; not used.
+
+        """
         n, state = alert.n, None
         try:
             if self._initial_state is not None:
@@ -313,10 +342,10 @@ class PolicyAgent:
         return {"steps": np.zeros(n, np.int64), "state": state}
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Wanted signed acceleration [n], m/s2.
+        """Return the commanded acceleration of ``vehicle``, [n] m/s2, and the agent's new memory.
 
-        Raises ``AgentFailed`` naming world and step where the policy raises, or gives another shape, no number, or one
-        that is not in [-1, 1].
+        Raises ``AgentFailed`` naming world and step if the policy raises, or returns a wrong shape, a value that is not
+        a number, or one outside [-1, 1].
         """
         seen = observe(worlds, vehicle, self.observation).astype(np.float32, copy=False)
         if self._more is not None:
@@ -331,21 +360,27 @@ class PolicyAgent:
             return self._answer(seen, state, np.arange(worlds.n))
         except Exception as error:
             k = self._find_failing(seen, state)
-            first, last = steps.min(initial=10**9) + 1, steps.max(initial=0) + 1  # of all running episodes
+            first, last = steps.min(initial=10**9) + 1, steps.max(initial=0) + 1  # over all running episodes
             where = f"step {first}" if first >= last else f"steps {first} to {last}"
             where = where if k is None else _moment_text(k, worlds, steps)
             reason = f"{where}: observations of shape {seen.shape}: {describe_error(error)}"
             raise AgentFailed(self.name, k, reason) from error
 
     def _answer(self, seen: Observations, state: State, rows: Ints) -> tuple[NDArray[Any], State]:
-        """What the policy says in some rows of the batch, and its memory of them then."""
+        """Return the policy's raw actions for the worlds with the indices ``rows``, and its new memory of these worlds.
+
+        ``seen`` [n, F] and ``state`` are observations and the policy's memory of all worlds.
+        """
         if self._initial_state is None:
             return to_array(self._infer(seen[rows], None)[0]), None
         action, state = self._infer(seen[rows], take_memory(state, rows))
         return to_array(action), checked_memory(state, len(rows))
 
     def _find_failing(self, seen: Observations, state: State) -> int | None:
-        """The row for which alone the policy fails too, found by halves; None where no half fails."""
+        """Return the index of a world for which the policy alone raises, found by bisection; None if there is none.
+
+        ``seen`` [n, F] and ``state`` are observations and the policy's memory of all worlds.
+        """
 
         def fails(rows: Ints) -> bool:
             try:
@@ -364,7 +399,10 @@ class PolicyAgent:
         return int(rows[0])
 
     def _checked(self, action: NDArray[Any], seen: Observations, worlds: Worlds, steps: Ints) -> Floats:
-        """The actions [n] in [-1, 1]."""
+        """Return a policy's raw actions as [n] in [-1, 1]; raise ``AgentFailed`` for wrong shapes or values.
+
+        ``seen``, ``worlds`` and ``steps`` [n] (steps taken) are used in the message only.
+        """
         n, what = worlds.n, f"gave {action.dtype} of shape {action.shape} for observations of shape {seen.shape}"
         if action.shape != (n, 1) or action.dtype.kind not in "fiu":
             first = len(action) if action.shape[1:] in ((), (1,)) and action.ndim and len(action) < n else 0

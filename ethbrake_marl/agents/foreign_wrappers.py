@@ -1,7 +1,7 @@
-"""Under which wrappers a Stable-Baselines3 model was trained, and whether they change what it sees or does.
+"""Checks for wrappers in a Stable-Baselines3 model's training environment that change observations or actions.
 
-An agent drives by the model alone, so a wrapper that changed observations or actions would be missing. Neither
-Stable-Baselines3 nor the libraries of the wrappers need be installed.
+An agent calls the model alone, without these wrappers, so their changes would be lost. Neither Stable-Baselines3 nor
+the libraries of the wrappers need to be installed.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 
-# By library, the classes whose methods hand on observations and actions as they are. ``VecNormalize`` is applied.
+# Library -> classes that pass observations and actions on unchanged. ``VecNormalize`` is applied by the agent.
 HARMLESS = {
     "gymnasium": (
         "Env", "Wrapper", "RewardWrapper", "NormalizeReward", "OrderEnforcing", "PassiveEnvChecker", "TimeLimit",
@@ -32,13 +32,16 @@ HARMLESS = {
     "supersuit": ("SB3VecEnvWrapper", "ConcatVecEnv", "MarkovVectorEnv", "gym_reward_lambda", "aec_reward_lambda"),
 }  # fmt: skip
 
-_METHODS = ("step", "reset", "step_async", "step_wait", "observe", "last")  # through which observations, actions pass
+_METHODS = ("step", "reset", "step_async", "step_wait", "observe", "last")  # methods that pass observations or actions
 
-_INSIDE = ("venv", "envs", "vec_envs", "par_env", "aec_env", "env")  # attributes that hold what is wrapped
+_INSIDE = ("venv", "envs", "vec_envs", "par_env", "aec_env", "env")  # attributes that hold the wrapped environment
 
 
 def changes(layer: type[Any]) -> bool:
-    """Whether a wrapper, or an environment, may change what is seen or done: by the class that defines its methods."""
+    """Return whether a class of wrappers or environments may change observations or actions.
+
+    A class does not if each of its methods is defined by a class in ``HARMLESS`` or by a class of this package.
+    """
     for method in _METHODS:
         definer = next((each for each in layer.__mro__ if method in vars(each)), object)
         library = definer.__module__.partition(".")[0]
@@ -53,14 +56,23 @@ class _WhatChanges(type):
 
 
 class _Changing(metaclass=_WhatChanges):
-    """Anything that ``changes``, for ``env_is_wrapped``, which asks in another process."""
+    """Stand-in class for ``env_is_wrapped``: every object whose class may change something is an instance of it.
+
+    ``env_is_wrapped`` also runs in other processes, where ``changes`` cannot be called directly.
+    """
 
 
 def training_environment(model: Any, name: str, *, ignore_wrappers: bool = False) -> Any:
-    """The environment of this package in which a Stable-Baselines3 model is trained, inside whatever wraps it.
+    """Return this package's environment inside the training environment of a Stable-Baselines3 model.
 
-    None where the model has none. Raises ``InvalidInput`` for a wrapper, in any copy, that may change what the model
-    sees or does, for copies that observe different features, and where the statistics of ``VecNormalize`` are missing.
+    Args:
+        model: any policy; returns None for one that has no environment, or none of this package.
+        name: name of the agent in error messages.
+        ignore_wrappers: accept everything that raises an error otherwise.
+
+    Raises ``InvalidInput`` for a wrapper, in any copy of the environment, that may change observations or actions; for
+    copies with different features; and for missing statistics of ``VecNormalize``.
+
     """
     statistics = normalisation(model)
     if statistics is None and not ignore_wrappers and _was_normalised(model):
@@ -90,14 +102,15 @@ def training_environment(model: Any, name: str, *, ignore_wrappers: bool = False
 
 
 def normalisation(model: Any) -> Any:
-    """Stable-Baselines3's ``VecNormalize`` that the model is trained under, as it counts now; None without one."""
+    """Return the ``VecNormalize`` under which the model is trained, with its present statistics; None without one."""
     return getattr(model, "get_vec_normalize_env", lambda: None)()
 
 
 def _was_normalised(model: Any) -> bool:
-    """Whether what a model keeps of its training, also in a file, shows that its observations were normalised.
+    """Return whether the saved training data of a Stable-Baselines3 model show that its observations were normalised.
 
-    The last of them lies outside the space, or its original is there; off-policy algorithms always have an original.
+    They were if the last observation lies outside the observation space, or its original is saved too. Off-policy
+    algorithms always save an original, so for them only the space counts.
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True
@@ -107,7 +120,10 @@ def _was_normalised(model: Any) -> bool:
 
 
 def _layers(env: Any) -> Iterator[Any]:
-    """An environment and all that is inside, in every copy, from the outside in; to one of this package."""
+    """Yield an environment, then every wrapper and environment inside it, from the outside in, in every parallel copy.
+
+    It stops at environments of this package.
+    """
     yield env
     for name in [] if _is_ours(env) else _INSIDE:
         inside = _own(env).get(name, [])
@@ -116,13 +132,22 @@ def _layers(env: Any) -> Iterator[Any]:
 
 
 def _look(layer: Any, name: str) -> tuple[str | None, list[Any]]:
-    """What to call a layer that may change something, else None; and the environments of this package that it is."""
+    """Return which class of a layer may change observations or actions, and this package's environments in it.
+
+    Args:
+        layer: one wrapper or environment, from ``_layers``.
+        name: name of the agent in error messages.
+
+    The first result is the name of that class; None if the layer changes nothing. The environments are the layer itself
+    or, if it runs environments in other processes, those.
+
+    """
     if changes(type(layer)):
-        modifier = _own(layer).get("modifier_class", type(layer))  # SuperSuit's
+        modifier = _own(layer).get("modifier_class", type(layer))  # the modifier of a SuperSuit wrapper
         return getattr(modifier, "__name__", type(layer).__name__), [layer] if _is_ours(layer) else []
     if "remotes" not in _own(layer):
         return None, [layer] if _is_ours(layer) else []
-    try:  # a question that fails ends the process, so each is one that all can answer
+    try:  # a failing call would end the process, so only calls that all environments support are made
         wrapped, ours = layer.env_is_wrapped(_Changing), layer.has_attr("engine")
         bases = layer.get_attr("unwrapped") if ours else []
         odd = [k for k, each in enumerate(wrapped) if each or not ours or changes(type(bases[k]))]
@@ -139,5 +164,5 @@ def _is_ours(env: Any) -> bool:
 
 
 def _own(layer: Any) -> dict[str, Any]:
-    """The attributes of a layer itself; wrappers hand on those of what is inside."""
+    """Return the attributes of a wrapper or environment itself, without those that it forwards from inside."""
     return getattr(layer, "__dict__", {})

@@ -1,4 +1,4 @@
-"""A trained policy as an agent: observe, infer, ask for that acceleration. Deterministic."""
+"""A trained policy as an agent: observe, infer, command that acceleration. Deterministic."""
 
 from __future__ import annotations
 
@@ -12,24 +12,26 @@ from ethbrake_marl.game.actions import action_to_command
 from ethbrake_marl.game.observations import Observations, ObservationSpec, observe
 from ethbrake_marl.physics.state import Floats, Worlds
 
-TRAINED_POLICY = "trained policy"  # name, in tables and figures, of the policy that a run trains
+TRAINED_POLICY = "trained policy"  # name of a run's own policy in tables and figures
 
 
 class LearnedPolicy(Protocol):
-    """What an agent needs of a policy; ``ethbrake_marl.policies.policy.Policy`` is one."""
+    """Interface of a policy that an agent needs; ``ethbrake_marl.policies.policy.Policy`` implements it."""
 
     @property
     def observation(self) -> ObservationSpec:
-        """What to observe for it."""
+        """The observation that the policy takes: its features and their order."""
         ...
 
     def __call__(self, observation: Observations, /) -> Observations:
-        """Map observation [n, F] to action [n, 1] in [-1, 1], each row on its own."""
+        """Return the action of each observation: [n, F] -> [n, 1] in [-1, 1]; rows do not influence each other."""
         ...
 
 
 class LearnedAgent(ByPolicy):
-    """Drives one vehicle by a policy's deterministic action; holds no state between steps.
+    """Agent that drives one vehicle by the deterministic action of a ``policy``; it has no memory between steps.
+
+    ``name`` stands in tables and error messages.
 
     >>> import ethbrake_marl as eb
     >>> eb.LearnedAgent(eb.load_shipped("ppo"), name="mine").name
@@ -44,7 +46,7 @@ class LearnedAgent(ByPolicy):
         self.name = name
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """Wanted signed acceleration [n], m/s2; world k's does not depend on the other worlds of the batch."""
+        """Return the commanded acceleration of ``vehicle`` (index, 0 = front) in each of n worlds, [n] m/s2."""
         action = self.policy(observe(worlds, vehicle, self.policy.observation)).astype(np.float64)
         if action.shape != (worlds.n, 1):
             raise InvalidInput(

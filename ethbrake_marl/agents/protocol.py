@@ -1,7 +1,7 @@
-"""The vocabulary in which every agent states what it knows of the line while it drives.
+"""The interfaces of agents, teams and shielded drivers, and the terms for what they know about the line.
 
-An agent says it with an attribute ``knows``: one ``Source``, its name, or several where parts of it know different
-things (a shield around a policy). A channel (``v2x``) hides things from the first three sources only.
+An agent states its knowledge in an attribute ``knows``: a ``Source``, its name, or several if its parts know different
+things (a shield around a policy). A channel (``v2x``) hides information from the first three sources only.
 """
 
 from __future__ import annotations
@@ -20,24 +20,29 @@ from ethbrake_marl.physics.state import Floats, Worlds
 
 
 class Source(StrEnum):
-    """Where knowledge comes from, least first; each has what stands before it as well."""
+    """Source of knowledge, from least to most; each includes the sources before it."""
 
-    SENSORS = "own sensors"  # its own vehicle, and the neighbours that its sensors see
+    SENSORS = "own sensors"  # the own vehicle, and the neighbours that its sensors see
     MESSAGES = "messages"  # the messages that have reached it
-    BELIEFS = "believed model"  # also what the scenario says of all lines: ranges, scripts, physics; nothing hidden
-    STATE = "true state"  # the others' states, capacities and latencies as they are, received or not
-    MODEL = "true model"  # also masses, restitution, every script: enough to roll the line forward in the same physics
-    UNSTATED = "not stated"  # of an agent that does not say
+    BELIEFS = "believed model"  # also the scenario's ranges, scripts and physics, but no hidden values
+    STATE = "true state"  # the other vehicles' true states, capacities and latencies, received or not
+    MODEL = "true model"  # also masses, restitution, scripts: all that an exact simulation of the line needs
+    UNSTATED = "not stated"  # the agent does not state its knowledge
 
 
 class Knowledge(tuple[Source, ...]):
-    """Sources in the order of the vocabulary, each once."""
+    """Set of sources of knowledge: a tuple of ``Source`` values in increasing order, each once."""
 
     @classmethod
     def of(cls, *agents: object, also: Source | None = None) -> Knowledge:
-        """What agents or teams say they know between them, and what a wrapper around them knows ``also``.
+        """Return the combined knowledge of several agents or teams.
 
-        ``UNSTATED`` of one that says nothing. Raises ``InvalidInput`` for a word that is not in the vocabulary.
+        Args:
+            agents: agents or teams; one without an attribute ``knows`` counts as ``UNSTATED``.
+            also: knowledge that a shield or search around them adds; None: none.
+
+        Raises ``InvalidInput`` for an unknown source.
+
         """
         known = set() if also is None else {also}
         for agent in agents:
@@ -55,21 +60,21 @@ class Knowledge(tuple[Source, ...]):
 
     @property
     def text(self) -> str:
-        """``messages + true model``; a dash for nothing, which is what a team of nobody knows."""
+        """The sources as one text, such as ``messages + true model``; a dash if there are none."""
         return " + ".join(self) or "–"
 
     @property
     def sees_through(self) -> bool:
-        """Whether it reads of the line what no channel brought."""
+        """Whether the true state or the true model, which no message or sensor delivers, is among the sources."""
         return Source.STATE in self or Source.MODEL in self
 
 
 @runtime_checkable
 class Agent(Script, Protocol):
-    """A ``Script`` with a name: it drives one vehicle in every world of a batch of ``n``.
+    """A ``Script`` with a name: drives one vehicle in every world of a batch of ``n``.
 
-    It says with ``knows`` what it knows of the line (``agents.registry.Source``); without it tables say "not stated".
-    One that remembers nothing has ``act(worlds, vehicle)`` alone:
+    Its attribute ``knows`` states what it knows about the line (``Source``); without it tables say "not stated".
+    An agent without a memory has only ``act(worlds, vehicle)``:
 
     >>> import ethbrake_marl as eb
     >>> class HalfBrake:
@@ -79,7 +84,7 @@ class Agent(Script, Protocol):
     >>> isinstance(HalfBrake(), eb.Agent)
     True
 
-    What one remembers of its episodes is a value that it is given and gives back, never an attribute:
+    The memory of an agent is a value that ``begin`` creates and ``act`` takes and returns, never an attribute:
 
     >>> class OnceHit:
     ...     name = "once_hit"
@@ -94,11 +99,18 @@ class Agent(Script, Protocol):
 
     """
 
-    name: str
+    name: str  # name in tables and messages
 
 
 def check_agent(agent: object, where: str, *, alone: bool = True) -> None:
-    """Raise ``InvalidInput`` for what is not an agent; unless ``alone``, what drives several vehicles will do, too."""
+    """Raise ``InvalidInput`` unless ``agent`` is an agent.
+
+    Args:
+        agent: any object.
+        where: beginning of the error message, for example ``agent 'mine'``.
+        alone: accept only an agent for one vehicle; if False, also a team or a driver behind a shield.
+
+    """
     if not isinstance(agent, Agent) and (alone or not isinstance(agent, Team | Shielding)):
         missing = [what for what in ("name", "act") if not hasattr(agent, what)]
         raise InvalidInput(
@@ -120,10 +132,19 @@ def fixed_commands(
     is_fixed: Callable[[Script], bool] = is_state_free,
     advice: str = ADVICE,
 ) -> Floats:
-    """The command of every vehicle from the alert on, [n, N] m/s2; those without an entry in ``scripts`` brake fully.
+    """Return every vehicle's constant command from the alert on, [n, N] m/s2, for an agent that looks ahead.
 
-    ``worlds`` are at the alert. ``who`` looks ahead and drives ``vehicle``, which is left out. Raises ``InvalidInput``
-    (first ``who``, at its end ``advice``) for a script whose command is not fixed at the alert, as ``is_fixed`` says.
+    Args:
+        scripts: index of each scripted vehicle -> its script; vehicles without a script brake fully.
+        worlds: n worlds at the alert.
+        who: name of the agent that looks ahead; errors begin with it.
+        vehicle: index of the vehicle that this agent drives, whose script is ignored; None: none.
+        is_fixed: whether the command of a script is fixed at the alert.
+        advice: end of the error message.
+
+    Raises ``InvalidInput`` for a script whose command is not fixed at the alert, and for worlds whose braking profiles
+    are not those of the scripts.
+
     """
     command = -worlds.vehicles.braking_capacity_mps2
     for i, script in scripts.items():
@@ -145,34 +166,39 @@ def fixed_commands(
 
 
 class ByPolicy:
-    """Base of what drives by a ``policy``, or is around an agent that does: it says which policy that is."""
+    """Base class of agents with an attribute ``policy``: a trained policy, or another agent that the agent wraps.
 
-    policy: Any
+    It derives the hash and the manifest from ``policy``, which a subclass sets; nothing has to be overridden.
+    """
+
+    policy: Any  # the trained policy, or the wrapped agent
 
     def policy_sha256(self) -> str | None:
-        """Hash of the policy; None where no policy drives, or none that says its hash."""
+        """Return the SHA-256 of the policy; None without a policy, or if the policy has no hash."""
         return policy_sha256(self.policy)
 
     @property
     def manifest(self) -> Any:
-        """Manifest of the policy; None without one."""
+        """Manifest of the policy's bundle (its origin, network and hashes); None for a policy without a bundle."""
         return getattr(self.policy, "manifest", None)
 
 
 def policy_sha256(agent: object) -> str | None:
-    """Hash of the policy that an agent drives by, inside whatever is around it; None without one.
+    """Return the SHA-256 of the policy that an agent uses, also inside shields and searches; None without a policy.
 
-    A policy bundle's is the hash in its manifest, which binds names, network and weights. A policy of another library
-    has the hash of its weights.
+    For a policy bundle it is the hash in its manifest, which covers names, network and weights. For a policy of another
+    library it is the hash of its weights.
     """
     ask = getattr(agent, "policy_sha256", None)
     return None if ask is None else ask()
 
 
 class AgentAround(ByPolicy):
-    """Base of agents that are put around a ``policy``, which is any agent: each says only what it does differently.
+    """Base class of agents that wrap another agent, called ``policy``.
 
-    ``adds`` is what it knows beside what the policy knows. Without a memory of its own it has that of the policy.
+    By default everything is passed to the wrapped agent. A subclass overrides ``begin``, ``act`` or both. The class
+    attribute ``adds`` is the knowledge that it has beyond the wrapped agent's, for example ``Source.MODEL``; None: no
+    more. ``name`` is the new agent's name; None: the wrapped agent's name.
     """
 
     adds: ClassVar[Source | None] = None
@@ -183,45 +209,55 @@ class AgentAround(ByPolicy):
 
     @property
     def knows(self) -> Knowledge:
-        """What the policy knows, and what this adds."""
+        """Knowledge of the wrapped agent, plus ``adds``."""
         return Knowledge.of(self.policy, also=self.adds)
 
     @property
     def time_step_s(self) -> float | None:
-        """The policy's, s; None: it goes by any."""
+        """Time between two decisions that the wrapped agent requires (s); None: any."""
         return getattr(self.policy, "time_step_s", None)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """As the policy."""
+        """Return the wrapped agent's initial memory.
+
+        Args:
+            alert: n worlds at the alert.
+            vehicle: index of the controlled vehicle (0 = front).
+            scripts: index of each scripted vehicle -> its script.
+
+        """
         return begin_script(self.policy, alert, vehicle, scripts)
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """As the policy, [n] m/s2."""
+        """Return the wrapped agent's command for ``vehicle``, [n] m/s2, and its new memory."""
         return ask_script(self.policy, worlds, memory, vehicle)
 
 
 @runtime_checkable
 class Shielding(Protocol):
-    """A driver behind a shield, on no vehicle yet."""
+    """Interface of an agent or team behind a shield, before it is known which vehicles it drives."""
 
-    name: str
+    name: str  # name in tables and messages
 
     @property
     def knows(self) -> Knowledge:
-        """What it knows, the shield included."""
+        """Combined knowledge of the agents and the shield."""
 
     def on(self, vehicles: Collection[int]) -> Team:
-        """The team that drives these vehicles."""
+        """Return the team, with this shield, that drives the vehicles with these indices (0 = front)."""
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent]) -> Guard:
-        """The shield in an engine in which these vehicles learn, who proposes for them, by vehicle."""
+        """Return the shield's part that checks commands in ``engine``.
+
+        ``policies`` maps the index of each learner to the agent that proposes its commands.
+        """
 
 
 class Team:
-    """One agent for each driven vehicle (index, 0 = front). Each decides for its own vehicle, from what that one knows.
+    """One agent per controlled vehicle (index, 0 = front); each decides from what its own vehicle knows.
 
-    Behind a ``shield`` they only propose. One agent may drive several vehicles: what it remembers of each is apart.
-    Raises ``InvalidInput`` for what is not an agent, or an index that is no whole number from 0.
+    Behind a ``shield`` the agents only propose. One agent may drive several vehicles, with a separate memory for each.
+    Raises ``InvalidInput`` for an invalid agent or index.
 
     >>> import ethbrake_marl as eb
     >>> team = eb.Team({1: eb.make_agent("full_brake"), 2: eb.make_agent("coast")}, "mixed")
@@ -241,12 +277,15 @@ class Team:
 
     @property
     def knows(self) -> Knowledge:
-        """What its drivers know between them, behind its shield; nothing where nobody is driven."""
+        """Combined knowledge of the agents and the shield; empty for a team without agents."""
         return Knowledge.of(*self.drivers.values(), *(() if self.shield is None else (self.shield,)))
 
     @staticmethod
     def of(driver: Driver, vehicles: Collection[int]) -> Team:
-        """Who drives each of the ``vehicles``, an agent alone all of them; raises ``InvalidInput`` for another team."""
+        """Return the team in which ``driver`` drives the vehicles with the indices ``vehicles`` (0 = front).
+
+        A single agent drives all of them. Raises ``InvalidInput`` for a team that drives other vehicles.
+        """
         if isinstance(driver, Shielding):
             return driver.on(vehicles)
         if not isinstance(driver, Team):
@@ -259,4 +298,4 @@ class Team:
         return driver
 
 
-Driver = Team | Agent | Shielding  # an agent alone drives every learner
+Driver = Team | Agent | Shielding  # a single agent drives every learner

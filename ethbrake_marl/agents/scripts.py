@@ -1,10 +1,10 @@
-"""Scripts: full braking, coasting, a constant, and two baselines that know only the vehicle in front."""
+"""Scripts as agents: full braking, coasting, a constant command, a profile; and the baseline E-V2X-BM."""
 
 from __future__ import annotations
 
 from ethbrake_marl.agents.e_v2x_bm.coupled import make_e_v2x_bm
 from ethbrake_marl.agents.protocol import Agent, Source
-from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.state import Floats, Worlds
 from ethbrake_marl.registry import Part
@@ -12,12 +12,11 @@ from ethbrake_marl.scenario.roles import ScriptSpec
 
 
 class StateFree:
-    """``full_brake``, ``coast`` or ``constant:a`` (deceleration in m/s2): the same command whatever happens.
+    """Agent with a fixed command: ``full_brake``, ``coast``, ``constant:a`` (deceleration in m/s2) or a ``profile``.
 
-    Of a ``profile`` it is the first piece's; the engine goes on to the others (``Worlds.play_pieces``).
-
-    ``full_brake`` of every vehicle is the paper's non-ethical strategy. Raises ``InvalidInput`` for any other script
-    and for a constant beyond the vehicle's capacity.
+    ``spec`` is one of these. A profile is a list of intervals of constant command: this agent commands the first, and
+    the engine applies the later ones (``Worlds.play_pieces``). ``full_brake`` for every vehicle is the paper's
+    non-ethical strategy. Raises ``InvalidInput`` for any other script and for a constant beyond the vehicle's capacity.
     """
 
     state_free = True
@@ -29,7 +28,7 @@ class StateFree:
         self.name, self.braking_pieces = spec, ScriptSpec.parse(spec).pieces
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """The constant command, [n] m/s2."""
+        """Return the constant command of ``vehicle`` (index, 0 = front) in each of n worlds, [n] m/s2."""
         vehicles = worlds.vehicles
         command = ScriptSpec.parse(self.name).command(
             vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
@@ -39,7 +38,7 @@ class StateFree:
 
 
 def make_script(argument: str | None, settings: AgentSettings) -> Agent:
-    """The script of that name."""
+    """Return the script that ``settings.spec`` names, such as ``constant:3.5``; ``argument`` is ignored."""
     return StateFree(settings.spec)
 
 
@@ -62,5 +61,5 @@ E_V2X_BM = Part(
     knows=Source.MODEL,
 )
 
-# Behind ``--agents ladder``, from no decision at all upwards; extensions add their rungs as ``ladder.NAME``.
+# Agents of ``--agents ladder``, beginning without any decision; extensions add agents as ``ladder.NAME``.
 LADDER = ("coast", "full_brake", "e_v2x_bm:pairwise", "e_v2x_bm")

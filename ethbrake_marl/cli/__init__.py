@@ -1,1 +1,1 @@
-"""The command ``ethbrake``: parse, call, print."""
+"""The command ``ethbrake``: parse arguments, call the package, print the results."""

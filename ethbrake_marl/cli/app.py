@@ -1,4 +1,4 @@
-"""The command ``ethbrake``: parse, call, print. Figures as JSON go to stdout alone, everything else to stderr."""
+"""The command ``ethbrake``: parse, call, print. Results as JSON go to stdout, everything else goes to stderr."""
 
 from __future__ import annotations
 
@@ -59,31 +59,32 @@ def _about(
         bool, typer.Option("--version", is_eager=True, callback=_show_version, help="Show the version and exit.")
     ] = False,
 ) -> None:
-    """Options of ``ethbrake`` itself."""
+    """Options of ``ethbrake`` without a command: ``--version``."""
 
 
 def main() -> None:
-    """Entry point: run the command line and exit with its status."""
-    gc.set_threshold(20_000)  # Python's 700 costs a run 1.5 CPU-s, and there is next to no garbage in circles
+    """Run the command line of this process, and exit with its status; the entry point of the program ``ethbrake``."""
+    gc.set_threshold(20_000)  # Python's 700 costs a run 1.5 CPU-s, and there are hardly any reference cycles
     prepare_streams()
     sys.exit(run_command(sys.argv[1:]))
 
 
 def run_command(arguments: Sequence[str]) -> int:
-    """Exit status of a command line: 2 with one line on stderr for bad input, bad usage or a file that fails.
+    """Run a command line (the arguments after ``ethbrake``) and return its exit status.
 
-    Other errors, which are defects, pass through.
+    It is 0 for success, and 2, with one line on stderr, for bad input, bad usage or a file error. Other errors are
+    defects, and are raised.
     """
     asked = _shell_asks(os.environ)
     try:
-        variable = None if asked else ""  # the usual one, or one by which no shell can ask for completion
+        variable = None if asked else ""  # the usual variable, or one with which no shell can request completion
         with naming_extras():
             status = whole_command()(arguments, prog_name="ethbrake", standalone_mode=False, complete_var=variable)
         sys.stdout.flush()
     except SystemExit as stop:
         if asked:
             raise
-        if isinstance(stop.__context__, BrokenPipeError):  # whoever read the output has had enough
+        if isinstance(stop.__context__, BrokenPipeError):  # the reader of the output has closed the pipe
             return 1
         return _refuse(f"code of yours ended the process: SystemExit: {stop.code}")
     except TyperException as error:
@@ -101,15 +102,16 @@ def run_command(arguments: Sequence[str]) -> int:
         return _refuse(f"not enough memory{f' ({error})' if str(error) else ''}; ask for fewer worlds at once")
     except (Exception, KeyboardInterrupt):
         raise
-    except BaseException as error:  # GeneratorExit and its like, which nothing of ours raises
+    except BaseException as error:  # GeneratorExit and similar, which this package never raises
         return _refuse(f"code of yours ended the process: {describe_error(error)}")
     return status if isinstance(status, int) else 0
 
 
 def _shell_asks(environment: Mapping[str, str]) -> bool:
-    """Whether a shell's completion runs this command, as its script from ``--show-completion`` does.
+    """Return whether a shell runs this command to complete a line, as the script from ``--show-completion`` does.
 
-    The variable alone, or with what no such script sets, is ignored: a command must not fail because of it.
+    ``environment`` are the environment variables. The completion variable is ignored if the other variables of such a
+    script are missing, so that a command never fails because of it.
     """
     if environment.get("_ETHBRAKE_COMPLETE") == "complete_bash":
         return "COMP_WORDS" in environment and environment.get("COMP_CWORD", "").isdecimal()
@@ -118,16 +120,17 @@ def _shell_asks(environment: Mapping[str, str]) -> bool:
 
 
 def _refuse(reason: str) -> int:
-    """Say why, in one line; gives the exit status."""
+    """Print the reason in one line on stderr, and return 2, the exit status for an error."""
     Out().note(f"ethbrake: error: {reason}")
     return 2
 
 
 def prepare_streams() -> None:
-    """Show ``?`` for what stdout's encoding does not have (m², box lines in Latin-1) instead of failing at the end.
+    """Set up stdout, stderr and warnings for the command line.
 
-    What writes past Python to file descriptor 1, here or in a process that is begun here, writes to stderr.
-    The package's own warnings are one line each, and one says why the first command takes longer.
+    Characters that stdout's encoding lacks (m², box lines in Latin-1) are shown as ``?`` instead of failing. Output
+    that bypasses Python and goes to file descriptor 1, in this process or a child, goes to stderr. The package's own
+    warnings are one line each. The first compilation of kernels is announced.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
@@ -148,16 +151,21 @@ def prepare_streams() -> None:
 
 
 def tell_compilation(folder: Path, empty: bool) -> None:
-    """Say that kernels are compiled, when it begins, and every ten seconds how many are done, as long as it goes on.
+    """Announce that kernels are being compiled, and report their number every ten seconds while this continues.
 
-    A thread says it: one kernel may take a minute, and nothing else is heard of it meanwhile.
+    The report comes from a thread, because a single kernel may take a minute.
+
+    Args:
+        folder: the cache folder of compiled kernels; a temporary one is not kept.
+        empty: whether nothing was in that folder yet.
+
     """
     kept = "the physics, once: minutes of one core" if empty else "what was not used before, once"
     lost = "the physics; no folder can be written to keep it, so every command does (ethbrake doctor)"
     Out().note(f"compiling {lost if is_temporary(folder) else f'{kept}, then it is kept'}")
-    from numba.core import event  # loaded by whatever compiles, and by nothing that does not
+    from numba.core import event  # imported here, because commands that compile nothing do not load numba
 
-    events: Any = event  # numba's own types end here
+    events: Any = event  # numba has no types for it
     begun, done, running = time.monotonic(), 0, 0
 
     class Count(event.Listener):  # type: ignore[misc]  # numba has no types
@@ -180,7 +188,7 @@ def tell_compilation(folder: Path, empty: bool) -> None:
 
 
 def abandon_output() -> None:
-    """Drop what stdout still holds and cannot hand on (a full disk), or Python fails a second time when it ends."""
+    """Discard what stdout still holds but cannot write (full disk), so that Python does not fail again at exit."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -188,10 +196,15 @@ def abandon_output() -> None:
 
 
 def add_command(name: str, command: typer.Typer | Callable[..., Any], *, epilog: str | None = None) -> None:
-    """Make ``ethbrake NAME`` known: a function, as ``app.command`` takes it, or a Typer with commands of its own.
+    """Add the command ``ethbrake NAME``.
 
-    An installed package, or an extension of ours, does it with an entry point of the group ``ethbrake_marl.commands``.
-    ``GROUP.NAME`` is a command of a group that another entry point gives. ``epilog``: the end of a function's help.
+    An installed package or an extension does the same with an entry point of the group ``ethbrake_marl.commands``.
+
+    Args:
+        name: name of the command; ``GROUP.NAME`` for a command inside an existing group of commands.
+        command: a function, as ``app.command`` of Typer takes it, or a Typer with commands of its own.
+        epilog: text at the end of the help page of a function.
+
     """
     if isinstance(command, typer.Typer):
         given = command
@@ -203,7 +216,7 @@ def add_command(name: str, command: typer.Typer | Callable[..., Any], *, epilog:
 
 
 def _names() -> list[str]:
-    """Of the commands that were added to the app."""
+    """Return the names of the commands and command groups of ``app``, without those of extensions."""
     return [
         *(each.name or each.callback.__name__.replace("_", "-") for each in app.registered_commands if each.callback),
         *(str(group.name) for group in app.registered_groups),
@@ -215,9 +228,9 @@ COMMANDS: Registry[Any] = Registry("command", "commands", add_command, dict.from
 
 
 class Installed(TyperCommand):
-    """A command of an extension or an installed package, which is loaded when it is called.
+    """A command of an extension or an installed package, which is imported only when it is called.
 
-    ``entry``: the name of its entry point, ``NAME`` or ``GROUP.NAME``.
+    ``entry`` is the name of its entry point, ``NAME`` or ``GROUP.NAME``.
     """
 
     def __init__(self, entry: str) -> None:
@@ -227,22 +240,31 @@ class Installed(TyperCommand):
         self.entry, self.is_ours = entry, givers == [OURS]
 
     def command(self) -> Any:
-        """The command itself."""
+        """Import the actual command of the entry point, and return it as a Typer (click) command."""
         found = COMMANDS[self.entry]
         found.name = self.name
         return with_installed(found, self.entry)
 
     def make_context(self, *given: Any, **settings: Any) -> Any:
-        """The context of the command itself."""
+        """Return the context in which the actual command runs; the arguments are those of Typer's own method."""
         return self.command().make_context(*given, **settings)
 
     def get_short_help_str(self, limit: int = 45) -> str:
-        """One line for the list of commands; of another package it names the package, and loads nothing of it."""
+        """Return the command's line, of at most ``limit`` characters, in the list of commands.
+
+        For a command of another package, the line names the package, so that the package need not be imported.
+        """
         return str(self.command().get_short_help_str(limit) if self.is_ours else super().get_short_help_str(limit))
 
 
 def with_installed(group: Any, name: str) -> Any:
-    """The group with the commands that entry points ``NAME.COMMAND`` add to it."""
+    """Add the commands of the entry points ``NAME.COMMAND`` to the command group called ``name``, and return it.
+
+    Args:
+        group: the group, a Typer (click) command with subcommands. It is changed.
+        name: name of the group.
+
+    """
     for entry in points(COMMANDS.group):
         of, _, own = entry.rpartition(".")
         if of == name:
@@ -251,9 +273,10 @@ def with_installed(group: Any, name: str) -> Any:
 
 
 def whole_command() -> Any:
-    """All commands: of the core, of extensions and installed packages, and of a user's program.
+    """Return the command ``ethbrake`` as a Typer (click) group.
 
-    Raises ``AlreadyExists`` for a command of a program that would take the place of another one.
+    It has the commands of the core, of extensions and installed packages, and those that a program added with
+    ``add_command``. Raises ``AlreadyExists`` if two commands have the same name.
     """
     added = [name for name in COMMANDS if name not in _OURS and "." not in name]
     names = [*_names(), *added]

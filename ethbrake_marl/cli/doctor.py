@@ -1,6 +1,6 @@
-"""The command ``doctor``: is this installation in order?
+"""The command ``doctor``: check this installation.
 
-Versions, folders, and the physics on worlds whose answer is known.
+It checks versions, folders, and the physics on worlds with a known result.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _TINY = ("--set=n_envs=16", "--set=n_steps=8", "--set=counterfactuals=16", "--se
 
 _LINEUP = "ladder,ppo@shipped,ppo@shipped+search+episode,full_brake+step"
 
-# Small calls of what people call first: what they use is what is compiled. One world alone lies otherwise in memory.
+# Small calls of the usual commands, to compile what they use. A single world has another memory layout.
 _DOORS = (
     ("run", "--steps", "128", "--episodes", "20", "--output", "run", *_TINY),
     ("evaluate", "--agents", _LINEUP, "--episodes", "20"),
@@ -44,7 +44,7 @@ _DOORS = (
     ("shield", "--agents", "full_brake", "--episodes", "3"),
 )
 
-# What `ethbrake run` uses but for three small kernels, without torch, and no more than that.
+# Uses the kernels of `ethbrake run`, except for three small ones, and no others; needs no torch.
 _FOR_A_RUN = (
     *("-m", "ethbrake_marl", "evaluate", "--episodes", "20", "--output", "page", "--report"),
     *("--agents", "full_brake,e_v2x_bm,e_v2x_bm:pairwise,ppo@shipped,ppo@shipped+episode"),
@@ -62,22 +62,23 @@ eb.evaluate(agents={"robust": robust}, scenario="paper-random", episodes=20)
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
-_CHECKOUT = _PACKAGE.parent  # or the folder of installed packages, where there is no pyproject.toml
+_CHECKOUT = _PACKAGE.parent  # of an installed package: the folder of packages, without a pyproject.toml
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One finding: what was looked at, whether it is in order, and what was found."""
+    """Result of one check of the installation."""
 
-    name: str
-    ok: bool
-    detail: str
+    name: str  # name of what was checked
+    ok: bool  # whether it is in order
+    detail: str  # version, folder or error, for the user
 
 
 def diagnose(*, compile_all: bool = False) -> list[Check]:
-    """All checks, in the order in which they should be repaired; none of them raises.
+    """Check the installation, and return all results in the order in which problems should be fixed.
 
-    ``compile_all``: call the usual commands on a few worlds first, so that all they use is compiled and kept.
+    No check raises. ``compile_all``: also call the usual commands on a few worlds, so that all kernels that they use
+    are compiled and stored.
     """
     has_torch = find_spec("torch") is not None
     return [
@@ -94,7 +95,7 @@ def diagnose(*, compile_all: bool = False) -> list[Check]:
 
 
 def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
-    """The finding of ``look``; whatever it raises is a finding too, so that the other checks are still made."""
+    """Return the check ``name`` with the result (ok, detail) of ``look()``; an exception becomes a failed check."""
     try:
         return Check(name, *look())
     except Exception as error:
@@ -102,9 +103,9 @@ def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
 
 
 def _dependencies() -> Iterator[Check]:
-    """One check per dependency of the package: installed, and not older than the oldest version that was tried.
+    """Yield one check per dependency: whether it is installed in a required version.
 
-    What only an extra brings may be missing.
+    A missing package of an extra counts as in order.
     """
     from packaging.version import Version
 
@@ -125,7 +126,10 @@ def _dependencies() -> Iterator[Check]:
 
 
 def _requirements() -> list[tuple[str, Requirement]]:
-    """(extra, or "" for what is always needed; requirement): from the checkout that it runs in, else its metadata."""
+    """Return the package's dependencies as pairs (extra, requirement); the extra is "" if it is always needed.
+
+    They come from the checkout's ``pyproject.toml``, or else from the metadata of the installed package.
+    """
     from packaging.requirements import Requirement
 
     project = _CHECKOUT / "pyproject.toml"
@@ -140,7 +144,7 @@ def _requirements() -> list[tuple[str, Requirement]]:
 
 
 def _pinned_versions(constraints: Path) -> dict[str, str]:
-    """Lower-case name -> version of every ``name==version`` line; empty outside a checkout."""
+    """Return the versions in a pip constraints file: lower-case package -> version; empty if there is no file."""
     text = constraints.read_text("utf-8") if constraints.is_file() else ""
     return {name.lower(): pin for name, pin in re.findall(r"^([^\s#=]+)==([^\s#]+)", text, re.MULTILINE)}
 
@@ -165,7 +169,10 @@ def _scenarios() -> tuple[bool, str]:
 
 
 def _golden_impact() -> tuple[bool, str]:
-    """A car at 10 m/s brakes with 5 m/s2, 8 m behind a standing one: harm ``10^2 - 2 * 5 * 8 = 20``."""
+    """Check the physics on a car at 10 m/s that brakes with 5 m/s2, 8 m behind a parked car.
+
+    The exact harm is ``10^2 - 2 * 5 * 8 = 20``. Returns whether it is right, and a text.
+    """
     import numpy as np
 
     from ethbrake_marl.physics.advance import advance
@@ -181,7 +188,10 @@ def _golden_impact() -> tuple[bool, str]:
 
 
 def _golden_baseline() -> tuple[bool, str]:
-    """The paper's distance scenario at 7 m and 7 m: E-V2X-BM brakes with 5.17021 m/s2 and expects harm 4.03447."""
+    """Check the baseline E-V2X-BM in the paper's distance scenario with gaps of 7 m and 7 m.
+
+    It must brake with 5.17021 m/s2, at harm 4.03447 m2/s2. Returns whether it does, and a text.
+    """
     import numpy as np
 
     from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
@@ -199,10 +209,14 @@ def _golden_baseline() -> tuple[bool, str]:
 
 
 def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str]:
-    """Call the commands of ``_DOORS`` on a few worlds, side by side on all cores, and tell how far they are.
+    """Compile and store the kernels that the usual commands use, by calling these commands on a few worlds.
 
-    ``training``: the one that needs torch, too. ``run_alone``: only what a run uses, which `make venv` asks for.
-    Whether all ended well, and what there is to say.
+    The commands run in parallel on all cores; the progress is printed. Returns whether all succeeded, and a message.
+
+    Args:
+        training: include ``ethbrake run``, which needs torch.
+        run_alone: instead, call a single command that compiles nearly all kernels of ``ethbrake run``.
+
     """
     if is_temporary(cache_folder()):
         return False, "no folder can be written to keep what is compiled; set NUMBA_CACHE_DIR to a writable folder"
@@ -225,7 +239,10 @@ def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str
 
 
 def _call(arguments: tuple[str, ...], folder: str) -> str:
-    """The last line of what a command says on stderr where it fails."""
+    """Run Python with these arguments in ``folder``.
+
+    Returns the last line that it prints on stderr if it fails; empty if it succeeds.
+    """
     done = subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False)
     return (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
 

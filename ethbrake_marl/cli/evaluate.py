@@ -1,4 +1,4 @@
-"""The commands that measure: ``evaluate``, ``compare`` and ``shield``."""
+"""The commands that measure agents: ``evaluate``, ``compare`` and ``shield``."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from ethbrake_marl.scenario.task import Task
     from ethbrake_marl.training.settings import Settings
 
-GROUP_EPISODES = 400  # of each scenario of a group; the tables of best known harm of `benchmark` hold them
+GROUP_EPISODES = 400  # worlds of each scenario of a group; the tables of best known harm of `benchmark` contain them
 
-RESULTS, WORLDS, REPORT = "results.json", "worlds", "report.html"  # in the folder of an evaluation
+RESULTS, WORLDS, REPORT = "results.json", "worlds", "report.html"  # names of files in the folder of an evaluation
 
 _FILES = (RESULTS, f"{WORLDS}.csv", f"{WORLDS}.parquet", REPORT)
 
@@ -46,7 +46,15 @@ _POLICIES = {"same": "the same", "other": "another", "none": ""}
 
 
 def read_task(scenario: str, settings: Sequence[str] | None) -> Task:
-    """The scenario that is named, with its settings, its learners, and the harm that ``harm_count`` among them says."""
+    """Load a scenario with settings, and return the task of controlling its learners.
+
+    Args:
+        scenario: name or path.
+        settings: ``KEY=VALUE`` overrides of the scenario, and ``harm_count=total``; None: none.
+
+    Raises ``InvalidInput`` for a scenario without a learner.
+
+    """
     return _task_of(scenario, training.read_settings(settings, of_agents=("harm_count",)))
 
 
@@ -58,7 +66,14 @@ def _task_of(scenario: str, given: Settings) -> Task:
 
 
 def make_drivers(agents: str | Sequence[str], task: Task, *, bare: bool = False) -> dict[str, Any]:
-    """Who is named on the command line, as ``make_lineup`` makes them; tells which policies ``@shipped`` stands for."""
+    """Return the agents of a command line by spec (``make_lineup``), and print which policy ``@shipped`` stands for.
+
+    Args:
+        agents: specs, as a list or with commas between them.
+        task: the scenario, and the harm that the agents minimise.
+        bare: refuse agents with a shield, because the command adds its own.
+
+    """
     lineup = evaluation.make_lineup(agents, task.scenario, harm_count=task.harm_count, bare=bare)
     _tell_shipped(lineup)
     return lineup
@@ -96,13 +111,13 @@ def evaluate_command(
 ) -> None:
     """Compare agents on the same fixed list of worlds.
 
-    `ethbrake agent list` says who can drive; ladder stands for all of them from coast to best_harm. Behind any agent:
+    `ethbrake agent list` shows all agents; ladder stands for all of them from coast to best_harm. Behind any agent:
     +search, then one shield, +episode or +step; for instance full_brake+step or ppo@PATH+search+episode.
     PATH is a run or a policy bundle, or shipped. +robust needs an uncertainty, which is given in Python;
-    +robust:believed needs none. With --set harm_count=total agents minimise the harm of all impacts, not that of first
-    impacts only. --set measures=injury,my_file.py:worst shows these beside the usual ones.
+    +robust:believed needs none. With --set harm_count=total agents minimise the harm of all impacts, not only of first
+    impacts. --set measures=injury,my_file.py:worst adds these measures to the usual ones.
     """
-    from ethbrake_marl.agents.registry import split_specs
+    from ethbrake_marl.agents.spec import split_specs
 
     with Out(as_json=as_json, force=force) as out:
         _check_outputs(out, output, per_world, report=report)
@@ -150,7 +165,10 @@ def evaluate_command(
 def _evaluate_long_list(
     out: Out, lineup: evaluation.Lineup, episodes: int, seed: int, jobs: int | None, ray: str | None
 ) -> evaluation.SummaryTable:
-    """The agents in a list of which no world is held in memory."""
+    """Evaluate the agents on a list that is too long to hold in memory, and return the results table.
+
+    The list is ``episodes`` worlds of ``seed``; ``jobs`` processes or the Ray cluster ``ray`` do the work.
+    """
     scenario = lineup.scenario
     evaluation.check_agents(lineup.make(), scenario.sample(1_000, seed).worlds, scenario, warn=True)
     tally = evaluation.tally_list(lineup, episodes, seed, jobs=jobs, ray=ray, on_done=_tell_worlds(out, episodes))
@@ -167,7 +185,19 @@ def _tell_worlds(out: Out, worlds: int) -> Callable[[int], None]:
 def _evaluate_group(
     out: Out, output: Path | None, group: Sequence[Task], agents: str, episodes: int | None, seed: int | None
 ) -> None:
-    """Each agent in each scenario: whether anybody collides, how hard the hardest pair does, and what is left to do."""
+    """Evaluate each agent in each scenario of a group, and print one table with a row for each of them.
+
+    It shows whether vehicles collide, how hard the worst impact is, and harm.
+
+    Args:
+        out: output of the command.
+        output: folder that also gets the results as JSON; None: no folder.
+        group: the scenarios, each with its controlled vehicles.
+        agents: specs with commas between them.
+        episodes: number of worlds of each scenario; None: 400.
+        seed: seed of the worlds; None: the standard seed.
+
+    """
     told: list[dict[str, Any]] = []
     rows: list[Any] = []
     seed = evaluation.LIST_SEED if seed is None else seed
@@ -214,7 +244,10 @@ def _evaluate_group(
 
 
 def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, report: bool) -> None:
-    """Refuse, before any work, a folder that cannot be written to, or that holds other results."""
+    """Raise ``InvalidInput``, before any work, if the folder ``output`` cannot be written or holds other files.
+
+    ``per_world`` (``csv``, ``parquet`` or None) and ``report`` say which files are requested; they need a folder.
+    """
     if output is None:
         for option in (name for name, given in (("--per-world", per_world), ("--report", report)) if given):
             raise InvalidInput(f"{option}: needs a folder for it: --output FOLDER")
@@ -225,7 +258,10 @@ def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, repo
 
 
 def _write_worlds(out: Out, output: Path | None, found: evaluation.Evaluation, per_world: str | None) -> Path | None:
-    """The file with one row per world and agent, where it is asked for."""
+    """Write the file with one row per world and agent into the folder ``output``, and return its path.
+
+    ``per_world`` is the format, ``csv`` or ``parquet``. If it or ``output`` is None, return None.
+    """
     if output is None or per_world is None:
         return None
     file = output / f"{WORLDS}.{per_world}"
@@ -236,7 +272,10 @@ def _write_worlds(out: Out, output: Path | None, found: evaluation.Evaluation, p
 
 
 def _write_results(out: Out, output: Path | None, results: object, *beside: str) -> None:
-    """``results.json``, with the files ``beside`` it; those of earlier results go."""
+    """Write ``results.json`` into the folder ``output``, and delete files of earlier results except ``beside``.
+
+    ``output`` None: write nothing.
+    """
     if output is None:
         return
     output.mkdir(parents=True, exist_ok=True)
@@ -251,7 +290,15 @@ def _json_text(content: object) -> str:
 
 
 def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: float) -> None:
-    """Say of shielded drivers in how many worlds, by driver, something still ``moving`` was cut off, if in any."""
+    """Print in how many worlds something still moved at the horizon, if there are any.
+
+    Args:
+        out: output of the command.
+        moving: name of an agent with a shield -> number of such worlds.
+        worlds: number of all worlds.
+        horizon_s: time of the horizon (s).
+
+    """
     found = ", ".join(f"{name} {count}" for name, count in moving.items() if count)
     if found:
         out.note(
@@ -261,7 +308,10 @@ def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: f
 
 
 def _moving(rows: Sequence[evaluation.SummaryRow]) -> dict[str, int]:
-    """In how many worlds something still moves at the horizon, by shielded driver."""
+    """Return name of each agent behind a shield -> number of worlds in which something still moves at the horizon.
+
+    ``rows`` is the results table.
+    """
     return {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
 
 
@@ -273,8 +323,8 @@ _FILE = typer.Argument(
 def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE], as_json: JsonOption = False) -> None:
     """Show how harm differs between two results.
 
-    The second minus the first, for agents of the same name. Both must be of one command, and about the same worlds of
-    the same scenario. Intervals are paired by world where the files of --per-world lie beside both results.
+    The second minus the first, for agents of the same name. Both must come from one command, and from the same worlds
+    of the same scenario. Intervals are paired by world if the files of --per-world lie beside both results.
     """
     with Out(as_json=as_json) as out:
         found = evaluation.compare_results(evaluation.read_result(first), evaluation.read_result(second))
@@ -290,7 +340,7 @@ def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE
             if agents:
                 out.note(f"in the {which} only: {', '.join(agents)}")
         for name, both in {**found.other_settings, **found.other_versions}.items():
-            if "SHA-256 " in f"{both[0]}{both[1]}":  # of a file; --json has the hashes
+            if "SHA-256 " in f"{both[0]}{both[1]}":  # the hash of a file, which only --json shows
                 out.note(f"note: {name} {'was read for one of the two' if None in both else 'changed between the two'}")
             else:
                 out.note(f"note: {name} {both[0]} in the first, {both[1]} in the second")
@@ -306,9 +356,9 @@ def shield_command(
     """Compare agents without and behind the shield.
 
     They drive the same worlds without a shield, in episode mode and in step mode; name them without a shield. The
-    shield bounds first-impact harm; with --set harm_count=total, total harm. Where several vehicles learn: no shield,
+    shield bounds first-impact harm; with --set harm_count=total, total harm. If several vehicles learn: no shield,
     step mode, and step mode with caps, for the whole team. Each decision that step mode replaced is simulated
-    again without it: needed (harm would have been higher), harmless (the same), costly (lower).
+    again without the shield: needed (harm would have been higher), harmless (the same), costly (lower).
     """
     with Out(as_json=as_json) as out:
         task = read_task(scenario, settings)
@@ -321,7 +371,10 @@ def shield_command(
 
 
 def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> evaluation.ShieldModes:
-    """The rows of these agents, with progress on stderr."""
+    """Compare ``agents`` (specs with commas between them) without and behind the shield in the worlds of ``sample``.
+
+    The progress is shown on stderr.
+    """
     lineup = make_drivers(agents, task, bare=True)
     n = sample.worlds.n
     return evaluation.compare_modes(
@@ -330,7 +383,7 @@ def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> evaluat
 
 
 def _tell_left_out(out: Out, left_out: LeftOutRows, whole: int) -> None:
-    """Name the worlds that count in no figure, of ``whole``, in a line on stderr; none where every world counts."""
+    """Print in one line on stderr which of ``whole`` worlds were left out, if there are any."""
     if left_out:
         told = [f"world {world} of seed {evaluation.LIST_SEED} ({reason})" for world, reason in left_out]
         out.note(evaluation.LeftOut.line(told, whole))

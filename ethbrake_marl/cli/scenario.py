@@ -1,4 +1,4 @@
-"""The commands about what there is: ``scenario`` and ``agent``."""
+"""The commands that list and show what exists: ``scenario`` and ``agent``."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.files.yaml import flow_text
 
-TRIED_WORLDS = 200  # by `scenario validate`
+TRIED_WORLDS = 200  # number of worlds that `scenario validate` tries
 
-MOST_RANGES = 8  # that it tells apart
+MOST_RANGES = 8  # largest number of ranges that `scenario validate` shows separately
 
-SCREEN = 24  # lines
+SCREEN = 24  # lines of a screen
 
-TABLE_WORLDS, PICTURE_WORLDS = 10, 1000  # by `scenario sample`
+TABLE_WORLDS, PICTURE_WORLDS = 10, 1000  # default number of worlds of `scenario sample`
 
 NameArgument = Annotated[
     str, typer.Argument(metavar="NAME|PATH", help="A shipped or registered scenario, or a path to a YAML file.")
@@ -40,7 +40,7 @@ scenario_group = typer.Typer(
 def scenario_list(as_json: JsonOption = False) -> None:
     """List the scenarios that have a name.
 
-    Name and title, and the folder of those that a program registers.
+    Shows name and title, and the folder of scenarios that a program registers.
     """
     with Out(as_json=as_json) as out:
         entries = scenarios.list_scenarios()
@@ -66,7 +66,7 @@ def scenario_show(scenario: NameArgument) -> None:
 def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
     """Check a scenario, and try it in 200 worlds.
 
-    Says what is drawn and what may be a mistake, or what is wrong. The first worlds of its list are drawn, the
+    Shows what is drawn and what may be a mistake, or what is wrong. The first worlds of its list are drawn, the
     scripts drive, and learners brake fully.
     """
     with Out(as_json=as_json) as out:
@@ -110,7 +110,11 @@ def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
 
 
 def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tuple[list[str], str, dict[str, Any]]:
-    """The range of each quantity that varies, a line each below a head; what is fixed; all of them by column."""
+    """Return three descriptions of the quantities of the worlds in ``sample``: (lines, text, columns).
+
+    ``lines`` are a table with the range of each varying quantity; ``text`` lists the fixed ones. ``columns`` is for
+    JSON: ``{"gap_1_m": {"least": 5.0, "median": 7.0, "largest": 9.0}}``.
+    """
     import numpy as np
 
     worlds, varying = sample.worlds, evaluation.drawn_alike(sample.worlds, scenario)
@@ -137,7 +141,7 @@ def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tupl
 
 
 def _folded(text: str, most: int, width: int = 80) -> list[str]:
-    """The lines of a text, at most so many."""
+    """Return the text as at most ``most`` lines of ``width`` characters; what does not fit becomes ``...``."""
     return textwrap.wrap(text, width, max_lines=most, placeholder=" ...", break_on_hyphens=False)
 
 
@@ -149,7 +153,7 @@ def _share(part: int, whole: int, things: str = "worlds") -> str:
 def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> None:
     """Describe a scenario in plain sentences.
 
-    Who stands in line, how each quantity is drawn, who knows what when, and whose harm counts.
+    Describes the line, how each quantity is drawn, who knows what when, and whose harm counts.
     """
     with Out(as_json=as_json) as out:
         chosen = evaluation.load_runnable(scenario)
@@ -158,8 +162,8 @@ def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> Non
 
 
 def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
-    """What is declared, piece by piece; empty where there is nothing to say."""
-    from ethbrake_marl.agents.registry import find_entry
+    """Yield a sentence about each part of the scenario; an empty text if there is nothing to say about a part."""
+    from ethbrake_marl.agents.making import find_entry
     from ethbrake_marl.game.objectives import OBJECTIVES
 
     yield f"{scenario.name}: {scenario.title or 'no title'}. {scenario.description}".rstrip()
@@ -187,7 +191,7 @@ def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
     for key, rule in scenarios.QUANTITY.declared.items():
         told = _declared_in_words(scenario, key)
         yield f"{rule.label[0].upper()}{rule.label[1:]}: {told}; {rule.meaning}." if told else ""
-    common = scenario.model_fields_set if scenario.members else type(scenario).model_fields  # to a whole mixture
+    common = scenario.model_fields_set if scenario.members else type(scenario).model_fields  # same for all members
     yield _news_in_words(scenario) if "v2x" in common else "Who knows what when (V2X) differs between these scenarios."
     early = "stays in the list" if scenario.early_impacts == "keep" else "is drawn again"
     yield (
@@ -205,7 +209,7 @@ def _obstacle_in_words(scenario: scenarios.Scenario) -> str:
 
 
 def _declared_in_words(scenario: scenarios.Scenario, key: str) -> str:
-    """How a quantity is drawn; empty where it is not declared, or by each type."""
+    """Describe how the quantity ``key`` is drawn; empty if the scenario does not declare it."""
     if scenario.members:
         told = key in scenarios.QUANTITY.usual or (
             key == "friction" and all(each.declares(key) for each in scenario.members)
@@ -222,7 +226,7 @@ def _declared_in_words(scenario: scenarios.Scenario, key: str) -> str:
 
 
 def _in_words(quantity: Any) -> str:
-    """A number or a distribution."""
+    """Describe ``quantity``, a number or a distribution of a scenario, in words: ``5 to 9 (uniform)``."""
     if isinstance(quantity, float):
         return f"{quantity:g}"
     (kind, shape), *more = quantity.model_dump(exclude_none=True).items()
@@ -233,7 +237,7 @@ def _in_words(quantity: Any) -> str:
 
 
 def _news_in_words(scenario: scenarios.Scenario) -> str:
-    """Who knows what, and when."""
+    """Return a sentence about the scenario's V2X channel: which vehicle knows what, and when."""
     channel, about = scenario.v2x.channel._asdict(), type(scenario.v2x).model_fields
     usual = scenarios.CHANNELS["paper"]._asdict()
     other = {key: value for key, value in channel.items() if key in about and value != usual[key]}
@@ -260,24 +264,23 @@ def scenario_new(
 
 @scenario_group.command("parts", epilog=example("scenario parts"))
 def scenario_parts(as_json: JsonOption = False) -> None:
-    """List what scenarios and recipes may name.
+    """List the names that scenarios and recipes may use.
 
-    Reward terms, features of observations, V2X presets, objectives, training algorithms, recipes and measures.
+    Features of observations, V2X presets, objectives, training algorithms, recipes and measures, which rewards weigh.
     """
     from ethbrake_marl.game.features import FEATURES
+    from ethbrake_marl.game.measures import MEASURES
     from ethbrake_marl.game.objectives import OBJECTIVES
-    from ethbrake_marl.game.rewards import TERMS
 
     features = FEATURES.usable().items()
     own = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in features]
     parts = {
-        "Reward terms": [*TERMS],
         "Observation": ["own", "front_K", "rear_K", "role", "obstacle", *own],
         "V2X presets": [*scenarios.CHANNELS],
         "Objectives": [kind.form for kind in OBJECTIVES.usable().values()],
         "Algorithms": [*training.algorithm_names()],
-        "Recipes": [*training.TrainingRecipe.shipped()],
-        "Measures": [*evaluation.MEASURES],
+        "Recipes": [*training.TrainingRecipe.usable()],
+        "Measures": [*MEASURES],
     }
     with Out(as_json=as_json) as out:
         out.result(
@@ -313,7 +316,7 @@ def scenario_sample(
     """Draw worlds of a list, as a table or a picture.
 
     The table has a column for each quantity that the scenario does not fix; `eb.read_worlds` reads it. The
-    picture shows distributions, pairs of quantities, and three worlds. The same list, seed and number are the same
+    picture shows distributions, pairs of quantities, and three worlds. The same list, seed and number give the same
     worlds on every machine.
     """
     with Out(as_json=as_json, force=force) as out:
@@ -346,7 +349,7 @@ agent_group = typer.Typer(
 def agent_list(as_json: JsonOption = False) -> None:
     """List all agents: how each is written, what it does, what it knows.
 
-    What begins with + goes behind any agent, for instance full_brake+step: +search first, then one shield.
+    Names with + go behind any agent, for instance full_brake+step: +search first, then one shield.
     """
     with Out(as_json=as_json) as out:
         from ethbrake_marl.agents.protocol import Knowledge
@@ -377,7 +380,7 @@ def agent_export(
 ) -> None:
     """Write a policy as an ONNX model: observation in, acceleration out.
 
-    Needs the package onnx, which the extra `export` brings.
+    Needs the package onnx, which the extra `export` installs.
     """
     with Out(force=force) as out:
         from ethbrake_marl.policies.shipped import load_named_policy

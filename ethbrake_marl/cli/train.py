@@ -13,7 +13,6 @@ from ethbrake_marl.cli.command import (
     ForceOption,
     JsonOption,
     Out,
-    RecipeOption,
     ScenarioOption,
     SettingsOption,
     StepsOption,
@@ -28,6 +27,8 @@ KEPT = (
 
 RUNS = Path("runs")
 
+QUICKEST = ("quick", "ppo")  # what `ethbrake run` trains: the first whose algorithm is installed
+
 TrainingSeedOption = Annotated[int | None, typer.Option(help="Seed of the training.", show_default="the recipe's")]
 
 OutputOption = Annotated[
@@ -36,7 +37,10 @@ OutputOption = Annotated[
 
 
 def run_folder(scenario: scenarios.Scenario, recipe: training.TrainingRecipe, seed: int | None) -> Path:
-    """Where a run goes if nothing else is said; the scheme stands behind the recipe where the recipe names one."""
+    """Return the default folder of a run: ``runs/SCENARIO-RECIPE-seedSEED``.
+
+    If the recipe names a scheme for several learners, it follows the recipe's name. ``seed`` None: the recipe's seed.
+    """
     plan = recipe.name if recipe.scheme is None else f"{recipe.name}-{recipe.scheme}"
     return RUNS / f"{scenario.name}-{plan}-seed{recipe.seed if seed is None else seed}"
 
@@ -47,7 +51,14 @@ def run_command(
     seed: TrainingSeedOption = None,
     episodes: Annotated[int, typer.Option(help="Worlds of the evaluation list.")] = 10_000,
     list_seed: Annotated[int, typer.Option(help="Seed of the evaluation list.")] = 7,
-    recipe: RecipeOption = "quick",
+    recipe: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME|PATH",
+            help="A shipped recipe, or a path to a YAML file.",
+            show_default=f"{QUICKEST[0]}, or {QUICKEST[1]} where no extension gives its algorithm",
+        ),
+    ] = None,
     settings: SettingsOption = None,
     output: OutputOption = None,
     force: ForceOption = False,
@@ -55,15 +66,15 @@ def run_command(
 ) -> None:
     """Train a policy, shield it, compare with the baselines, report.
 
-    Writes the run's folder: the policy, results as CSV and JSON, every world, and what installed reports add: three
-    figures and report.html; after one of the three tests (paper-random, -brake-only, -obstacle) also the other two.
-    Ctrl-C ends the training early, and what it has is evaluated; a second Ctrl-C stops at once.
+    Writes the run's folder: the policy, results as CSV and JSON, every world, and the installed reports: three
+    figures and report.html; for one of the three tests (paper-random, -brake-only, -obstacle) also the other two.
+    Ctrl-C ends the training early, and the policy so far is evaluated; a second Ctrl-C stops at once.
     """
     with Out(as_json=as_json, force=force, kept=KEPT) as out:
         # torch takes seconds to load, here and in the other commands that learn
         from ethbrake_marl.training.experiment import run_experiment
 
-        plan = training.load_recipe(recipe)
+        plan = training.load_recipe(recipe or quickest())
         given = training.read_settings(settings, [plan])
         chosen = evaluation.load_runnable(scenario, given.scenario, drives="one")
         plan = given.change(plan, out.note)
@@ -90,6 +101,12 @@ def run_command(
         for note in result.notes:
             out.note(note)
         _end(out, result.trained)
+
+
+def quickest() -> str:
+    """Return the name of the recipe that `ethbrake run` trains by default."""
+    usable = training.TrainingRecipe.usable()
+    return next(name for name in QUICKEST if name in usable)
 
 
 def train_command(
@@ -122,12 +139,11 @@ def train_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Train a policy, or those of several learners.
+    """Train a policy, or the policies of several learners.
 
     Writes a run's folder. Afterwards: `ethbrake evaluate --agents full_brake,ppo@FOLDER,ppo@FOLDER+episode`;
-    of several: `team@FOLDER`. Ctrl-C ends the training after the update in progress and keeps the policy; `ethbrake
-    train --resume FOLDER` goes on: the policy is the one that the training would have come to without the stop, bit
-    for bit.
+    for several learners: `team@FOLDER`. Ctrl-C ends the training after the current update and keeps the policy;
+    `ethbrake train --resume FOLDER` continues: the final policy is the same, bit for bit, as without the stop.
     """
     with Out(as_json=as_json, force=force, kept=KEPT) as out:
         if resume is not None:
@@ -153,7 +169,7 @@ def train_command(
         begun = [training.Training.of(plan, chosen).who_drives()]
 
         def tell(progress: Progress) -> None:
-            if begun:  # all input is known to be good
+            if begun:  # all input has been checked by now
                 out.note(begun.pop())
             out.show_progress(progress)
 
@@ -165,7 +181,7 @@ def train_command(
 
 
 def _tell(out: Out, result: training.TrainResult) -> None:
-    """What a training came to."""
+    """Print the result of a training as JSON on stdout, and how it ended on stderr."""
     out.result({
         "directory": str(result.directory),
         "status": result.status,
@@ -180,7 +196,7 @@ def _tell(out: Out, result: training.TrainResult) -> None:
 
 
 def _end(out: Out, result: training.TrainResult) -> None:
-    """Say what a training left; an interrupted one ends with that status."""
+    """Print how the training of ``result`` ended and where it is; if it was interrupted, exit with status 130."""
     if result.status == "interrupted":
         left = f"go on with: ethbrake train --resume {result.directory} (its policy is there)"
         out.interrupted(f"interrupted after {result.steps:,} training steps; {left}")

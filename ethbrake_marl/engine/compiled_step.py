@@ -1,6 +1,7 @@
-"""The compiled step of the engine: actions to commands, motion, episode ends, the terms of reward that all share.
+"""The engine's compiled step: actions to commands, motion, ends of episodes, and the reward that vehicles share.
 
-Worlds are rows of ``physics.batch``; ``clock`` [n, 4] holds what an episode needs beside them.
+Each of n worlds is a row of the arrays ``state`` and ``params``, whose columns ``physics.columns`` defines. The array
+``clock`` [n, 4] holds the time of the first decision, the numbers of steps, and whether the episode has ended.
 """
 
 from __future__ import annotations
@@ -22,89 +23,94 @@ from ethbrake_marl.physics.rows import FLAG, LISTED, ROW, place_forces, place_ob
 from ethbrake_marl.physics.segment import advance_table
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
-# columns of clock
+# columns of ``clock``
 START = 0  # time of the first decision (s)
 
-STEP = 1  # steps taken
+STEP = 1  # number of steps taken
 
-LAST_STEP = 2  # the step that ends at the horizon
+LAST_STEP = 2  # number of the step that ends at the horizon
 
-ENDED = 3  # 1 once the episode has ended
+ENDED = 3  # 1 after the episode has ended, else 0
 
 CLOCK_WIDTH = 4
 
-# rows of outcome: what the step brought to each world
-STEP_FIRST_HARM = 0
+# rows of ``outcome``: results of the step in each world
+STEP_FIRST_HARM = 0  # first-impact harm of the step (m2/s2)
 
-STEP_TOTAL_HARM = 1
+STEP_TOTAL_HARM = 1  # total harm of the step (m2/s2)
 
-TERMINATED = 2  # 1 if the step ended the episode in this way, else 0
+TERMINATED = 2  # 1 if the step ended the episode at rest, else 0
 
-TRUNCATED = 3
+TRUNCATED = 3  # 1 if the step ended the episode at the horizon, else 0
 
-SAFE_END = 4  # without any collision
+SAFE_END = 4  # 1 if the episode ended without any impact, else 0
 
-FAILED = 5  # what went wrong (a status of the kernel) where the world could not be advanced, else 0
+FAILED = 5  # status code of the kernel if the world could not be advanced, else 0
 
 OUTCOME_ROWS = 6
 
-# places in settings
+# indices of ``settings``
 TIME_STEP, HORIZON, HARM_WEIGHT, HARM_IS_TOTAL, TERMINAL_WEIGHT = range(5)
 
 BAD_ACTION = -1
 
 
 class Step(NamedTuple):
-    """What one step brought, for every world of the batch."""
+    """Results of one step of n worlds with N vehicles."""
 
-    reward: Floats  # [n, N]
-    outcome: Floats  # [OUTCOME_ROWS, n] as the kernel tells it; read it through the properties
-    params: RewardParams
-    further: dict[str, Floats]  # unweighted reward terms that differ between vehicles or need the motion, each [n, N]
+    reward: Floats  # [n, N] reward of each vehicle
+    outcome: Floats  # [OUTCOME_ROWS, n] raw results of the compiled step; use the properties to read them
+    params: RewardParams  # settings of the reward
+    further: dict[str, Floats]  # name -> unweighted reward term that the compiled step does not know, [n] or [n, N]
 
     @property
     def terminated(self) -> Bools:
-        """Episodes that ended with this step with everything at rest and no command that would move it, [n]."""
+        """Whether this step ended the episode because the line is at rest and no command would move a vehicle, [n]."""
         return self._is(TERMINATED)
 
     @property
     def truncated(self) -> Bools:
-        """Episodes that reached the horizon with this step, [n]."""
+        """Whether this step ended the episode at the horizon, or because the world could not be advanced, [n]."""
         return self._is(TRUNCATED)
 
     @property
     def ended(self) -> Bools:
-        """Episodes that ended with this step, [n]."""
+        """Whether this step ended the episode, for either reason, [n]."""
         return self.terminated | self.truncated
 
     @property
     def failed(self) -> Ints:
-        """What went wrong in the worlds that could not be advanced (a status of the kernel), 0 elsewhere, [n]."""
+        """Status code of the physics for each world that could not be advanced, 0 for the others, [n]."""
         return np.asarray(self.outcome[FAILED], np.int64)
 
     @property
     def safe_end(self) -> Bools:
-        """Episodes that ended with this step without any collision, [n]."""
+        """Whether this step ended the episode and the whole episode had no impact, [n]."""
         return self._is(SAFE_END)
 
     @property
     def first_impact_harm(self) -> Floats:
-        """Of the whole line in this step, [n]."""
+        """Harm that the step added to the whole line, counting each pair's first impact only, [n] m2/s2."""
         return np.asarray(self.outcome[STEP_FIRST_HARM], np.float64)
 
     @property
     def total_harm(self) -> Floats:
-        """Likewise, every impact counted, [n]."""
+        """Harm that the step added to the whole line, counting every impact, [n] m2/s2."""
         return np.asarray(self.outcome[STEP_TOTAL_HARM], np.float64)
 
     @property
     def shared(self) -> dict[str, Floats]:
-        """Unweighted reward terms that are the same for all vehicles of a world, each [n]."""
+        """Unweighted reward terms that are the same for all vehicles of a world: name -> value, [n]."""
         return self.params.shared(self.counted_harm, self.outcome[SAFE_END])
 
     @property
+    def terms(self) -> dict[str, Floats]:
+        """Every unweighted reward term: name -> value, [n] if it is the same for all vehicles, otherwise [n, N]."""
+        return self.shared | self.further
+
+    @property
     def counted_harm(self) -> Floats:
-        """Harm of the whole line in this step, as the reward counts impacts, [n]."""
+        """Harm that the step added to the whole line, counting the impacts that the reward counts, [n] m2/s2."""
         return self.first_impact_harm if self.params.harm_count == "first" else self.total_harm
 
     def _is(self, row: int) -> Bools:
@@ -113,7 +119,11 @@ class Step(NamedTuple):
 
 @compiled(apart=True, bare=True)
 def place_row(table: Floats, state: Floats, params: Floats, k: int, pieces: Floats) -> None:
-    """``place_forces`` of a row; a function of its own, as worlds without rates would pay for it in their loop."""
+    """Add to the ``table`` of world ``k`` what is needed only if brakes take time to build up.
+
+    These are accelerations in force and rates of build-up, from row ``k`` of ``state`` and ``params``, and the braking
+    profiles ``pieces`` [N, 2 K]. A separate function, because it would slow down the loop for worlds without build-up.
+    """
     column, N = columns(state), pieces.shape[0]
     command, brake_rate, release_rate = column.command, column.brake_rate, column.release_rate
     place_forces(
@@ -127,13 +137,28 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     state: Floats, params: Floats, clock: Floats, actions: Floats, learners: Ints, settings: Floats, no_rows: Floats,
     builds_up: bool, pieces: Floats, wanted: Floats, reward: Floats, outcome: Floats,
 ) -> tuple[int, int]:  # fmt: skip
-    """Advance every running world by one step, in place (state, clock, wanted); fills the last two arrays.
+    """Advance every running world by one step.
 
-    ``actions`` [n, L] become the learners' commands in ``wanted`` [n, N]; nothing is moved if one of them is not in
-    [-1, 1]. A world that cannot be advanced stays where it was; its episode is cut off there, without a reward, and
-    marked in ``outcome``. Without ``builds_up`` no world's brakes do, nor come in ``pieces`` [N, 2 K], those of all
-    worlds. Returns a world and what went wrong there (BAD_ACTION, or the status of one that could not be advanced), or
-    (-1, DONE).
+    An action outside [-1, 1] moves nothing. A world that cannot be advanced keeps its state; its episode is cut off
+    there, without a reward, and marked in ``outcome``.
+
+    Args:
+        state: [n, S] motion and harm of the worlds, changed in place.
+        params: [n, K] parameters of the vehicles.
+        clock: [n, CLOCK_WIDTH] changed in place.
+        actions: [n, L] actions of the learners.
+        learners: [L] indices of the learners.
+        settings: [5] ``TIME_STEP``, ``HORIZON``, ``HARM_WEIGHT``, ``HARM_IS_TOTAL``, ``TERMINAL_WEIGHT``.
+        no_rows: ``NO_ROWS``, so that no single impact is recorded.
+        builds_up: must be True if brakes build up in any world, or if a script follows a profile.
+        pieces: [N, 2 K] braking profiles with K intervals of constant command; used only if ``builds_up``.
+        wanted: [n, N] commands, m/s2; the learners' are written.
+        reward: [n, N] written.
+        outcome: [OUTCOME_ROWS, n] written.
+
+    Returns the row of a world and its error (``BAD_ACTION``, or the status of a world that could not be advanced), or
+    ``(-1, FLAG.DONE)``.
+
     """
     n, N = wanted.shape
     for k in range(n):
@@ -145,7 +170,7 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     braking, driving, latency, mass, limit = column.braking, column.driving, column.latency, column.mass, column.limit
     P, obstacle = N - 1, column.obstacle
     worst, worst_status = -1, FLAG.DONE
-    at = 1 if state.shape[1] > obstacle else 0  # vehicle i stands in column at + i, behind an obstacle
+    at = 1 if state.shape[1] > obstacle else 0  # vehicle i is in column at + i; an obstacle is in column 0
     table = np.zeros((rows_for(pieces.shape[1]) if builds_up else ROW.OF_SEGMENT, N + at))
     for k in range(n):
         if clock[k, ENDED] == 1.0:
@@ -232,21 +257,33 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     return worst, worst_status
 
 
-NO_ROWS = np.empty((0, LISTED.WIDTH))  # no list of impacts is kept
+NO_ROWS = np.empty((0, LISTED.WIDTH))  # an empty list of impacts, so that none are recorded
 
 
 class Rules(NamedTuple):
-    """What all steps of an engine have in common, and the compiled step under it."""
+    """Settings that all steps of an engine share, and the compiled step that uses them."""
 
     learners: Ints  # [L] indices of the learners
     settings: Floats  # [5] TIME_STEP, HORIZON, HARM_WEIGHT, HARM_IS_TOTAL, TERMINAL_WEIGHT
-    builds_up: bool  # whether the brakes of some world may build up, or follow ``pieces``
-    pieces: Floats  # [N, 2 K] braking profile of each scripted vehicle, as in ``Vehicles``; K may be 0
+    builds_up: bool  # whether brakes take time to build up in some world, or a script follows a braking profile
+    pieces: Floats  # [N, 2 K] braking profiles with K intervals of constant command, as in ``Vehicles``; K may be 0
 
     def step(
         self, worlds: Packed, clock: Floats, actions: Floats, wanted: Floats, reward: Floats, outcome: Floats
     ) -> int:
-        """Advance every running world by one step, in place; return a status. See ``step_worlds``."""
+        """Advance every running world by one step and return a status.
+
+        Args:
+            worlds: rows of n worlds, changed in place.
+            clock: [n, CLOCK_WIDTH] changed in place.
+            actions: [n, L] actions of the learners in [-1, 1].
+            wanted: [n, N] commands, m/s2; the learners' are written.
+            reward: [n, N] written.
+            outcome: [OUTCOME_ROWS, n] written.
+
+        The status is ``FLAG.DONE``, ``BAD_ACTION`` (nothing was moved), or the code of the failed check of some world.
+
+        """
         _, status = step_worlds(
             *worlds, clock, actions, self.learners, self.settings, NO_ROWS, self.builds_up, self.pieces, wanted,
             reward, outcome,
@@ -254,7 +291,7 @@ class Rules(NamedTuple):
         return status
 
     def unpack(self, packed: Packed) -> Worlds:
-        """The worlds of these rows, in their own memory, with the pieces in which their scripts brake."""
+        """Return packed worlds as ``Worlds`` in new arrays, whose vehicles follow the braking profiles ``pieces``."""
         worlds = packed.worlds()
         if self.pieces.shape[1] == 0:
             return worlds

@@ -31,6 +31,7 @@ from ethbrake_marl.errors import InvalidInput, UncertifiedStep, renumbered
 from ethbrake_marl.game.actions import checked_action
 from ethbrake_marl.game.definition import Game
 from ethbrake_marl.game.harm import Ledger, empty_ledger
+from ethbrake_marl.game.impacts import EpisodeImpacts
 from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec, Plan
 from ethbrake_marl.game.observed import common_observation, observations_of
 from ethbrake_marl.game.rewards import Reward
@@ -46,92 +47,119 @@ Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]
 
 
 class Watcher(Protocol):
-    """Looks on while an engine's episodes run, as the trace of a picture does; it changes nothing.
+    """Observer that follows an engine's episodes without changing them, for example to record them for a picture.
 
-    What it remembers is kept by the engine beside the worlds (``Engine.memory``): both change in one piece, or, where
-    anything fails or is interrupted, neither does. A memory is therefore never changed in place.
+    The engine keeps the watcher's memory beside its state. Both change in one assignment, or, after an error or an
+    interrupt, neither does. So a watcher never changes its memory in place.
     """
 
     def begun(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
-        """The memory once episodes start in these rows; ``alert`` holds those worlds only, at t = 0."""
+        """Return the watcher's memory after episodes have started in the rows with the indices ``rows``.
+
+        ``alert`` holds only the worlds of these rows, at t = 0. ``memory`` is the watcher's memory before.
+        """
 
     def stepped(self, memory: Any, before: Engine, after: Engine) -> Any:
-        """The memory once the engine, as it was ``before`` this step, is as ``after``."""
+        """Return the watcher's memory after a step, given its ``memory`` before.
+
+        ``before`` and ``after`` are the engine before and after the step.
+        """
 
 
 class Ruling(NamedTuple):
-    """What a guard lets happen in one step, of n worlds and L learners."""
+    """Answer of a guard in one step, for n worlds and L learners."""
 
-    proposed: Floats  # [n, L] actions; NaN: none, or no number
-    applied: Floats  # [n, L] actions
-    stepped_in: Bools  # [n] something else is applied than what was proposed
-    asked: Bools  # [n] worlds that it is about
-    decision: Any  # what else there is to tell of it
-    memory: Any  # the guard's once the step is made
+    proposed: Floats  # [n, L] actions that the learners proposed; NaN: none, or not a number
+    applied: Floats  # [n, L] actions to apply, in [-1, 1]
+    stepped_in: Bools  # [n] whether the guard replaced an action, or chose E-V2X-BM (mode ``episode``)
+    asked: Bools  # [n] whether the guard decided in this world; False for ended episodes
+    decision: Any  # further details, in the guard's own format
+    memory: Any  # the guard's memory after the step
 
 
 class Guard(Protocol):
-    """Stands between what is proposed to an engine and what is applied: a shield.
+    """A shield inside an engine: it replaces proposed actions by the actions that are applied.
 
-    It is asked inside ``Engine.step``, so nothing that reaches the engine passes it by. What it remembers is kept by
-    the engine: worlds, memory and ruling change in one piece, or, where anything fails or is interrupted, none does. A
-    memory is therefore never changed in place.
+    The engine calls it inside ``Engine.step``, so no action bypasses it. The engine keeps the guard's memory beside its
+    state. State, memory and ruling change in one assignment, or, after an error or an interrupt, none of them does. So
+    a guard never changes its memory in place.
     """
 
     def begin(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
-        """The memory once episodes start in these rows, None before; ``alert`` holds those worlds only, at t = 0."""
+        """Return the guard's memory after episodes have started in the rows with the indices ``rows``.
+
+        ``alert`` holds only the worlds of these rows, at t = 0. ``memory`` is the memory before, None before the first
+        episode.
+        """
 
     def decide(self, running: Engine, memory: Any, proposed: Floats) -> Ruling:
-        """What is applied instead of the actions [n, L]. A column of NaN: nothing was proposed for that learner."""
+        """Return the actions to apply in the next step.
+
+        Args:
+            running: the engine before the step.
+            memory: the guard's memory.
+            proposed: [n, L] actions of the learners; a column of NaN means that this learner proposed none.
+
+        """
 
     def check(self, ruling: Ruling, after: Engine) -> Any:
-        """The memory now that the step led to ``after``. Raises ``UncertifiedStep``: then it was not made."""
+        """Return the memory to keep after the step, or raise ``UncertifiedStep`` to undo the step.
+
+        ``ruling`` is the guard's own answer before the step, ``after`` the engine after it.
+        """
 
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
-        """What infos say of each vehicle, by name, each [n, N]: of its last step, or of the alert before the first."""
+        """Return the guard's infos about the last step: name -> values [n, N].
+
+        Before the first step of an episode, they are about the alert. ``running`` is the engine.
+        """
 
 
 class Now(NamedTuple):
-    """Everything of an engine that a reset or a step changes; replaced in one assignment."""
+    """Everything that a reset or a step of an engine changes; replaced in one assignment."""
 
-    state: State
-    roster: Roster  # who runs in which row, and which worlds failed
-    stream: Stream
-    obstacle: bool  # the rows have columns of an obstacle
-    by_link: bool  # ... of news by link
-    rules: Rules
-    watched: dict[Watcher, Any]  # what each watcher remembers
-    ruling: Ruling | None = None  # of the last step
-    stops: tuple[Stop, ...] = ()  # of scripts on their own grid within the last step
+    state: State  # the running episodes
+    roster: Roster  # the world that runs in each row, and the worlds that could not be advanced
+    stream: Stream  # the source of the next episodes
+    obstacle: bool  # whether the rows have columns for an obstacle ahead
+    by_link: bool  # whether the rows have columns for messages over links between vehicles
+    rules: Rules  # settings of every step
+    watched: dict[Watcher, Any]  # watcher -> its memory
+    ruling: Ruling | None = None  # the guard's answer in the last step; None without one
+    stops: tuple[Stop, ...] = ()  # decisions of scripts within the last step, see ``own_grid``
 
     def apart(self) -> Now:
-        """The same, in arrays of its own."""
+        """Return a copy whose arrays can be changed without changing these."""
         return self._replace(state=self.state.copy(), roster=self.roster.apart(), stream=copy.copy(self.stream))
 
     def kept(self, packed: Packed) -> Packed:
-        """Rows as wide as they are kept: with columns of an obstacle, and of news by link, if the first had such."""
+        """Return ``packed`` with the same columns as the rows of this engine.
+
+        Columns for an obstacle and for messages are added if the engine has them, even if these worlds do not need
+        them.
+        """
         return packed.widened(self.obstacle, self.by_link)
 
 
 class Engine:
     """A batch of ``n`` running episodes of one scenario.
 
-    Steps start when the first of the ``deciders`` may act; with none, at t = 0. A ``guard`` (a shield) may stand
-    between what is proposed and what is applied. A world that the physics cannot advance takes no other with it: its
-    episode is cut off (truncated), and the ``roster`` names it.
+    A step goes from one decision of the ``deciders`` to the next; the first begins when the first decider may act. With
+    a ``guard`` (a shield), the applied actions may differ from the proposed ones. If the physics cannot advance a
+    world, its episode is truncated and the ``roster`` names it; the other worlds go on.
 
     Args:
-        scenario: of every episode.
-        n: worlds that are advanced together, at least 1.
+        scenario: the scenario of all episodes, or another ``Game``.
+        n: number of worlds that are advanced together, at least 1.
         learners: indices of the vehicles (0 = front) that need an action in every step.
-        scripts: vehicle index -> what drives it, for every vehicle that does not learn.
-        reward: a name, a mapping of settings, or ``RewardParams``.
-        observation: what vehicles observe, or by name what each does; None: as the scenario says.
-        seed: of the scenario's training stream, from which worlds come unless they are given.
-        deciders: indices of the vehicles that set the grid of decisions; None: the learners. An evaluated agent drives
-            its vehicle as a script, on a learner's grid.
-        worlds: of the first episodes, at t = 0; None: from the stream.
-        guard: makes what stands between proposed and applied actions; None: what is proposed is applied.
+        scripts: index of every vehicle that does not learn -> its script.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        observation: what the vehicles observe: one for all, or vehicle name -> observation; None: as the scenario says.
+        seed: seed of the training stream, which provides the worlds unless ``worlds`` does.
+        deciders: indices of the vehicles whose decisions delimit the steps; None: the learners. An evaluation has no
+            learner: there a script is the decider.
+        worlds: worlds of the first episodes, at t = 0; None: the first ones of the training stream.
+        guard: function that makes the guard of this engine; None: proposed actions are applied.
 
     >>> import ethbrake_marl as eb
     >>> engine = eb.make_engine("paper-random", 4, seed=7)
@@ -168,7 +196,7 @@ class Engine:
         self.deciders = self.learners if deciders is None else tuple(deciders)
         if not set(self.deciders) <= set(range(scenario.vehicles)):
             raise InvalidInput(f"engine: deciders {self.deciders} must be from 0 to {scenario.vehicles - 1}")
-        self._terms = Terms(reward, scenario, self.learners)
+        self._terms = Terms(reward, scenario, self.learners or self.deciders)
         self.reward = self._terms.params
         self.observations = observations_of(scenario, observation)  # of each vehicle
         self._plans = tuple(each.plan for each in self.observations)
@@ -186,7 +214,11 @@ class Engine:
         self._now = self._started(stream, None, worlds, {})
 
     def check_time_step(self, drivers: Mapping[int, Script]) -> None:
-        """Raise ``InvalidInput`` for one that was made for decisions at another distance in time (``time_step_s``)."""
+        """Raise ``InvalidInput`` if an agent was made for another time between decisions than the scenario's.
+
+        ``drivers`` maps vehicle indices to agents or scripts; those without an attribute ``time_step_s`` fit every
+        scenario.
+        """
         for script in drivers.values():
             step, here = getattr(script, "time_step_s", None), self.scenario.time_step_s
             if step not in (None, here):
@@ -195,121 +227,13 @@ class Engine:
                     f" scenario {self.scenario.name!r} has one every {here:g} s: make_agent(..., scenario=...) knows"
                 )
 
-    @property
-    def observation(self) -> ObservationSpec:
-        """What all learners observe; raises ``InvalidInput`` where they observe different features."""
-        return common_observation(self.observations, self.scenario)
-
-    @property
-    def seed(self) -> int:
-        """Seed of the training stream."""
-        return self._now.stream.seed
-
-    @property
-    def state(self) -> State:
-        """The running episodes as they are now: to be read, not to be changed."""
-        return self._now.state
-
-    @property
-    def roster(self) -> Roster:
-        """Who runs in which row, and which worlds failed."""
-        return self._now.roster
-
-    @property
-    def memories(self) -> dict[int, Memory]:
-        """What the scripts remember, by vehicle."""
-        return self._now.state.memories
-
-    @property
-    def guarded(self) -> Any:
-        """What the guard remembers; None without one, or before its first episode."""
-        return self._now.state.guarded
-
-    @property
-    def ruling(self) -> Ruling | None:
-        """What the guard ruled in the last step."""
-        return self._now.ruling
-
-    @property
-    def packed(self) -> Packed:
-        """The running worlds themselves, as rows of ``physics.batch``: for kernels to read, not to be changed."""
-        return self._now.state.packed
-
-    @property
-    def wanted_mps2(self) -> Floats:
-        """What each vehicle wanted in the last step, [n, N]: for kernels to read, not to be changed."""
-        return self._now.state.wanted
-
-    @property
-    def worlds(self) -> Worlds:
-        """The worlds as they are now, in their own memory."""
-        return self._now.rules.unpack(self.packed)
-
-    @property
-    def in_pieces(self) -> bool:
-        """Whether some script brakes in pieces."""
-        return bool(self._now.rules.pieces.shape[1] > 0)
-
-    @property
-    def ledger(self) -> Ledger:
-        """Harm of the running episodes so far, in its own memory."""
-        return self._now.state.ledger
-
-    @property
-    def ended(self) -> Bools:
-        """Episodes that have ended, [n]."""
-        return self._now.state.ended
-
-    @property
-    def steps(self) -> Ints:
-        """Steps that the running episodes have taken, [n]."""
-        return self._now.state.steps
-
-    def observe(self, vehicle: int) -> Observations:
-        """Current observation of one vehicle, [n, F]."""
-        if not isinstance(vehicle, int | np.integer) or not 0 <= vehicle < self.scenario.vehicles:
-            raise InvalidInput(f"observe: vehicle index {vehicle!r}; must be in 0..{self.scenario.vehicles - 1}")
-        return self.observe_all(np.array([vehicle]))[:, 0]
-
-    def observe_all(self, vehicles: Ints | None = None, rows: Ints | None = None) -> Observations:
-        """Current observations of several vehicles, of all learners if none are given, [n, len(vehicles), F].
-
-        Only of the worlds ``rows`` if given. Raises ``InvalidInput`` where these vehicles observe different features.
-        """
-        vehicles = self._learner_index if vehicles is None else vehicles
-        if not self._alike and len({self.observations[i] for i in vehicles.tolist()}) > 1:
-            names = ", ".join(self.scenario.vehicle_names[i] for i in vehicles.tolist())
-            raise InvalidInput(f"observe_all: {names} observe different features; use observe for each")
-        state = self._now.state
-        motion, params, clock = state.motion, state.params, state.clock
-        plan: Plan = self._plans[0 if self._alike else int(vehicles[0])]
-        if rows is not None:
-            motion, params = motion.take(rows, axis=0), params.take(rows, axis=0)
-        if not plan.extras:
-            return plan.observe(motion, params, vehicles)
-        return plan.observe(motion, params, vehicles, clock[:, STEP] if rows is None else clock[rows, STEP])
-
-    def memory(self, watcher: Watcher) -> Any:
-        """What a watcher remembers of the running episodes."""
-        return self._now.watched[watcher]
-
-    def watch(self, watcher: Watcher, memory: Any) -> None:
-        """Let a watcher follow, from ``memory`` on."""
-        self._now = self._now._replace(watched={**self._now.watched, watcher: memory})
-
-    def protect(self, guard: Guard | None) -> None:
-        """Let a guard stand between what is proposed and what is applied, from the next reset on; None: nobody does."""
-        self.guard = guard
-        self._now = self._now._replace(state=self._now.state._replace(guarded=None), ruling=None)
-
-    def remember(self, guarded: Any) -> None:
-        """Replace what the guard remembers, for who decides in the place of a step (``place``)."""
-        self._now = self._now._replace(state=self._now.state._replace(guarded=guarded))
-
     def reset(self, *, seed: int | None = None, worlds: Worlds | None = None) -> None:
-        """Start new episodes in all rows: the given worlds (at t = 0), or the next ones of the training stream.
+        """Start new episodes in all rows. If anything fails, the running episodes go on.
 
-        With ``seed`` the stream starts again from its beginning. Whatever fails, the running episodes go on.
+        Args:
+            seed: restart the training stream from the first world of this seed; None: continue in the stream.
+            worlds: n worlds at t = 0; None: the next worlds of the training stream.
+
         """
         stream = copy.copy(self._now.stream)
         if seed is not None:
@@ -317,7 +241,10 @@ class Engine:
         self._now = self._started(stream, self._now.state.guarded, worlds, self._now.watched)
 
     def _started(self, stream: Stream, guarded: Any, worlds: Worlds | None, watched: dict[Watcher, Any]) -> Now:
-        """New episodes in all rows: the given worlds, or the next ones of the ``stream``."""
+        """Return new episodes in all rows, in ``worlds`` (at t = 0) or, if None, in the next worlds of ``stream``.
+
+        ``guarded`` and ``watched`` are the memories of the guard and the watchers so far.
+        """
         if worlds is not None:
             check_alert(worlds, self.n, self.scenario.vehicles)
         first = None if worlds is not None else stream.position
@@ -334,160 +261,12 @@ class Engine:
         new._begin(np.arange(self.n), start)
         return new._now
 
-    def _at(self, now: Now) -> Engine:
-        """The same engine at another moment."""
-        new = copy.copy(self)
-        new._now = now
-        return new
-
-    def renew(self, rows: Ints) -> None:
-        """Start new episodes of the training stream in these rows (autoreset). Whatever fails, nothing is changed."""
-        if len(rows) == 0:
-            return
-        if not 0 <= np.min(rows) <= np.max(rows) < self.n or np.bincount(rows).max() > 1:
-            raise InvalidInput(f"renew: rows {rows}; must be different numbers from 0 to {self.n - 1}")
-        new = self if self._nobody_refuses_episodes else self._at(self._now.apart())
-        (state, roster, stream, *_), now = new._now, new._now
-        position = stream.position
-        start = stream.take(len(rows))
-        roster.renew(rows, position)
-        state.motion[rows], state.params[rows] = now.kept(start.packed)
-        state.clock[rows], state.wanted[rows] = start.clock, start.wanted
-        new._begin(rows, start)
-        self._now = new._now
-
-    @property
-    def _nobody_refuses_episodes(self) -> bool:
-        """Whether nothing can fail when episodes begin: then they begin in the arrays that are there."""
-        return not (self._now.watched or self._remembering or self.guard)
-
-    def cut(self, step: Step, most_steps: int) -> None:
-        """Truncate the episodes that have taken ``most_steps`` with the last ``step``, here and in what that tells."""
-        cut = (self.steps >= most_steps) & (step.ended | ~self.ended)
-        step.outcome[TRUNCATED, cut] = self._now.state.clock[cut, ENDED] = 1.0
-
-    def step(self, actions: Actions) -> Step:
-        """Advance every running episode by one time step.
-
-        ``actions``: for each learner (by vehicle index, or as columns [n, L] in the order of ``learners``) a number in
-        [-1, 1] per world; by index a guarded one may be left out. Rows whose episode has ended stay as they are until
-        ``renew`` or ``reset``. What the guard refuses does not happen: the worlds stay as they are.
-        """
-        columns = self._columns(actions)
-        if self._nobody_refuses_steps:
-            return self._advance(columns)
-        before, new = self._at(self._now), self._at(self._now.apart())
-        ruling = None
-        if self.guard is not None:
-            ruling = self._ruled(before, columns, checked=isinstance(actions, Mapping))
-            columns = np.ascontiguousarray(ruling.applied)
-        step = new._advance(columns)
-        if self.guard is not None and ruling is not None:
-            new.remember(self.guard.check(ruling, new))
-            new._now = new._now._replace(ruling=ruling)
-        watched = {watcher: watcher.stepped(memory, before, new) for watcher, memory in new._now.watched.items()}
-        self._now = new._now._replace(watched=watched)
-        return step
-
-    @property
-    def _nobody_refuses_steps(self) -> bool:
-        """Whether nothing can fail within a step: then it is made in the arrays that are there."""
-        return not (self.guard or self._now.watched or self._terms.are_foreign or self._own_grid.scripts)
-
-    def _ruled(self, before: Engine, columns: Floats, *, checked: bool) -> Ruling:
-        """What the guard makes of the actions [n, L]; they are in range if they are ``checked``."""
-        assert self.guard is not None
-        if before.guarded is None:
-            raise UncertifiedStep("shield: this episode began before the shield was put around it; reset first")
-        return self.guard.decide(before, before.guarded, columns if checked else self._in_range(columns))
-
-    def _advance(self, columns: Floats) -> Step:
-        """Advance every running episode by one time step, in the arrays that are there."""
-        asked = self._ask_scripts()
-        harm_before = self._terms.objective_harm(self.state) if self._terms.by_objective else None
-        step, some_failed = self._move(columns)
-        if asked:
-            self._change(memories=self.memories | asked)
-        if some_failed:
-            times = self.state.motion[:, 0]
-            self.roster.mark(step.failed, times, np.minimum(times + self.scenario.time_step_s, self.scenario.horizon_s))
-        if self._terms.add_something:
-            worlds = self.worlds if self.reward.shaping > 0.0 else None
-            self._now = self._now._replace(state=self._terms.add(step, self.state, self.scenario, harm_before, worlds))
-        return step
-
-    def _change(self, **fields: Any) -> None:
-        """Replace fields of the state."""
-        self._now = self._now._replace(state=self._now.state._replace(**fields))
-
-    def _ask_scripts(self) -> dict[int, Memory]:
-        """What the scripts that decide in every step want now; and what they remember once the step is made."""
-        asked: dict[int, Memory] = {}
-        own_grid = self._own_grid.scripts
-        if len(self._remembering) > len(own_grid):
-            worlds, wanted = self.worlds, self.state.wanted
-            for vehicle in self._remembering.keys() - own_grid.keys():
-                script = self._remembering[vehicle]
-                command, asked[vehicle] = ask_script(script, worlds, self.memories[vehicle], vehicle)
-                wanted[:, vehicle] = within_capacity(command, worlds, vehicle, script)
-        return asked
-
-    def _move(self, columns: Floats) -> tuple[Step, bool]:
-        """Move the worlds under the actions [n, L], and hear what messages bring. Also: whether a world failed."""
-        if self._now.stops:
-            self._now = self._now._replace(stops=())
-        way = self._drive_own_grid(columns) if self._own_grid.scripts else None
-        state, rules = self._now.state, self._now.rules
-        was = state.motion.copy() if state.packed.has_messages else None
-        reward, outcome = np.empty(state.wanted.shape), np.empty((OUTCOME_ROWS, self.n))
-        status = rules.step(state.packed, state.clock, columns, state.wanted, reward, outcome)
-        if status == BAD_ACTION:  # nothing was moved
-            actions = self._in_range(columns)
-            status = rules.step(state.packed, state.clock, actions, state.wanted, reward, outcome)
-        if was is not None:
-            times = state.time_s, state.time_s, self.scenario.time_step_s
-            hear_rows(was, state.params, state.wanted, *times, rules.pieces)
-        if way is not None:
-            way.add_to(state.motion, state.packed.column, reward, outcome)
-        some_failed = status != FLAG.DONE or (way is not None and bool(way.failed.any()))
-        return Step(reward, outcome, self.reward, {}), some_failed
-
-    def _drive_own_grid(self, columns: Floats) -> Way:
-        """Let the scripts on their own grids decide within the step that begins."""
-        way = self._own_grid.drive_step(self.state, self._now.rules, self._in_range(columns))
-        self._change(memories=way.memories)
-        self._now = self._now._replace(stops=way.stops)
-        return way
-
-    def _columns(self, actions: Actions) -> Floats:
-        """The learners' actions as [n, L]; their range is checked where they are used."""
-        shape = (self.n, len(self.learners))
-        if type(actions) is np.ndarray and actions.shape == shape and actions.dtype.kind in "fiu":
-            return np.ascontiguousarray(actions, np.float64)
-        if not isinstance(actions, Mapping):
-            return checked_action(actions, shape, "the learners")
-        for vehicle in actions:
-            if vehicle not in self.learners:
-                raise InvalidInput(
-                    f"step: an action for vehicle index {vehicle!r}; the learners have the indices {self.learners}"
-                )
-        columns = np.empty(shape)
-        for c, vehicle in enumerate(self.learners):
-            if vehicle not in actions and self.guard is not None:
-                columns[:, c] = np.nan
-                continue
-            if vehicle not in actions:
-                raise InvalidInput(f"step: no action for the learner vehicle_{vehicle + 1}")
-            columns[:, c] = checked_action(actions[vehicle], (self.n,), f"vehicle_{vehicle + 1}")
-        return columns
-
-    def _in_range(self, columns: Floats) -> Floats:
-        """The actions [n, L] without the last rounding of a float32; ``InvalidInput`` for one out of range."""
-        each = [checked_action(columns[:, c], (self.n,), f"vehicle_{i + 1}") for c, i in enumerate(self.learners)]
-        return np.stack(each, axis=1) if each else columns
-
     def _begin(self, rows: Ints, start: Start) -> None:
-        """Tell those who must know that episodes start in ``rows``, and move what depends on them."""
+        """Start episodes in the rows with the indices ``rows``, in place.
+
+        ``start`` holds their worlds at the alert and at the first decision. Scripts, guard and watchers get their first
+        memory. Messages that arrive before the first step are delivered, and scripts that decide before it do so.
+        """
         if not self._nobody_refuses_episodes:
             alert, memories = start.alert, self.memories
             with renumbered(rows):
@@ -511,13 +290,243 @@ class Engine:
             start_s = self.state.time_s[rows]
             hear_rows(at_alert, heard, wanted[rows], start_s, start_s, self.scenario.time_step_s, rules.pieces)
             params[rows] = heard
+        if self._terms.count_impacts:
+            alert, now, before = start.alert, self.worlds, self.state.impacts
+            impacts = EpisodeImpacts.of(alert) if before is None else before.renewed(rows, alert)
+            since_alert = self.segments(now.assign(rows, alert), now.command_mps2)
+            self._change(impacts=impacts.and_then(since_alert, np.isin(np.arange(self.n), rows)))
         if self.reward.shaping > 0.0:
             potential[rows] = self._terms.potentials(rules.unpack(Packed(motion[rows], params[rows])), self.scenario)
 
-    def segments(self, before: Worlds, last_mps2: Floats) -> Iterator[tuple[Worlds, Floats, Floats]]:
-        """The last step, made from ``before`` (after a reset: the alert), in parts within which nobody decides.
+    def step(self, actions: Actions) -> Step:
+        """Advance every running episode by one time step and return the results.
 
-        Each is worlds, the commands [n, N] that they followed, ``last_mps2`` in the last part, and until when [n].
+        ``actions`` are numbers in [-1, 1] for each learner: an array [n, L] with columns in the order of ``learners``,
+        or a mapping from vehicle index to [n]. With a guard, the mapping may leave learners out. An episode that has
+        ended does not move until ``renew`` or ``reset``. If the guard refuses the step, nothing changes.
+        """
+        columns = self._columns(actions)
+        if self._nobody_refuses_steps:
+            return self._advance(columns)
+        before, new = self._at(self._now), self._at(self._now.apart())
+        ruling = None
+        if self.guard is not None:
+            ruling = self._ruled(before, columns, checked=isinstance(actions, Mapping))
+            columns = np.ascontiguousarray(ruling.applied)
+        step = new._advance(columns)
+        if self.guard is not None and ruling is not None:
+            new.remember(self.guard.check(ruling, new))
+            new._now = new._now._replace(ruling=ruling)
+        watched = {watcher: watcher.stepped(memory, before, new) for watcher, memory in new._now.watched.items()}
+        self._now = new._now._replace(watched=watched)
+        return step
+
+    @property
+    def _nobody_refuses_steps(self) -> bool:
+        """Whether a step cannot fail. Then the arrays are changed in place, which is faster."""
+        return not (self.guard or self._now.watched or self._terms.are_foreign or self._own_grid.scripts)
+
+    def _columns(self, actions: Actions) -> Floats:
+        """Return the learners' actions as an array [n, L], from an array or a mapping as in ``step``.
+
+        Their range is checked later.
+        """
+        shape = (self.n, len(self.learners))
+        if type(actions) is np.ndarray and actions.shape == shape and actions.dtype.kind in "fiu":
+            return np.ascontiguousarray(actions, np.float64)
+        if not isinstance(actions, Mapping):
+            return checked_action(actions, shape, "the learners")
+        for vehicle in actions:
+            if vehicle not in self.learners:
+                raise InvalidInput(
+                    f"step: an action for vehicle index {vehicle!r}; the learners have the indices {self.learners}"
+                )
+        columns = np.empty(shape)
+        for c, vehicle in enumerate(self.learners):
+            if vehicle not in actions and self.guard is not None:
+                columns[:, c] = np.nan
+                continue
+            if vehicle not in actions:
+                raise InvalidInput(f"step: no action for the learner vehicle_{vehicle + 1}")
+            columns[:, c] = checked_action(actions[vehicle], (self.n,), f"vehicle_{vehicle + 1}")
+        return columns
+
+    def _in_range(self, columns: Floats) -> Floats:
+        """Return the actions ``columns`` [n, L], with values up to a rounding error of float32 outside [-1, 1] clipped.
+
+        Raises ``InvalidInput`` for other values outside [-1, 1].
+        """
+        each = [checked_action(columns[:, c], (self.n,), f"vehicle_{i + 1}") for c, i in enumerate(self.learners)]
+        return np.stack(each, axis=1) if each else columns
+
+    def _ruled(self, before: Engine, columns: Floats, *, checked: bool) -> Ruling:
+        """Return the guard's answer to the actions ``columns`` [n, L].
+
+        ``before`` is the engine before the step. ``checked`` says that the actions are known to be in [-1, 1].
+        """
+        assert self.guard is not None
+        if before.guarded is None:
+            raise UncertifiedStep("shield: this episode began before the shield was put around it; reset first")
+        return self.guard.decide(before, before.guarded, columns if checked else self._in_range(columns))
+
+    def _advance(self, columns: Floats) -> Step:
+        """Advance every running episode by one time step, in place, under the learners' actions ``columns`` [n, L]."""
+        harm_before = self._terms.objective_harm(self.state) if self._terms.by_objective else None
+        start = None if self.state.impacts is None else self.worlds
+        asked = self._ask_scripts()
+        step, some_failed = self._move(columns)
+        if asked:
+            self._change(memories=self.memories | asked)
+        if some_failed:
+            times = self.state.motion[:, 0]
+            self.roster.mark(step.failed, times, np.minimum(times + self.scenario.time_step_s, self.scenario.horizon_s))
+        if self._terms.add_something:
+            self._add_terms(step, harm_before, start)
+        return step
+
+    def _ask_scripts(self) -> dict[int, Memory]:
+        """Ask the scripts with a memory whose vehicles decide at every step; return vehicle index -> new memory.
+
+        Their commands are written to ``state.wanted``.
+        """
+        asked: dict[int, Memory] = {}
+        own_grid = self._own_grid.scripts
+        if len(self._remembering) > len(own_grid):
+            worlds, wanted = self.worlds, self.state.wanted
+            for vehicle in self._remembering.keys() - own_grid.keys():
+                script = self._remembering[vehicle]
+                command, asked[vehicle] = ask_script(script, worlds, self.memories[vehicle], vehicle)
+                wanted[:, vehicle] = within_capacity(command, worlds, vehicle, script)
+        return asked
+
+    def _move(self, columns: Floats) -> tuple[Step, bool]:
+        """Move the worlds by one step under the actions ``columns`` [n, L], and deliver messages.
+
+        Returns the results of the step, and whether some world could not be advanced.
+        """
+        if self._now.stops:
+            self._now = self._now._replace(stops=())
+        way = self._drive_own_grid(columns) if self._own_grid.scripts else None
+        state, rules = self._now.state, self._now.rules
+        was = state.motion.copy() if state.packed.has_messages else None
+        reward, outcome = np.empty(state.wanted.shape), np.empty((OUTCOME_ROWS, self.n))
+        status = rules.step(state.packed, state.clock, columns, state.wanted, reward, outcome)
+        if status == BAD_ACTION:  # nothing was moved
+            actions = self._in_range(columns)
+            status = rules.step(state.packed, state.clock, actions, state.wanted, reward, outcome)
+        if was is not None:
+            times = state.time_s, state.time_s, self.scenario.time_step_s
+            hear_rows(was, state.params, state.wanted, *times, rules.pieces)
+        if way is not None:
+            way.add_to(state.motion, state.packed.column, reward, outcome)
+        some_failed = status != FLAG.DONE or (way is not None and bool(way.failed.any()))
+        return Step(reward, outcome, self.reward, {}), some_failed
+
+    def _drive_own_grid(self, columns: Floats) -> Way:
+        """Move the worlds to the last decision that a script makes within the step; return this part of the step.
+
+        Such scripts decide at times of their own, between the decisions of the deciders. ``columns`` [n, L] are the
+        learners' actions.
+        """
+        way = self._own_grid.drive_step(self.state, self._now.rules, self._in_range(columns))
+        self._change(memories=way.memories)
+        self._now = self._now._replace(stops=way.stops)
+        return way
+
+    def _add_terms(self, step: Step, harm_before: Floats | None, start: Worlds | None) -> None:
+        """Add the reward terms that the compiled step does not know to the step's results.
+
+        Args:
+            step: the step just made; changed in place.
+            harm_before: harm that each vehicle's objective counted before the step, [n, N] m2/s2; None if the reward
+                counts the harm of the whole line.
+            start: the worlds before the step; None unless the reward has a measure of single impacts.
+
+        """
+        impacts = self.state.impacts
+        if impacts is not None and start is not None:
+            moved = start.time_s < self.state.time_s
+            self._change(impacts=impacts.and_then(self.segments(start, self.wanted_mps2), moved))
+        worlds = self.worlds if self.reward.shaping > 0.0 else None
+        state = self._terms.add(step, self.state, self.scenario, harm_before, impacts, worlds)
+        self._now = self._now._replace(state=state)
+
+    def _change(self, **fields: Any) -> None:
+        """Replace the named fields of ``state``."""
+        self._now = self._now._replace(state=self._now.state._replace(**fields))
+
+    def observe(self, vehicle: int) -> Observations:
+        """Return the current observation of the vehicle with this index (0 = front) in each world, [n, F]."""
+        if not isinstance(vehicle, int | np.integer) or not 0 <= vehicle < self.scenario.vehicles:
+            raise InvalidInput(f"observe: vehicle index {vehicle!r}; must be in 0..{self.scenario.vehicles - 1}")
+        return self.observe_all(np.array([vehicle]))[:, 0]
+
+    def observe_all(self, vehicles: Ints | None = None, rows: Ints | None = None) -> Observations:
+        """Return the current observations of several vehicles, [n, len(vehicles), F].
+
+        Args:
+            vehicles: indices of the vehicles (0 = front); None: all learners.
+            rows: indices of the worlds to observe, in place of all n; None: all.
+
+        Raises ``InvalidInput`` if these vehicles observe different features.
+
+        """
+        vehicles = self._learner_index if vehicles is None else vehicles
+        if not self._alike and len({self.observations[i] for i in vehicles.tolist()}) > 1:
+            names = ", ".join(self.scenario.vehicle_names[i] for i in vehicles.tolist())
+            raise InvalidInput(f"observe_all: {names} observe different features; use observe for each")
+        state = self._now.state
+        motion, params, clock = state.motion, state.params, state.clock
+        plan: Plan = self._plans[0 if self._alike else int(vehicles[0])]
+        if rows is not None:
+            motion, params = motion.take(rows, axis=0), params.take(rows, axis=0)
+        if not plan.extras:
+            return plan.observe(motion, params, vehicles)
+        return plan.observe(motion, params, vehicles, clock[:, STEP] if rows is None else clock[rows, STEP])
+
+    def renew(self, rows: Ints) -> None:
+        """Start the next episodes of the training stream in the rows with the indices ``rows``.
+
+        The other rows continue. If anything fails, nothing changes. Raises ``InvalidInput`` for a repeated or unknown
+        row.
+        """
+        if len(rows) == 0:
+            return
+        if not 0 <= np.min(rows) <= np.max(rows) < self.n or np.bincount(rows).max() > 1:
+            raise InvalidInput(f"renew: rows {rows}; must be different numbers from 0 to {self.n - 1}")
+        new = self if self._nobody_refuses_episodes else self._at(self._now.apart())
+        (state, roster, stream, *_), now = new._now, new._now
+        position = stream.position
+        start = stream.take(len(rows))
+        roster.renew(rows, position)
+        state.motion[rows], state.params[rows] = now.kept(start.packed)
+        state.clock[rows], state.wanted[rows] = start.clock, start.wanted
+        new._begin(rows, start)
+        self._now = new._now
+
+    @property
+    def _nobody_refuses_episodes(self) -> bool:
+        """Whether the start of an episode cannot fail. Then the arrays are changed in place, which is faster."""
+        return not (self._now.watched or self._remembering or self.guard or self._terms.count_impacts)
+
+    def cut(self, step: Step, most_steps: int) -> None:
+        """Truncate the episodes that have taken ``most_steps`` steps.
+
+        ``step``, the result of the last step, is changed accordingly.
+        """
+        cut = (self.steps >= most_steps) & (step.ended | ~self.ended)
+        step.outcome[TRUNCATED, cut] = self._now.state.clock[cut, ENDED] = 1.0
+
+    def segments(self, before: Worlds, last_mps2: Floats) -> Iterator[tuple[Worlds, Floats, Floats]]:
+        """Yield the parts of the last step: usually one, but a script that decides within the step begins a new one.
+
+        Right after a reset, the parts lead from the alert to the first step. Each part is a tuple: the worlds at its
+        start, the commands that the vehicles followed [n, N] m/s2, and the time at its end [n] s.
+
+        Args:
+            before: the worlds at the start of the step.
+            last_mps2: commands of the last part, [n, N] m/s2.
+
         """
         for motion, wanted in self._now.stops:
             then = Packed(motion, self.state.params).worlds(before.vehicles)
@@ -525,21 +534,44 @@ class Engine:
             before = then
         yield before, last_mps2, self.state.time_s.copy()
 
-    def snapshot(self) -> Arrays:
-        """Copies of everything that changes while it runs: its rows, its place in the stream, the scripts' memories.
+    def protect(self, guard: Guard | None) -> None:
+        """Use this guard from the next reset on; None removes the present one."""
+        self.guard = guard
+        self._now = self._now._replace(state=self._now.state._replace(guarded=None), ruling=None)
 
-        The stream is one number: worlds are pure functions of the seed and of where they stand in it.
+    def remember(self, guarded: Any) -> None:
+        """Set the memory of the guard, for a caller that moves the worlds by ``place`` instead of ``step``.
+
+        ``guarded`` is what ``Guard.begin`` or ``Guard.check`` has returned.
+        """
+        self._now = self._now._replace(state=self._now.state._replace(guarded=guarded))
+
+    def memory(self, watcher: Watcher) -> Any:
+        """Return the present memory of a watcher that ``watch`` has added."""
+        return self._now.watched[watcher]
+
+    def watch(self, watcher: Watcher, memory: Any) -> None:
+        """Add an observer of the episodes. ``memory`` is its memory until the next episode begins."""
+        self._now = self._now._replace(watched={**self._now.watched, watcher: memory})
+
+    def snapshot(self) -> Arrays:
+        """Return copies of everything that changes while the engine runs, by name, for ``restore``.
+
+        These are the state, the place in the stream of worlds and the memories of the scripts. Worlds are pure
+        functions of the seed and their number, so the stream is one number.
         """
         arrays: Arrays = {name: array.copy() for name, array in zip(SNAPSHOT, self.state, strict=False)}
         arrays["stream"] = np.array([self.seed, self._now.stream.position], np.uint64)
         arrays["numbers"] = self.roster.numbers.copy()
+        if self.state.impacts is not None:
+            arrays |= self.state.impacts.arrays()
         return arrays | {f"script.{name}": array for name, array in flat(self.memories).items()}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Go on from the ``snapshot`` of an engine of the same scenario, size and scripts, as if nothing had happened.
+        """Continue exactly from ``arrays``, a ``snapshot`` of an engine of the same scenario, size and scripts.
 
-        Raises ``InvalidInput``, before anything is changed, naming the array that is missing or has another shape, and
-        where a shield stands in the engine, which would know nothing of these worlds.
+        Raises ``InvalidInput`` before anything changes: for a missing array, an array of another shape, or an engine
+        with a guard, whose memory the snapshot does not hold.
         """
         if self.guard is not None:
             raise InvalidInput(
@@ -551,9 +583,10 @@ class Engine:
             if have is None or have.shape != needed:
                 shape = "nothing" if have is None else have.shape
                 raise InvalidInput(f"engine snapshot: {name} is {shape}; {needed} is needed")
+        impacts = self.state.impacts and self.state.impacts.read(arrays)
         memories = {vehicle: checked_memory(unflat(arrays, f"script.{vehicle}"), self.n) for vehicle in self.memories}
         motion, params, clock, moving, potential = (np.array(arrays[name], np.float64) for name in SNAPSHOT)
-        state = State(motion, params, clock, moving, potential, memories, self.guarded)
+        state = State(motion, params, clock, moving, potential, memories, self.guarded, impacts)
         seed, taken = (int(number) for number in arrays["stream"])
         stream, roster = copy.copy(self._now.stream), Roster(self.n, seed, None)
         stream.restart(seed, taken)
@@ -561,18 +594,32 @@ class Engine:
         self._now = self._now._replace(state=state, stream=stream, roster=roster, rules=self._rules_for(state))
 
     def _rules_for(self, state: State) -> Rules:
-        """The rules for other rows: their brakes may build up where those of the rows before did not."""
+        """Return the settings with which steps must advance the worlds of ``state``, instead of this engine's worlds.
+
+        They differ from the present ones if only the worlds of ``state`` have brakes that take time to build up.
+        """
         builds_up = self.scenario.builds_up or state.packed.builds_up or self.in_pieces
         return self._now.rules._replace(builds_up=builds_up)
 
     def place(self, worlds: Worlds, ledger: Ledger | None = None, *, ended: Bools | None = None) -> None:
-        """Put the running worlds in all rows as somebody else has moved them, with their ``ledger`` so far.
+        """Replace the worlds in all rows, for example by worlds that another simulator has moved.
 
-        Vehicles, memories and the grid of decisions stay those of the last reset: the next step goes to the next
-        decision after the worlds' time. ``ended`` [n]: those that no step moves; None: those at the horizon. Raises
-        ``InvalidInput`` for another number of worlds or vehicles.
+        Vehicles, memories and times of decisions stay those of the last reset; the next step goes to the next decision
+        after the worlds' time.
+
+        Args:
+            worlds: n worlds at any time of their episodes.
+            ledger: harm so far; None: none.
+            ended: [n] whether the episode has ended, so that no step moves the world; None: ended if the worlds' time
+                is at or after the horizon.
+
+        Raises ``InvalidInput`` for another number of worlds or vehicles, and if the reward needs every single impact.
+
         """
         state = self.state
+        if state.impacts is not None:
+            names = ", ".join(self._terms.impact_names)
+            raise InvalidInput(f"place: reward: {names} needs every impact, which is not known of worlds placed here")
         if worlds.speeds_mps.shape != state.wanted.shape:
             n, N = state.wanted.shape
             raise InvalidInput(f"place: {worlds.n} worlds of {worlds.N} vehicles; {n} of {N} needed")
@@ -584,11 +631,11 @@ class Engine:
         self._now = self._now._replace(state=state._replace(motion=motion, clock=clock), ruling=None)
 
     def moment(self) -> State:
-        """The present state of all rows, in arrays of its own."""
+        """Return a copy of the state, from which ``branch`` can continue."""
         return self.state.copy()
 
     def first_moments(self, count: int) -> tuple[Worlds, State]:
-        """The first ``count`` worlds of the training stream, at the alert, and at their first decision."""
+        """Return the first ``count`` worlds of the training stream: at the alert, and at the first decision."""
         stream = copy.copy(self._now.stream)
         stream.restart(self.seed)
         alert, new = stream.take(count).alert, self._unwatched(count, self._now)
@@ -597,9 +644,10 @@ class Engine:
         return alert, new.moment()
 
     def branch(self, state: State) -> Engine:
-        """An engine of the same scenario whose rows go on from ``state``, under the same guard; this one stays.
+        """Return another engine whose episodes continue from ``state``, under the same guard.
 
-        Raises ``InvalidInput`` for an engine with a reward that is shaped, which tells of more than what happens.
+        This engine does not change. Raises ``InvalidInput`` for a reward with shaping, whose potentials depend on more
+        than the state.
         """
         if self.reward.shaping > 0.0:
             raise InvalidInput(f"branches: reward: shaping = {self.reward.shaping:g}: must be 0; a branch has an end")
@@ -610,7 +658,83 @@ class Engine:
         return self._unwatched(n, self._now._replace(state=state.copy(), roster=roster, ruling=None, rules=rules))
 
     def _unwatched(self, n: int, now: Now) -> Engine:
-        """An engine of the same scenario for ``n`` worlds, at that moment, which nobody watches."""
+        """Return an engine of the same scenario for ``n`` worlds, with the contents ``now`` and without watchers."""
         new = self._at(now._replace(watched={}))
         new.n = n
         return new
+
+    def _at(self, now: Now) -> Engine:
+        """Return a copy of this engine with the contents ``now``."""
+        new = copy.copy(self)
+        new._now = now
+        return new
+
+    @property
+    def state(self) -> State:
+        """The running episodes. Not a copy: do not change them."""
+        return self._now.state
+
+    @property
+    def worlds(self) -> Worlds:
+        """The running worlds, as a copy."""
+        return self._now.rules.unpack(self.packed)
+
+    @property
+    def packed(self) -> Packed:
+        """The running worlds packed into two arrays (``physics.columns``). Not a copy: do not change them."""
+        return self._now.state.packed
+
+    @property
+    def wanted_mps2(self) -> Floats:
+        """Acceleration that each vehicle commanded in the last step, [n, N] m/s2. Not a copy."""
+        return self._now.state.wanted
+
+    @property
+    def ledger(self) -> Ledger:
+        """Harm and number of impacts of the running episodes so far, by pair of vehicles, as a copy."""
+        return self._now.state.ledger
+
+    @property
+    def ended(self) -> Bools:
+        """Whether each episode has ended, [n]."""
+        return self._now.state.ended
+
+    @property
+    def steps(self) -> Ints:
+        """Number of steps that each running episode has taken, [n]."""
+        return self._now.state.steps
+
+    @property
+    def roster(self) -> Roster:
+        """The number of the world in each row, and the worlds that the physics could not advance."""
+        return self._now.roster
+
+    @property
+    def seed(self) -> int:
+        """Seed of the training stream: the endless list of worlds from which new episodes come."""
+        return self._now.stream.seed
+
+    @property
+    def observation(self) -> ObservationSpec:
+        """The observation of all learners. Raises ``InvalidInput`` if learners observe different features."""
+        return common_observation(self.observations, self.scenario)
+
+    @property
+    def memories(self) -> dict[int, Memory]:
+        """Vehicle index -> memory of its script, for the scripts that have a memory."""
+        return self._now.state.memories
+
+    @property
+    def guarded(self) -> Any:
+        """Memory of the guard; None without a guard, or before its first episode."""
+        return self._now.state.guarded
+
+    @property
+    def ruling(self) -> Ruling | None:
+        """The guard's answer in the last step; None without a guard or before the first step."""
+        return self._now.ruling
+
+    @property
+    def in_pieces(self) -> bool:
+        """Whether a script follows a braking profile, a list of intervals of constant command."""
+        return bool(self._now.rules.pieces.shape[1] > 0)

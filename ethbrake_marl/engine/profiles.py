@@ -1,4 +1,8 @@
-"""Whole command profiles of some vehicles, and the harm they lead to: the problem that search and shield solve."""
+"""Command profiles of whole episodes and their harm: the optimisation problem that searches and shields solve.
+
+A *profile* holds the commands of the controlled vehicles from the first decision to the horizon, in at most K phases. A
+*phase* is an interval of constant command that ends at a decision.
+"""
 
 from __future__ import annotations
 
@@ -22,39 +26,45 @@ MOST_PHASES = 12
 
 
 class SearchWorld(NamedTuple):
-    """One world as candidates run in it."""
+    """One world of a ``ProfileProblem``, prepared for running candidate profiles."""
 
-    episode: Episode
-    bounds: Floats  # [C, 2] smallest and largest command (m/s2)
-    random: UInt64s  # [1] state of the world's random numbers
+    episode: Episode  # working memory in which the world is simulated (``physics.episode``)
+    bounds: Floats  # [C, 2] smallest and largest command of each controlled vehicle (m/s2)
+    random: UInt64s  # [1] state of the world's random generator
 
 
 @compiled
 def copy_rows(rows: Floats, to_rows: Floats, n: int) -> None:
-    """Copy the first ``n`` rows. (An assignment of slices compiles ten times longer, for its message of an error.)"""
+    """Copy the first ``n`` rows of ``rows`` [>= n, c] to those of ``to_rows``, element by element.
+
+    An assignment of slices would take ten times longer to compile, because of its error message.
+    """
     for k in range(n):
         for c in range(rows.shape[1]):
             to_rows[k, c] = rows[k, c]
 
 
-TIME_STEP_S = 0.1  # between two decisions, where nobody says otherwise
+TIME_STEP_S = 0.1  # default time between two decisions
 
 
 class ProfileProblem(NamedTuple):
-    """Whose commands are chosen, in which worlds, on which grid of decisions. Build it with ``profile_problem``."""
+    """The problem of choosing command profiles of the controlled vehicles in n worlds. Made by ``profile_problem``.
 
-    vehicles: Ints  # [C] controlled, index from 0; in lines with an obstacle from 1, it being vehicle 0 of every column
-    start: Floats  # [n, S] at the first decision
-    clock: Floats  # [n, CLOCK_WIDTH]
-    bounds: Floats  # [n, C, 2] m/s2
-    command: Floats  # [n, N] of the others
-    latency: Floats  # [n, N]
-    mass: Floats  # [n, N]
-    limit: Floats  # [n, N]
-    brake_rate: Floats  # [n, N] m/s3
-    release_rate: Floats  # [n, N]
-    pieces: Floats  # [n, N, 2 K]
-    identity: UInt64s  # [n]
+    If a line has an obstacle, it is vehicle 0 of every column, and the vehicles' indices start from 1.
+    """
+
+    vehicles: Ints  # [C] indices of the controlled vehicles
+    start: Floats  # [n, S] state at the first decision, as ``physics.episode.save`` stores it
+    clock: Floats  # [n, CLOCK.WIDTH] times and numbers of the decisions, and settings; see ``physics.episode``
+    bounds: Floats  # [n, C, 2] smallest and largest command of the controlled vehicles (m/s2)
+    command: Floats  # [n, N] commands of the other vehicles, 0 for the controlled ones (m/s2)
+    latency: Floats  # [n, N] latencies (s)
+    mass: Floats  # [n, N] masses (t)
+    limit: Floats  # [n, N] speed limits (m/s)
+    brake_rate: Floats  # [n, N] rates at which brakes build up (m/s3)
+    release_rate: Floats  # [n, N] rates at which brakes are released (m/s3)
+    pieces: Floats  # [n, N, 2 K] braking profiles of scripts with K intervals of constant command, as in ``Vehicles``
+    identity: UInt64s  # [n] hash of each world's problem, see ``identities``
 
     @property
     def n(self) -> int:
@@ -62,12 +72,12 @@ class ProfileProblem(NamedTuple):
         return len(self.start)
 
     def take(self, rows: Ints) -> ProfileProblem:
-        """That of some of the worlds."""
+        """Return the problem of the worlds with the indices ``rows`` only."""
         arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._fields[1:]}
         return self._replace(**arrays)
 
     def put(self, rows: Ints, new: ProfileProblem) -> ProfileProblem:
-        """A copy with the worlds of a ``new`` one in these rows."""
+        """Return a copy in which the worlds with the indices ``rows`` are replaced by those of ``new``, in order."""
         arrays: dict[str, Any] = {name: getattr(self, name).copy() for name in self._fields[1:]}
         for name, array in arrays.items():
             array[rows] = getattr(new, name)
@@ -75,11 +85,16 @@ class ProfileProblem(NamedTuple):
 
     @property
     def last_step(self) -> Ints:
-        """Number of decisions up to the horizon, [n]."""
+        """Number of decisions before the horizon, [n]."""
         return self.clock[:, CLOCK.LAST_STEP].astype(np.int64)
 
     def constant(self, commands_mps2: Floats) -> Profiles:
-        """Profiles [n * Q] that hold the given commands [n, Q, C], divided into phases for a search to change."""
+        """Return profiles that hold constant commands.
+
+        ``commands_mps2`` [n, Q, C] are Q constant commands for each world and controlled vehicle. The result has n * Q
+        profiles, in the order of the first two axes. Each is divided into ``MOST_PHASES`` phases, all with the same
+        command, so that a search can change them later.
+        """
         n, Q, C = commands_mps2.shape
         borders = np.array([2, 5, 9, 14, 20] + (MOST_PHASES - 5) * [np.iinfo(np.int64).max])
         ends = np.minimum(borders, self.last_step[:, np.newaxis])
@@ -91,19 +106,20 @@ class ProfileProblem(NamedTuple):
         )
 
     def even_grid(self, number: int) -> Floats:
-        """``number`` commands from each vehicle's least to its greatest, evenly spaced, both included.
+        """Return ``number`` evenly spaced commands from each vehicle's smallest to its largest, [n, number, C] m/s2.
 
-        [n, number, C] m/s2. ``low + (high - low)`` may lie an ulp beyond ``high``, so the greatest is taken as it is.
+        Both ends are included. ``low + (high - low)`` may be an ulp above ``high``, so the result is limited to
+        ``high``.
         """
         low, high = self.bounds[:, np.newaxis, :, 0], self.bounds[:, np.newaxis, :, 1]
         share = np.linspace(0.0, 1.0, number)[:, np.newaxis]
         return np.asarray(np.minimum(low + share * (high - low), high), np.float64)
 
     def follow(self, profiles: Profiles) -> tuple[Floats, Floats]:
-        """First-impact and total harm [n] of one profile per world, as the engine counts it, to the same bits.
+        """Return first-impact and total harm of one profile per world, each [n] m2/s2.
 
-        Raises ``InvalidInput`` for profiles that do not fit the problem or exceed a capacity, ``PhysicsError`` naming
-        the worlds in which a check of the kernel failed.
+        They equal the engine's to the bit. Raises ``InvalidInput`` for profiles that do not fit the problem or exceed a
+        capacity, ``PhysicsError`` naming the worlds in which a check of the physics failed.
         """
         self.check(profiles)
         n = self.n
@@ -115,7 +131,11 @@ class ProfileProblem(NamedTuple):
         return first, total
 
     def check(self, profiles: Profiles) -> None:
-        """Raise ``InvalidInput`` unless there is one profile per world, within the capacities, its phases in order."""
+        """Raise ``InvalidInput`` for profiles that do not fit this problem.
+
+        There must be one profile per world, with commands within the capacities, and phases that end in order, the last
+        one at the last decision.
+        """
         n, C = self.n, len(self.vehicles)
         K = profiles.ends.shape[-1]
         if profiles.ends.shape != (n, K) or profiles.commands_mps2.shape != (n, K, C):
@@ -147,14 +167,24 @@ def profile_problem(
     deciders: Sequence[int] | None = None,
     written_out: bool = False,
 ) -> ProfileProblem:
-    """The problem of choosing the whole profiles of ``vehicles`` (indices from 0) so as to do the least harm.
+    """Return the problem of choosing whole command profiles of some vehicles with the least harm.
 
-    The first decision falls on the smallest latency of the ``deciders`` (default: ``vehicles``) or on the worlds' time,
-    whichever is later; one follows every ``time_step_s``. Where any world has an obstacle ahead, it is written out as a
-    vehicle in front (``Worlds.with_obstacle``; in the others one that nobody reaches): all columns of the problem are
-    those of that line. The other vehicles follow ``others_mps2`` [n, N] (default: full braking; the columns of
-    ``vehicles`` are ignored). Raises ``InvalidInput`` for no vehicle, one given twice or not there, an unknown count, a
-    command beyond capacity, or a horizon before the first decision.
+    Args:
+        worlds: n worlds.
+        vehicles: indices of the controlled vehicles (0 = front).
+        harm_count: impacts whose harm is minimised: ``first`` (each pair's first) or ``total`` (all).
+        horizon_s: end of the episodes, s.
+        time_step_s: time between two decisions, s.
+        others_mps2: constant commands of the other vehicles, [n, N] m/s2 (columns of ``vehicles`` are ignored); None:
+            full braking.
+        deciders: indices of vehicles; the first decision is at their smallest latency, or at the worlds' time if that
+            is later. None: ``vehicles``.
+        written_out: describe an obstacle ahead as a vehicle in front (``Worlds.with_obstacle``) even if no world has
+            one; worlds without one get one out of reach. If any world has one, this is always done.
+
+    Raises ``InvalidInput`` for no vehicle, a repeated or unknown one, an unknown harm count, a command beyond capacity,
+    or a horizon before the first decision.
+
     """
     chosen = _checked_vehicles(vehicles, worlds.N)
     check_harm_count(harm_count)
@@ -176,7 +206,7 @@ def profile_problem(
             others_mps2=np.concatenate([np.zeros((len(command), 1)), command], axis=1),
             deciders=None if deciders is None else [i + 1 for i in deciders],
         )
-        if not obstacle.all():  # a world is searched as it is beside any others
+        if not obstacle.all():  # the identity of a world must not depend on the other worlds
             free = np.flatnonzero(~obstacle)
             found.identity[free] = profile_problem(
                 worlds.take(free), vehicles, harm_count=harm_count, horizon_s=horizon_s, time_step_s=time_step_s,
@@ -207,10 +237,11 @@ def profile_problem(
 
 
 def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -> UInt64s:
-    """What tells one world's problem from another's, [n]: 8 bytes of BLAKE2b over all that the harm depends on.
+    """Return a hash of each world's problem, [n]: 8 bytes of BLAKE2b over everything that the harm depends on.
 
-    State and parameters of the world, the other vehicles' commands, the decisions (first, step, number), the horizon
-    and the controlled vehicles; not the count.
+    That is the world's state and parameters, the other vehicles' ``command`` [n, N], the times of decisions and the
+    horizon in ``clock`` [n, CLOCK.WIDTH], and the indices ``vehicles`` of the controlled vehicles; but not the harm
+    count.
     """
     packed = Packed.of(worlds)
     (state, params), column = packed, packed.column
@@ -220,20 +251,20 @@ def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -
         state[:, [column.time]],
         state[:, column.speed : column.command],
         state[:, column.gap : column.harm],
-        params[:, : column.brake_rate],  # the news of others changes no harm
+        params[:, : column.brake_rate],  # without messages, which do not affect the harm
         command,
         clock[:, [CLOCK.START, CLOCK.TIME_STEP, CLOCK.LAST_STEP, CLOCK.HORIZON]],
         who,
     ]
-    rows = np.ascontiguousarray(np.concatenate(parts, axis=1) + 0.0, "<f8")  # + 0.0: one zero, not two
-    slow = worlds.vehicles.build_up  # others have the names that they had before there were rates
+    rows = np.ascontiguousarray(np.concatenate(parts, axis=1) + 0.0, "<f8")  # + 0.0 turns -0.0 into 0.0
+    slow = worlds.vehicles.build_up  # other worlds keep the hashes of versions without build-up rates
     forces = np.concatenate(
         [state[:, column.command : column.previous], params[:, column.brake_rate : column.own_latency]], 1
     )
     further = [forces[k].tobytes() if slow[k] else b"" for k in range(worlds.n)]
     for k in np.flatnonzero(worlds.vehicles.in_pieces):
         pieces = worlds.vehicles.pieces[k]
-        there = np.isfinite(pieces)  # not how many others of the batch have
+        there = np.isfinite(pieces)  # without the padding, which depends on the other worlds
         further[k] += there.sum(axis=1).astype("<i8").tobytes() + pieces[there].astype("<f8").tobytes()
     digests = [hashlib.blake2b(row.tobytes() + further[k], digest_size=8).digest() for k, row in enumerate(rows)]
     return np.frombuffer(b"".join(digests), "<u8").astype(np.uint64)
@@ -247,28 +278,31 @@ def _checked_vehicles(vehicles: Sequence[int], N: int) -> Ints:
 
 
 class Profiles(NamedTuple):
-    """One profile per world: ``commands_mps2[k, j]`` from step ``ends[k, j - 1]`` to ``ends[k, j]`` of the decisions.
+    """One profile per world: ``commands_mps2[k, j]`` is in force from decision ``ends[k, j - 1]`` to ``ends[k, j]``.
 
-    Phases beyond a world's last one are empty: they too end at the last step.
+    Phases after a world's last one are empty: they also end at the last step.
     """
 
-    ends: Ints  # [n, K]
-    commands_mps2: Floats  # [n, K, C]
+    ends: Ints  # [n, K] number of the decision at which each phase ends
+    commands_mps2: Floats  # [n, K, C] commands in each phase
 
     def at(self, step: Ints) -> Floats:
-        """The commands in force in these steps [n]: [n, C] m/s2; beyond the last step its command goes on."""
+        """Return the commands in force after decision number ``step`` [n] of each world, [n, C] m/s2.
+
+        Decisions are numbered from 0. The last command continues after the last phase.
+        """
         phase = np.minimum((self.ends <= step[:, np.newaxis]).sum(axis=1), self.ends.shape[1] - 1)
         return np.asarray(self.commands_mps2[np.arange(len(phase)), phase], np.float64)
 
     def take(self, rows: Ints | slice) -> Profiles:
-        """Those of some worlds."""
+        """Return the profiles of the worlds with the indices ``rows``."""
         return Profiles(self.ends[rows], self.commands_mps2[rows])
 
     @staticmethod
     def padded(parts: Sequence[Profiles], least: int) -> list[Profiles]:
-        """The same profiles, all with as many phases (at least ``least``): empty ones are added.
+        """Return copies of several sets of profiles, all with the same number of phases, at least ``least``.
 
-        In their own memory.
+        The added phases are empty: they end where the last one does.
         """
         width = max([least, *(part.ends.shape[1] for part in parts)])
         return [
@@ -280,14 +314,17 @@ class Profiles(NamedTuple):
         ]
 
     def grown(self, n: int) -> Profiles:
-        """These and as many meaningless ones as make ``n`` in all; in their own memory."""
+        """Return a copy with ``n`` rows, at least as many as now; the contents of the added rows are meaningless."""
         more = n - len(self.ends)
         return Profiles(np.pad(self.ends, ((0, more), (0, 0))), np.pad(self.commands_mps2, ((0, more), (0, 0), (0, 0))))
 
 
 @compiled
 def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> SearchWorld:
-    """The surroundings of world k, with room to work in; ``random`` [n]: the states of all worlds' random numbers."""
+    """Return world number ``k`` of a problem, with working memory of its own.
+
+    ``random`` [n] holds the states of all worlds' random generators; the result refers to entry ``k``.
+    """
     N = problem.mass.shape[1]
     table = np.zeros((rows_for(problem.pieces.shape[2]), N))
     for i in range(N):
@@ -301,7 +338,11 @@ def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> Searc
 def follow_worlds(
     problem: ProfileProblem, ends: Ints, commands: Floats, first: Floats, total: Floats, failed: Bools
 ) -> None:
-    """Fill ``first`` and ``total`` [n] with the harm of one profile per world, and ``failed`` [n] where it ended."""
+    """Simulate one profile in each world; write the harm to ``first`` and ``total`` [n] m2/s2.
+
+    ``ends`` [n, K] and ``commands`` [n, K, C] are the fields of ``Profiles``. ``failed`` [n] is set to True for a world
+    in which a check of the physics failed.
+    """
     start, no_random = problem.start, np.zeros(problem.start.shape[0], np.uint64)
     for k in range(start.shape[0]):
         episode = make_search_world(problem, k, no_random).episode

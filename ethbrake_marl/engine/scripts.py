@@ -1,32 +1,36 @@
-"""Scripts: what drives a vehicle that does not learn, and what it remembers."""
+"""Scripts: the drivers of vehicles that do not learn, and their memory."""
 
 from __future__ import annotations
 
 from typing import Any, Protocol
 
-SAMPLED_AT_ONCE = 1024  # training worlds are drawn in blocks of at least this many
+SAMPLED_AT_ONCE = 1024  # smallest number of training worlds that are drawn together
 
 
 class Script(Protocol):
-    """Drives one vehicle in every world of a batch of ``n``. An ``Agent`` is one with a name.
+    """Driver of one vehicle in every world of a batch of ``n``. An ``Agent`` is a script with a name.
 
-    It is asked when the latency of its vehicle has elapsed, and every time step from then on, whoever learns.
+    A script is called when the latency of its vehicle has elapsed, and at every time step from then on.
 
-    One that remembers nothing has ``act(worlds, vehicle)``, which gives the wanted signed acceleration of ``vehicle``
-    (index from 0) in every world, [n] m/s2. One that remembers has two methods, and keeps nothing in itself:
+    A script without memory has ``act(worlds, vehicle)``, which returns the wanted signed acceleration of ``vehicle``
+    (index from 0) in every world, [n] m/s2. A script with memory has two methods, and stores nothing in its attributes:
 
-    - ``begin(alert, vehicle, scripts) -> memory``: episodes start in the worlds ``alert``, at t = 0. ``scripts`` drive
-      the vehicles that are scripted, by index; all others are free to decide.
-    - ``act(worlds, memory, vehicle) -> (command, memory)``: the command [n] m/s2, and what it remembers then. Not each
-      world need have a decision now: of the others neither is used.
+    - ``begin(alert, vehicle, scripts) -> memory``: episodes start in the worlds ``alert``, at t = 0. ``scripts`` maps
+      the index of each scripted vehicle to its script; all other vehicles decide freely.
+    - ``act(worlds, memory, vehicle) -> (command, memory)``: the command [n] m/s2, and the new memory. Worlds without a
+      decision at this moment may be included; their results are ignored.
 
-    A memory is None, an array whose first axis is the world, or a tuple or mapping of such. Whoever runs the episodes
-    owns it: takes rows of it, begins some anew, tries what would be. So it is never changed in place. What a mapping
-    holds as ``predicted_harm`` [n] (m2/s2) is what the agent expected when the episode began.
+    A memory is None, an array whose first axis is the world, or a tuple or mapping of memories. The caller owns it: it
+    selects rows, restarts some of them, or tries out what would happen. So a script must never change a memory in
+    place. If a mapping contains ``predicted_harm`` [n] (m2/s2), it is the harm that the agent predicted when the
+    episode began.
 
-    With an attribute ``state_free = True`` it is asked only once per episode, right after ``begin``: its command is
-    fixed at the alert and never changes.
+    A script with the attribute ``state_free = True`` is called only once per episode, right after ``begin``: its
+    command is fixed at the alert.
     """
 
     def act(self, *args: Any, **kwargs: Any) -> Any:
-        """The command [n] m/s2, of one that remembers with its memory."""
+        """Return the commanded acceleration in n worlds, [n] m/s2; a script with memory also returns its new memory.
+
+        Arguments are ``(worlds, vehicle)`` without, and ``(worlds, memory, vehicle)`` with memory.
+        """

@@ -1,4 +1,4 @@
-"""The stream of episodes: worlds at the alert, made ready for their first decision."""
+"""The stream of episodes: worlds drawn at the alert and advanced to their first decision."""
 
 from __future__ import annotations
 
@@ -24,57 +24,73 @@ from ethbrake_marl.physics.state import Floats, Ints, Worlds
 
 
 class Start(NamedTuple):
-    """Worlds ready for their first decision."""
+    """Worlds of new episodes, advanced from the alert to their first decision."""
 
-    origin: Worlds  # at t = 0: these worlds are its ``first``, ``first + 1``, ...
-    first: int
-    packed: Packed  # at the first decision
-    clock: Floats  # [n, CLOCK_WIDTH]
-    wanted: Floats  # [n, N] commands of the state-free scripts, 0 for all others
+    origin: Worlds  # worlds at the alert, t = 0; these n worlds and possibly others
+    first: int  # row in ``origin`` of the first of these worlds; the others follow it
+    packed: Packed  # the n worlds at the first decision
+    clock: Floats  # [n, CLOCK_WIDTH] times and steps of the episodes, see ``compiled_step``
+    wanted: Floats  # [n, N] commands of the scripts whose command never changes, 0 for all other vehicles (m/s2)
 
     @property
     def alert(self) -> Worlds:
-        """These worlds at the alert, t = 0."""
+        """These n worlds at the alert, t = 0."""
         return self.origin.take(np.arange(self.first, self.first + len(self.clock)))
 
     def part(self, first: int, count: int) -> Start:
-        """``count`` worlds of these, from ``first`` on."""
+        """Return ``count`` of these worlds, starting from row ``first``."""
         rows = slice(first, first + count)
         packed = Packed(self.packed.state[rows], self.packed.params[rows])
         return Start(self.origin, self.first + first, packed, self.clock[rows], self.wanted[rows])
 
 
 class FailedWorld(UserWarning):
-    """A running episode was cut off: its world could not be advanced. (The rest of the batch goes on.)"""
+    """Warning: a world could not be advanced, so its episode was cut off. The rest of the batch continues."""
 
 
 class Roster:
-    """Which world of the stream stands in each row of a batch, and which of them could not be advanced.
+    """Record of which world runs in each row of a batch, and of the rows whose worlds could not be advanced.
 
-    ``first`` is the number of row 0's world, the others follow; None: the worlds were given, and have no number.
+    Args:
+        n: number of rows.
+        seed: seed of the stream of worlds.
+        first: number in the stream of row 0's world; the other rows follow. None: the caller passed the worlds, which
+            have no numbers.
+        given: the worlds that the caller passed, at the alert; None: none.
+
     """
 
     def __init__(self, n: int, seed: int, first: int | None, given: Worlds | None = None) -> None:
-        self.failed: dict[int, str] = {}  # by row, and why; until a new episode begins there
-        self.warns = True  # with a ``FailedWorld`` that names the world; off: the caller looks at ``failed``
+        self.failed: dict[int, str] = {}  # row -> reason, until a new episode begins in that row
+        self.warns = True  # whether to warn with ``FailedWorld``; if not, the caller must check ``failed``
         self.seed = seed
-        self.given = given  # the worlds that were given, at the alert: where ``numbers`` are -1
-        self.numbers = np.full(n, -1, np.int64) if first is None else first + np.arange(n)  # by row; -1: given
+        self.given = given  # worlds passed by the caller, at the alert; valid in rows where ``numbers`` is -1
+        self.numbers = np.full(n, -1, np.int64) if first is None else first + np.arange(n)  # [n]; -1: passed
 
     def apart(self) -> Roster:
-        """One that goes on from here without changing this one."""
+        """Return an independent copy."""
         new = copy.copy(self)
         new.failed, new.numbers = dict(self.failed), self.numbers.copy()
         return new
 
     def renew(self, rows: Ints, first: int) -> None:
-        """World ``first`` of the stream and those after it now stand in these rows."""
+        """Record that new worlds run in the rows with the indices ``rows``.
+
+        They are the worlds ``first``, ``first + 1``, ... of the stream.
+        """
         self.numbers[rows] = first + np.arange(len(rows))
         for row in self.failed.keys() & rows.tolist() if self.failed else ():
             del self.failed[row]
 
     def mark(self, status: Ints, from_s: Floats, until_s: Floats) -> None:
-        """Enter the worlds with a ``status``: a step from ``from_s`` to ``until_s`` [n] could not advance them."""
+        """Record the worlds that a step could not advance, and warn of them with ``FailedWorld``.
+
+        Args:
+            status: [n] status of the physics; 0 for a world without failure.
+            from_s: [n] times at which the step began, s.
+            until_s: [n] times at which it would have ended, s.
+
+        """
         new = FLAG.failure(np.where(status == 0, FLAG.DONE, status), from_s, until_s).worlds
         self.failed |= new
         for row, reason in new.items() if self.warns else ():
@@ -84,9 +100,17 @@ class Roster:
 
 
 class Stream:
-    """The training worlds of a seed, one after the other, each ready for its first decision.
+    """The training worlds of a seed, one after the other, each advanced to its first decision.
 
-    Learners and scripts with a memory coast until then: whoever uses them moves their worlds anew (``moved``).
+    Until the first decision, learners and scripts with a memory coast. An engine whose scripts decide earlier advances
+    the worlds again from the alert.
+
+    Args:
+        scenario: the scenario from which worlds are drawn.
+        deciders: indices of the vehicles (0 = front); the first decision is when the first of them may act.
+        scripts: index of each scripted vehicle -> its script.
+        seed: seed of the stream.
+
     """
 
     def __init__(self, scenario: Game, deciders: Sequence[int], scripts: Mapping[int, Script], seed: int) -> None:
@@ -94,11 +118,12 @@ class Stream:
         self._deciders = list(deciders)
         self._state_free = {i: script for i, script in scripts.items() if is_state_free(script)}
         self._pieces = {i: getattr(script, "braking_pieces", ()) for i, script in scripts.items()}
-        self.known = {i: script for i, script in scripts.items() if i not in self._deciders}  # to who looks ahead
+        # scripts that are passed to each script's ``begin``
+        self.known = {i: script for i, script in scripts.items() if i not in self._deciders}
         self.restart(seed)
 
     def restart(self, seed: int, position: int = 0) -> None:
-        """Go to a world of ``seed``, the first one where no other is named."""
+        """Continue with world number ``position`` of the stream of ``seed``."""
         self.seed, self._drawn = seed, position
         self._pool: Start | None = None
         self._next = 0
@@ -109,7 +134,7 @@ class Stream:
         return self._drawn - (0 if self._pool is None else len(self._pool.clock) - self._next)
 
     def take(self, count: int) -> Start:
-        """The next ``count`` worlds."""
+        """Return the next ``count`` worlds at their first decision, and move on in the stream."""
         if self._pool is None or self._next + count > len(self._pool.clock):
             self._fill(count)
         assert self._pool is not None
@@ -118,10 +143,10 @@ class Stream:
         return taken
 
     def _fill(self, count: int) -> None:
-        """Draw and prepare more worlds behind those that are left.
+        """Draw and prepare at least ``count`` more worlds; worlds that were not taken yet come first.
 
-        One that cannot be advanced to its first decision gives its place to the next one that can; a ``FailedWorld``
-        warning names it. So worlds keep their places in the stream, and a training goes on.
+        A world that cannot be advanced to its first decision is replaced by the next one that can, with a
+        ``FailedWorld`` warning. So the other worlds keep their positions in the stream, and a training continues.
         """
         first, size = self.position, max(4 * count, SAMPLED_AT_ONCE)
         alert = self._scenario.sample(size, self.seed, first=self._drawn, channel="training").worlds
@@ -139,7 +164,10 @@ class Stream:
         self._drawn += size
 
     def prepare(self, alert: Worlds) -> Start:
-        """Worlds at t = 0, made ready for their first decision. Raises ``InvalidInput`` if nobody may ever decide."""
+        """Return the worlds ``alert`` (at t = 0) advanced to their first decision.
+
+        Raises ``InvalidInput`` if the first decision of a world is not before the horizon.
+        """
         alert = alert.play_pieces(self._pieces)
         clock = np.zeros((alert.n, CLOCK_WIDTH))
         clock[:, START] = alert.first_decision_s(self._deciders)
@@ -157,7 +185,7 @@ class Stream:
 
 
 def check_alert(worlds: Worlds, n: int, vehicles: int) -> None:
-    """Refuse worlds, with ``InvalidInput``, that are not ``n`` lines of ``vehicles`` at the alert: t = 0, no impact."""
+    """Raise ``InvalidInput`` unless there are ``n`` lines of ``vehicles`` vehicles, at t = 0 and without any impact."""
     if (worlds.n, worlds.N) != (n, vehicles):
         raise InvalidInput(
             f"reset: {count_of(worlds.n, 'world')} of {worlds.N} vehicles are given; {n} of {vehicles} vehicles needed"
@@ -170,13 +198,20 @@ def check_alert(worlds: Worlds, n: int, vehicles: int) -> None:
 
 
 def moved(alert: Worlds, wanted: Floats, start_s: Floats) -> Packed:
-    """Worlds at t = 0 moved to their first decision, harm on the way included."""
+    """Return worlds advanced from the alert to their first decision, packed together with the harm up to then.
+
+    Args:
+        alert: n worlds at t = 0.
+        wanted: constant commands, [n, N] m/s2.
+        start_s: times of the first decisions, [n] s.
+
+    """
     after, impacts = advance(alert, wanted, until_s=start_s)
     return packed_with(after, impacts)
 
 
 def packed_with(worlds: Worlds, harm: Impacts | Ledger) -> Packed:
-    """Worlds, and the harm so far, as rows."""
+    """Return worlds packed into two arrays (``physics.columns``), with ``harm`` as their harm so far."""
     packed = Packed.of(worlds)
     column, pairs = packed.column, worlds.N - 1
     for group, values in enumerate((harm.first_impact_harm, harm.total_harm, harm.count)):

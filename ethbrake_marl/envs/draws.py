@@ -1,7 +1,7 @@
-"""The draws behind the worlds of an environment: every quantity at the alert, type and scenario, as flat columns.
+"""The random draws behind the worlds of an environment: initial states, vehicle types and scenarios, as columns.
 
-Worlds are pure functions of scenario, seed and number, so nothing is kept while episodes run: it costs nothing until
-somebody asks, and then the worlds are drawn again.
+Worlds are pure functions of scenario, seed and number. So nothing is stored while episodes run; the worlds are drawn
+again on request.
 """
 
 from __future__ import annotations
@@ -18,19 +18,20 @@ from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import as_scenario
 
-_MOST_APART = 1024  # numbers between two worlds that are still drawn in one go
+_MOST_APART = 1024  # largest distance between the numbers of two worlds that are drawn in one call
 
 Columns = dict[str, NDArray[Any]]
 
 
 def describe_worlds(engine: Engine) -> Columns:
-    """What each running world was drawn as: column -> values [n].
+    """Return the random draw of each running world, as columns: ``{"gap_1_m": [n], "mass_2_t": [n], ...}``.
 
-    Quantities of the world at the alert, named as in a table of initial states (``gap_1_m``, ``mass_2_t``); where there
-    is such, ``scenario`` of a mixture and ``vehicle_2_type``; and ``world_seed`` and ``world`` as in the infos. Where
-    worlds were given and others have taken the places of some since, types are of these only. Raises ``InvalidInput``
-    for worlds of which nobody knows: given ones after a snapshot was restored, or one that could not be advanced to its
-    first decision, where another one stands in its place.
+    There is a column for each quantity of the world at the alert (the moment at which the episode begins), named as in
+    a table of initial states. A mixture adds ``scenario``, vehicle types add ``vehicle_2_type`` for worlds that were
+    drawn. ``world_seed`` and ``world`` are as in the infos.
+
+    Raises ``InvalidInput`` for worlds whose draw is unknown. These are worlds that the caller passed, after a snapshot
+    was restored, and a world that could not be advanced to its first decision, so that another world replaced it.
     """
     numbers, given = engine.roster.numbers, engine.roster.given
     named = {"world_seed": np.full(engine.n, engine.roster.seed), "world": numbers.copy()}
@@ -54,7 +55,11 @@ def describe_worlds(engine: Engine) -> Columns:
 
 
 def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
-    """These worlds of the training stream, in the order of ``numbers``; ``InvalidInput`` if they do not run here."""
+    """Draw the worlds with the numbers ``numbers`` in the training stream again, and return them in this order.
+
+    Raises ``InvalidInput`` if the running worlds of the engine differ from them: a world that could not be advanced to
+    its first decision was replaced by another world.
+    """
     ordered, places = np.unique(numbers, return_inverse=True)
     breaks = np.flatnonzero(np.diff(ordered) > _MOST_APART) + 1
     parts, scenario = [], as_scenario(engine.scenario)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.infos import OneWorld, Report
 from ethbrake_marl.envs.making import AnyScenario, action_box, feature_box, learner_actions, make_engine, only_learner
-from ethbrake_marl.envs.motion import Viewer
+from ethbrake_marl.envs.viewer import Viewer
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec
 from ethbrake_marl.game.rewards import Reward, RewardParams
@@ -25,22 +25,28 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 class Specified:
-    """What Gymnasium makes by an id: ``spec`` says how, in settings that JSON keeps."""
+    """Mixin for environments that ``gymnasium.make`` makes: its ``spec`` stores settings only as plain data for JSON.
 
-    engine: Engine
-    max_episode_steps: int | None = None
-    _spec: EnvSpec | None = None
+    A scenario object, for instance, becomes a mapping, and a path becomes a text.
+    """
+
+    engine: Engine  # the engine that moves the worlds, set by the environment
+    max_episode_steps: int | None = None  # largest number of steps of an episode; None: the horizon limits it alone
+    _spec: EnvSpec | None = None  # the value of ``spec``
 
     @property
     def spec(self) -> EnvSpec | None:
-        """How it was made; None where no id was used. No episode has more than its ``max_episode_steps``."""
+        """Gymnasium's record of how the environment was made; None if it was not made by an id.
+
+        No episode is longer than its ``max_episode_steps``.
+        """
         return self._spec
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
         if spec is not None:
             kwargs = {name: _plain(value) for name, value in spec.kwargs.items()}
-            if kwargs.get("learners") is not None:  # any iterable, perhaps used up
+            if kwargs.get("learners") is not None:  # may be an exhausted iterator
                 kwargs["learners"] = [self.engine.scenario.vehicle_names[i] for i in self.engine.learners]
             scenario = self.engine.scenario
             from_alert = int(Decisions(np.zeros(1), scenario.time_step_s).before(scenario.horizon_s)[0])
@@ -49,7 +55,7 @@ class Specified:
 
 
 def _plain(setting: Any) -> Any:
-    """A setting of an environment as JSON keeps it."""
+    """Return a setting of an environment as plain data for JSON: a ``Scenario`` as a mapping, a path as a text."""
     if isinstance(setting, Scenario):
         return setting.declared()
     if isinstance(setting, RewardParams):
@@ -71,10 +77,11 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
     """One learner brakes in a line of vehicles that follow their scripts: ``gymnasium.make("EthBrake-v0")``.
 
     Observation: float32 [F], the features of ``ObservationSpec``. Action: [1] in [-1, 1]; -1 full braking capacity, 0
-    coasts, +1 full driving capacity. Terminated: all at rest and no command that would move one. Truncated: the
-    horizon. Infos: see docs/infos.md. ``reset(seed=s)`` starts the stream of worlds of s, ``reset()`` goes on in
-    it; ``options={"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}}`` starts from there. Raises
-    ``InvalidInput`` for more or fewer than one learner, an action outside [-1, 1], a step without an episode.
+    coasts, +1 full driving capacity. Terminated: all vehicles are at rest and no command would move one. Truncated: the
+    horizon is reached. Infos: see docs/infos.md. ``reset(seed=s)`` starts the stream of worlds of seed s; ``reset()``
+    continues in it; ``options={"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}}`` starts from that
+    state. Raises ``InvalidInput`` for more or fewer than one learner, an action outside [-1, 1], and a step without an
+    episode.
 
     Args:
         scenario: a shipped name, the path of a YAML file, or a ``Scenario``.
@@ -117,14 +124,24 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode; see docs/episodes.md."""
+        """Start an episode; return the observation and the info.
+
+        Args:
+            seed: restart the stream of worlds from the first world of this seed; None: continue in the stream.
+            options: ``{"initial_state": ...}`` or ``{"listed_world": {"seed": 7, "number": 3}}`` choose the world; see
+                docs/episodes.md.
+
+        """
         self._restart(seed, options)
         self._running = True
         self.viewer.began()
         return self._observe(), Report.of(self.engine).plain_infos(self._column)[0]
 
     def step(self, action: NDArray[Any]) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
-        """Advance by one time step."""
+        """Advance by one time step; return observation, reward, terminated, truncated and info.
+
+        ``action`` is [1] in [-1, 1]: -1 full braking capacity, 0 coasts, +1 full driving capacity.
+        """
         if not self._running:
             raise InvalidInput("step: no episode is running; call reset first")
         step = self.engine.step(learner_actions(self.engine, {self._name: action}))

@@ -1,14 +1,14 @@
-"""Infos of every interface, computed once for all vehicles of all worlds: the same keys after a reset and a step.
+"""Infos of every interface, computed once for all vehicles of all worlds. A reset and a step give the same keys.
 
-``time_s``, ``command_in_force_mps2`` (in force up to now; 0 up to the latency), ``chosen_command_mps2`` and
-``chosen_action`` (what the vehicle asked for, whoever chose it; 0 before a learner's first step), the vehicle's share
-of the harm so far under both counts, the same for the whole world, and whether anything has collided. Of the last
-step: ``cost`` (the harm it added to the line, as the reward counts impacts; for safe-RL libraries) and
-``reward_NAME``, each term of the reward before its weight; after a reset they are 0. ``world_seed`` and ``world``
-name the world, so that it can be played again (-1: it was given). Where the scenario has a ``v2x`` channel also
-``known_from_s`` [N]: from when on this vehicle acts on news of each one (infinite: never; of itself: its latency);
-and where its messages are periodic ``age_s`` [N]: how old the newest sample is that it was told of each (infinite:
-none). Behind a shield also what that reports, as ``shield_NAME``.
+``time_s``; ``command_in_force_mps2``, the command in force up to now (0 up to the latency); ``chosen_command_mps2`` and
+``chosen_action``, the command that the vehicle asked for, whoever chose it (0 before a learner's first step); the harm
+so far that the vehicle bears, under both counts; the harm of the whole world; and whether there has been an impact.
+About the last step: ``cost``, the harm that it added to the line, as the reward counts impacts (for safe-RL libraries),
+and ``reward_NAME``, each term of the reward before its weight; all are 0 after a reset. ``world_seed`` and ``world``
+identify the world, so that it can be played again (-1: passed by the caller). With a ``v2x`` channel,
+``known_from_s`` [N]: the time from which this vehicle acts on news of each vehicle (infinite: never; for itself: its
+latency). With periodic messages, ``age_s`` [N]: age of the newest received sample of each vehicle (infinite: none).
+Behind a shield, also the shield's infos, as ``shield_NAME``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ethbrake_marl.engine.compiled_step import Step
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.draws import Columns, describe_worlds
 from ethbrake_marl.envs.making import INITIAL_STATE, LISTED_WORLD, chosen_seed, wanted_worlds, warn_of_unknown
-from ethbrake_marl.envs.motion import Viewer
+from ethbrake_marl.envs.viewer import Viewer
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.actions import action_of
 from ethbrake_marl.game.harm import front_share
@@ -49,7 +49,10 @@ _FLOAT32 = np.dtype(np.float32)
 
 
 def shield_columns(engine: Engine, rows: Ints | None = None) -> Columns:
-    """What the shield in an engine reports, ``shield_NAME`` -> [n, N]; only of the worlds ``rows`` if given."""
+    """Return the infos of the engine's shield, each [n, N] with the name ``shield_NAME``; empty without a shield.
+
+    ``rows`` are the indices of the worlds to include; None: all.
+    """
     if engine.guard is None or engine.guarded is None:
         return {}
     every = slice(None) if rows is None else rows
@@ -57,26 +60,44 @@ def shield_columns(engine: Engine, rows: Ints | None = None) -> Columns:
 
 
 def plain_rows(columns: Columns, vehicles: Ints, count: int) -> list[dict[str, Any]]:
-    """Columns [n, N] as plain values by name, for each of these vehicles, world by world: ``count`` in all."""
+    """Return one dictionary of plain values for each world and vehicle: ``[{"time_s": 0.5, "collided": 0.0}, ...]``.
+
+    The list begins with the vehicles of the first world.
+
+    Args:
+        columns: name -> values [n, N].
+        vehicles: indices of the vehicles to include.
+        count: length of the list if ``columns`` is empty; its dictionaries are then empty.
+
+    """
     values = [column.take(vehicles, axis=1).reshape(-1).tolist() for column in columns.values()]
     return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)] or [{} for _ in range(count)]
 
 
 class Report(NamedTuple):
-    """What there is to tell about n worlds of N vehicles."""
+    """Everything that the infos contain at one moment, for n worlds of N vehicles."""
 
-    values: Floats  # [n, N, len(COLUMNS)]
-    cost: Floats  # [n] harm of the step (m2/s2); 0 without one
-    terms: dict[str, Floats]  # reward terms of the step, each [n], shared by all vehicles, or [n, N]; 0 without one
-    world_seed: int
-    world: Ints  # [n] numbers in the stream of that seed
-    known_from_s: Floats | None  # [n, N, N] where there is a channel
-    age_s: Floats | None  # [n, N, N] where its messages are periodic
-    shield: Columns  # each [n, N]; none without a shield
+    values: Floats  # [n, N, len(COLUMNS)] the infos named in COLUMNS, in this order
+    cost: Floats  # [n] harm that the step added to the line (m2/s2); 0 after a reset
+    terms: dict[str, Floats]  # name of a reward term -> its value in the step, [n] or [n, N]; 0 after a reset
+    world_seed: int  # seed of the stream of worlds
+    world: Ints  # [n] number of each world in the stream of that seed
+    known_from_s: Floats | None  # [n, N, N] time from which vehicle i may use messages about j (s); None: no channel
+    age_s: Floats | None  # [n, N, N] age of vehicle i's newest sample of vehicle j (s); None: no periodic messages
+    shield: Columns  # name -> info of the shield, [n, N]; empty without a shield
 
     @classmethod
     def of(cls, engine: Engine, step: Step | None = None, rows: Ints | None = None) -> Report:
-        """The engine's worlds as they are now, before any of them is renewed; only the worlds ``rows`` if given."""
+        """Return the report of an engine's worlds as they are now.
+
+        Call it after a step before ended episodes are replaced by new ones.
+
+        Args:
+            engine: the engine.
+            step: results of the last step; None after a reset.
+            rows: indices of the worlds to include; None: all.
+
+        """
         now, world = engine.state, engine.roster.numbers
         motion, params, wanted = now.motion, now.params, now.wanted
         if rows is not None:
@@ -90,7 +111,7 @@ class Report(NamedTuple):
         cost = np.zeros(len(world))
         terms = dict.fromkeys(engine.reward_terms, cost)
         if step is not None:
-            every = step.shared | step.further
+            every = step.terms
             terms = {name: every[name] for name in engine.reward_terms}
             cost = step.counted_harm
             if rows is not None:
@@ -100,11 +121,15 @@ class Report(NamedTuple):
         return cls(values, cost, terms, engine.roster.seed, world, known, age, shield_columns(engine, rows))
 
     def columns(self) -> dict[str, Floats]:
-        """What is told of every vehicle, by name, each [n, N]."""
+        """Return the infos named in ``COLUMNS``: name -> values of all vehicles [n, N]."""
         return {name: self.values[:, :, c] for c, name in enumerate(COLUMNS)}
 
     def plain_infos(self, vehicles: Ints) -> list[dict[str, Any]]:
-        """Infos of these vehicles, world by world, as plain numbers; ``chosen_action`` is an array [1]."""
+        """Return one dictionary of infos for each vehicle in ``vehicles`` (indices), world by world.
+
+        The values are plain numbers, except ``chosen_action``, an array [1], and ``known_from_s`` and ``age_s``, arrays
+        [N].
+        """
         worlds: list[list[list[Any]]] = self.values.take(vehicles, axis=1).tolist()
         numbers, costs = self.world.tolist(), self.cost.tolist()
         terms = {
@@ -143,9 +168,16 @@ class Report(NamedTuple):
         return infos
 
     def batch_info(self, vehicle: int, rows: Bools, stepped: Bools) -> dict[str, Any]:
-        """One vehicle in many worlds as Gymnasium's vector infos: ``name`` [n] and its mask ``_name`` [n].
+        """Return one vehicle's infos in all worlds in Gymnasium's vector format.
 
-        The worlds marked by ``rows`` are told of. What a step brought is 0 but in the worlds marked by ``stepped``.
+        This is ``{"time_s": [n], "_time_s": [n], ...}``; the entry with an underscore marks the worlds that have the
+        info.
+
+        Args:
+            vehicle: index of the vehicle (0 = front).
+            rows: [n] worlds that have infos.
+            stepped: [n] worlds in which values about the last step are given; they are 0 in the others.
+
         """
         columns: dict[str, NDArray[Any]] = {name: told[:, vehicle] for name, told in self.columns().items()}
         columns["collided"] = columns["collided"] == 1.0
@@ -169,7 +201,10 @@ class Report(NamedTuple):
 
 @compiled
 def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> None:
-    """Fill ``out`` [n, N, ...] with the columns of AFTER_A_STEP."""
+    """Write the infos named in ``COLUMNS`` to ``out`` [n, N, len(COLUMNS)].
+
+    ``state`` and ``params`` are packed worlds (``physics.columns``), ``wanted`` [n, N] the commands of the vehicles.
+    """
     n, N = wanted.shape
     column = columns(state)
     P, harm, mass, obstacle = N - 1, column.harm, column.mass, column.obstacle
@@ -189,7 +224,7 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
             first += state[k, harm + p]
             total += state[k, harm + P + p]
             impacts += state[k, harm + 2 * P + p]
-        if state.shape[1] > obstacle:  # after the pairs, as in the ledger
+        if state.shape[1] > obstacle:  # added after the pairs, in the same order as in the ledger
             out[k, 0, 2] += state[k, obstacle + 2]
             out[k, 0, 3] += state[k, obstacle + 3]
         for i in range(N):
@@ -204,24 +239,25 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
 
 
 class Begun:
-    """What the interfaces share: an engine in which episodes have begun, or not yet, and the seed of its worlds.
+    """Base class of all environments: it holds an engine, and starts episodes by a seed and options.
 
-    ``np_random`` and ``np_random_seed`` mean what they mean in ``gymnasium.Env``.
+    A subclass sets ``engine`` in its constructor, and calls ``_restart`` in its ``reset``. ``np_random`` and
+    ``np_random_seed`` have the same meaning as in ``gymnasium.Env``.
     """
 
-    engine: Engine
-    _known_options: Sequence[str] = (INITIAL_STATE, LISTED_WORLD)
-    _started = False
-    _goes_on = False  # a reset without a seed goes on in the running stream
+    engine: Engine  # the engine that moves the worlds
+    _known_options: Sequence[str] = (INITIAL_STATE, LISTED_WORLD)  # keys that ``options`` of ``reset`` may have
+    _started = False  # whether an episode has begun
+    _goes_on = False  # whether a reset without a seed continues the running stream
     _np_random: np.random.Generator | None = None
-    _np_random_seed: int | None = None  # -1: nobody knows, since the user set the generator
+    _np_random_seed: int | None = None  # -1: unknown, because the user set the generator
 
     @property
     def np_random(self) -> np.random.Generator:
-        """A generator for wrappers to draw from; the worlds come from ``np_random_seed`` alone.
+        """Random generator for wrappers. The worlds do not depend on it, only on ``np_random_seed``.
 
-        Once you set another generator, each ``reset`` without a seed draws the seed of its worlds from it, until a
-        ``reset`` with one.
+        After you set another generator, each ``reset`` without a seed draws the seed of its worlds from it, until a
+        ``reset`` with a seed.
         """
         if self._np_random is None:
             self._set_seed(chosen_seed(None))
@@ -236,7 +272,7 @@ class Begun:
 
     @property
     def np_random_seed(self) -> int:
-        """Seed of the stream of worlds, from fresh entropy where nobody named one; -1 once ``np_random`` was set."""
+        """Seed of the stream of worlds, chosen at random unless a seed was passed; -1 after ``np_random`` was set."""
         if self._np_random_seed is None:
             self._set_seed(chosen_seed(None))
             assert self._np_random_seed is not None
@@ -246,13 +282,20 @@ class Begun:
         self._np_random, self._np_random_seed = np.random.default_rng(seed), seed
 
     def _restart(self, seed: int | None, options: Mapping[str, Any] | None) -> None:
-        """Start new episodes in all worlds: the stream of ``seed`` from its start, or where the stream stands.
+        """Start new episodes in all worlds, as ``reset`` does.
 
-        ``options["initial_state"]`` (see ``scenario.tables.worlds_from_state``) is the start of every world instead;
-        ``options["listed_world"] = {"seed": 7, "number": 3}`` starts in that world of the list on which agents are
-        evaluated, a batch in that one and those after it. With autoreset, later episodes come from the stream. Other
-        options warn with ``UnknownResetOption`` and are ignored. Raises ``InvalidInput``, with nothing changed, for a
-        seed that is not a whole number >= 0, a bad initial state or listed world, or both of them.
+        With ``options["initial_state"]`` (see ``scenario.tables.worlds_from_state``) every world starts in that state.
+        With ``options["listed_world"] = {"seed": 7, "number": 3}`` the episode starts in that world of the evaluation
+        list; a batch starts in that world and those after it. With autoreset, later episodes come from the stream.
+        Other options cause the warning ``UnknownResetOption`` and are ignored.
+
+        Args:
+            seed: restart the stream of worlds from the first world of this seed; None: continue in the stream.
+            options: the options; None: none.
+
+        Raises ``InvalidInput``, without changing anything, for a seed that is not a whole number >= 0, an invalid
+        initial state or listed world, or both of them.
+
         """
         named = None if seed is None else chosen_seed(seed)
         if not (options is None or isinstance(options, Mapping)):
@@ -263,10 +306,14 @@ class Begun:
         self._begin(named, wanted_worlds(self.engine, options or {}))
 
     def _begin(self, seed: int | None, worlds: Worlds | None) -> None:
-        """Start these worlds, or those of the stream: of ``seed``, of the user's generator, or where it stands."""
+        """Start episodes in ``worlds`` (at the alert), or, if None, in the next worlds of a stream.
+
+        With a ``seed`` the stream starts anew from its first world. Without a seed the current stream continues; but if
+        the user has set ``np_random``, a new seed is drawn from it.
+        """
         drawn, used = seed is None and self._np_random_seed == -1, seed
         if drawn:
-            used = int(copy.deepcopy(self.np_random).integers(2**63))  # a copy: the reset may still be refused
+            used = int(copy.deepcopy(self.np_random).integers(2**63))  # from a copy, because the reset may still fail
         elif seed is None and not self._goes_on:
             used = self.np_random_seed
         self.engine.reset(seed=used, worlds=worlds)
@@ -281,23 +328,33 @@ class Begun:
             raise InvalidInput(f"{what}: no episode was started; call reset first")
 
     def describe_worlds(self) -> Columns:
-        """What each running world was drawn as: columns by name, each [worlds]; see ``describe_worlds`` of the file."""
+        """Return the random draw of each running world: column name -> values [worlds].
+
+        See ``envs.draws.describe_worlds``.
+        """
         self._check_started("describe_worlds")
         return describe_worlds(self.engine)
 
 
 class OneWorld(Begun):
-    """... of one world, which is shown by a viewer."""
+    """Base class of the environments with a single world: adds ``describe_world``, ``render`` and ``close``.
 
-    viewer: Viewer
+    A subclass sets ``viewer`` in its constructor.
+    """
+
+    viewer: Viewer  # draws the pictures of the running episode
 
     def describe_world(self) -> dict[str, Any]:
-        """What the running world was drawn as: flat numbers and texts by name; see ``describe_worlds``."""
+        """Return the random draw of the running world: name -> number or text; see ``envs.draws.describe_worlds``."""
         self._check_started("describe_world")
         return {name: column[0].item() for name, column in describe_worlds(self.engine).items()}
 
     def render(self) -> Any:
-        """What the render mode says: a frame [H, W, 3] uint8, a list of new ones, a text, or None for ``human``."""
+        """Return the picture of the present moment, in the form of the render mode.
+
+        ``rgb_array``: a frame [H, W, 3] uint8. ``rgb_array_list``: the list of frames since the last call. ``ansi``: a
+        text. ``human``: None, because the window shows every step anyway.
+        """
         return self.viewer.render()
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Build an engine for an interface: its spaces, its learners, its seeds."""
+"""Build the parts that all interfaces share: spaces, engine, actions, seeds and reset options."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario, as_scenario
 from ethbrake_marl.scenario.tables import worlds_from_state
 
-AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping: what a file would say
+AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping holds the content of a scenario file
 
 
 def feature_box(features: Sequence[Feature]) -> Box[np.float32]:
-    """Float32 box [F] with the features' bounds, which are finite."""
+    """Return the observation space of the features: a float32 box [F] with their bounds, which are finite."""
     low, high = (np.array([getattr(f, side) for f in features], np.float32) for side in ("low", "high"))
     return Box(low, high, dtype=np.float32)
 
 
 def action_box() -> Box[np.float32]:
-    """Float32 box [1]: -1 full braking capacity, 0 coasts, +1 full driving capacity."""
+    """Return the action space, a float32 box [1]: -1 full braking capacity, 0 coasts, +1 full driving capacity."""
     return Box(-1.0, 1.0, (1,), dtype=np.float32)
 
 
@@ -45,15 +45,15 @@ def make_engine(
     observation: Observation | None = None,
     seed: int = 0,
 ) -> Engine:
-    """``n`` worlds for a training loop of one's own, with any number of learners; needs no other library.
+    """Return an engine with ``n`` worlds and any number of learners, for a training loop of your own.
 
     Args:
         scenario: a shipped name, the path of a YAML file, its content as a mapping, or a ``Scenario``.
-        n: worlds that are advanced together, at least 1.
+        n: number of worlds that are advanced together, at least 1.
         learners: vehicles that learn instead of the scenario's, by name (``vehicle_2``) or index from 0; any number.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
-        observation: what every vehicle observes, or a mapping from vehicles to what each does; None: the scenario's.
-        seed: of the stream of worlds.
+        observation: what every vehicle observes, or a mapping from vehicle to its observation; None: the scenario's.
+        seed: seed of the stream of worlds.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -85,7 +85,7 @@ def make_engine(
 
 
 def only_learner(engine: Engine) -> int:
-    """Index of the one learner; ``InvalidInput`` when there is none or more than one."""
+    """Return the index of the engine's only learner (0 = front); raise ``InvalidInput`` unless there is exactly one."""
     check_one_learner(
         engine.scenario.name,
         [engine.scenario.vehicle_names[i] for i in engine.learners],
@@ -95,10 +95,11 @@ def only_learner(engine: Engine) -> int:
 
 
 def learner_actions(engine: Engine, actions: Mapping[str, Any]) -> Floats | dict[int, Floats]:
-    """The learners' actions of one world as [1, L], from an action [1] for each by name; behind a shield by vehicle.
+    """Return the learners' actions of an engine with one world, as ``Engine.step`` takes them: [1, L].
 
-    Raises ``InvalidInput`` naming the vehicle whose action is missing or misshapen; the engine checks the range. Behind
-    a shield an action may be missing.
+    ``actions`` maps vehicle names to actions [1]. Raises ``InvalidInput`` naming the vehicle whose action is missing or
+    has the wrong shape; the engine checks the range. Behind a shield, actions may be missing; then the result is a
+    mapping from vehicle index to action [1].
     """
     names, columns = engine.scenario.vehicle_names, np.empty((1, len(engine.learners)))
     for c, vehicle in enumerate(engine.learners):
@@ -123,29 +124,34 @@ RESET_MASK = "reset_mask"
 
 
 class UnknownResetOption(UserWarning):
-    """A key of ``reset``'s options is not known to this environment; it is ignored."""
+    """Warning: the environment does not know a key of ``reset``'s options, and ignores it."""
 
 
 class IgnoredAction(UserWarning):
-    """An action was passed for a vehicle that follows a script; it is ignored."""
+    """Warning: an action was passed for a vehicle that follows a script, and is ignored."""
 
 
 def chosen_seed(seed: int | None) -> int:
-    """A seed as it is; for None one of 63 bits from the operating system's entropy.
+    """Return ``seed``, or, for None, a seed of 63 bits from the operating system's entropy.
 
-    Raises ``InvalidInput`` for what is neither None nor a whole number >= 0.
+    Raises ``InvalidInput`` unless ``seed`` is None or a whole number >= 0.
     """
     if seed is None:
         entropy = np.random.SeedSequence().entropy
         assert isinstance(entropy, int)  # always, when SeedSequence chooses it itself
-        return entropy % 2**63  # fits the integers of every library that infos are handed to
+        return entropy % 2**63  # fits into the integers of every library that receives infos
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not seed >= 0:
         raise InvalidInput(f"reset: seed = {seed!r}: must be None or a whole number, at least 0")
     return int(seed)
 
 
 def wanted_worlds(engine: Engine, options: Mapping[str, Any]) -> Worlds | None:
-    """The worlds that the options ask for, one for each row; None for the stream's."""
+    """Return the worlds that the ``options`` of a reset choose, one for each of the engine's worlds.
+
+    ``initial_state`` puts all of them in one state; ``listed_world`` chooses consecutive worlds of an evaluation list.
+    Without either key the result is None: the worlds come from the stream. Raises ``InvalidInput`` if both keys are
+    present, or if one is invalid.
+    """
     if LISTED_WORLD not in options:
         if INITIAL_STATE not in options:
             return None
@@ -165,7 +171,7 @@ def wanted_worlds(engine: Engine, options: Mapping[str, Any]) -> Worlds | None:
 
 
 def warn_of_unknown(options: Iterable[str], known: Sequence[str]) -> None:
-    """One warning for all option names that are not ``known``."""
+    """Warn with ``UnknownResetOption``, once, about all names in ``options`` that are not in ``known``."""
     unknown = sorted({str(name) for name in options} - set(known))
     if unknown:
         names, right = ", ".join(unknown), ", ".join(known)

@@ -1,6 +1,4 @@
-"""PettingZoo's interface: the vehicles of one world are agents, to the end; and around it the one
-in which they act in turn (AEC).
-"""
+"""PettingZoo's interfaces: all vehicles of one world are agents, acting in parallel, or in turn (AEC)."""
 
 from __future__ import annotations
 
@@ -17,7 +15,7 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.infos import OneWorld, Report
 from ethbrake_marl.envs.making import AnyScenario, IgnoredAction, action_box, feature_box, learner_actions, make_engine
-from ethbrake_marl.envs.motion import Viewer
+from ethbrake_marl.envs.viewer import Viewer
 from ethbrake_marl.errors import InvalidInput, check_whole_number, unknown_name
 from ethbrake_marl.game.actions import checked_action
 from ethbrake_marl.game.full_state import full_state, state_features
@@ -27,13 +25,13 @@ from ethbrake_marl.physics.state import Ints
 
 
 class SeededInside:
-    """A wrapper of PettingZoo's or SB3's whose ``np_random`` is that of the environment inside, also when it is set."""
+    """Mixin for wrappers: ``np_random`` and ``np_random_seed`` are read from, and set on, the innermost environment."""
 
-    unwrapped: Any
+    unwrapped: Any  # the innermost environment
 
     @property
     def np_random(self) -> np.random.Generator:
-        """See ``EthBrakeParallelEnv.np_random``."""
+        """Random generator of the environment inside; see ``EthBrakeParallelEnv.np_random``."""
         generator: np.random.Generator = self.unwrapped.np_random
         return generator
 
@@ -43,30 +41,37 @@ class SeededInside:
 
     @property
     def np_random_seed(self) -> int:
-        """See ``EthBrakeParallelEnv.np_random_seed``."""
+        """Seed of the environment inside; see ``EthBrakeParallelEnv.np_random_seed``."""
         seed: int = self.unwrapped.np_random_seed
         return seed
 
 
 class Ordered(SeededInside, OrderEnforcingWrapper):  # type: ignore[misc]  # PettingZoo is untyped
-    """PettingZoo's, seeded inside."""
+    """PettingZoo's ``OrderEnforcingWrapper``, with ``np_random`` of the wrapped environment."""
 
     def __str__(self) -> str:
         return str(self.env)
 
 
 class InTurns(SeededInside, parallel_to_aec_wrapper):  # type: ignore[misc]  # PettingZoo is untyped
-    """As PettingZoo's, but an unusable action is refused in its agent's own turn, which stays: nothing is lost."""
+    """PettingZoo's wrapper from parallel to AEC, but an invalid action is refused at once, in its agent's own turn.
+
+    The turn stays with that agent, so that it can act again.
+    """
 
     @classmethod
     def around(cls, env: ParallelEnv[str, Observations, NDArray[Any]]) -> AECEnv[str, Observations, NDArray[Any]]:
-        """The AEC environment of a parallel one of this package, whatever wraps it; order is enforced."""
+        """Return the AEC environment of a parallel environment of this package, possibly wrapped.
+
+        PettingZoo's order enforcement is included: methods called before ``reset`` raise an error.
+        """
         return Ordered(cls(env))
 
     def step(self, action: Any) -> None:
-        """Take the action of ``agent_selection``; the last one's advances all by one step.
+        """Take the action [1] of the agent whose turn it is (``agent_selection``).
 
-        Raises ``InvalidInput`` for an unusable action of a learner, and for any but None once its episode is over.
+        After the last agent's action, all vehicles advance by one time step. Raises ``InvalidInput`` for an invalid
+        action of a learner, and for any action but None after the agent's episode has ended.
         """
         agent, engine = self.agent_selection, self.env.unwrapped.engine
         assert isinstance(engine, Engine)
@@ -74,7 +79,7 @@ class InTurns(SeededInside, parallel_to_aec_wrapper):  # type: ignore[misc]  # P
             if action is not None:
                 raise InvalidInput(f"step: the episode of {agent} is over; only None may follow, or reset")
         elif engine.scenario.vehicle_names.index(agent) in engine.learners and not (action is None and engine.guard):
-            checked_action(action, (1,), agent)  # left out: a shield may choose alone
+            checked_action(action, (1,), agent)  # behind a shield, an action may be omitted
         super().step(action)
 
 
@@ -84,12 +89,12 @@ WhoIsAgent = Literal["all", "learners"]
 
 
 class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
-    """A line of vehicles ``vehicle_1`` (front) ... ``vehicle_N``, all of them agents from the alert to the end.
+    """A line of vehicles ``vehicle_1`` (front) ... ``vehicle_N``, all of which are agents from the alert to the end.
 
     Learners need an action [1] in [-1, 1] in each step: -1 full braking capacity, 0 coasts, +1 full driving capacity.
-    What is passed for scripted vehicles is ignored; ``infos[agent]`` shows what their script did. All agents end
-    together: terminated when all are at rest and no command would move one, truncated at the horizon. ``state()`` is
-    the full state of the line, for central critics. Observations, rewards, infos and ``reset`` are those of
+    Actions of scripted vehicles are ignored; ``infos[agent]`` shows the commands of their scripts. All agents end at
+    the same time: terminated when all are at rest and no command would move one, truncated at the horizon. ``state()``
+    is the full state of the line, for central critics. Observations, rewards, infos and ``reset`` are as in
     ``EthBrakeEnv``.
 
     Args:
@@ -97,9 +102,9 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/watching.md).
         learners: vehicles that learn instead of the scenario's, by name (``vehicle_2``) or index from 0; any number.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
-        observation: what every vehicle observes, or by name what each does; None: the scenario's.
+        observation: what every vehicle observes, or a mapping from name to observation; None: the scenario's.
         agents: ``all`` vehicles, or ``learners`` only, for trainers that learn from every agent.
-        max_cycles: truncates an episode after so many steps, if it is not over before; None: the horizon does.
+        max_cycles: truncates an episode after this many steps; None: only at the horizon.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.parallel_env(scenario="paper-random")
@@ -134,7 +139,7 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         self.possible_agents = [names[i] for i in self._vehicles.tolist()]
         self.agents: list[str] = []
         learners = [names[i] for i in self.engine.learners]
-        self._scripted = [agent for agent in self.possible_agents if agent not in learners]  # to be warned of, once
+        self._scripted = [agent for agent in self.possible_agents if agent not in learners]  # emptied after a warning
         seen = self.engine.observations
         self._alike = len({seen[i] for i in self._vehicles.tolist()}) == 1
         self.observation_spaces = {names[i]: feature_box(seen[i].features) for i in self._vehicles.tolist()}
@@ -142,17 +147,24 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         self.state_space = feature_box(state_features(self.engine.scenario))
 
     def observation_space(self, agent: str) -> Any:
-        """Float32 box [F], the same object on each call."""
+        """Return the observation space of the agent with this name, a float32 box [F]; the same object on each call."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Any:
-        """Float32 box [1], the same object on each call."""
+        """Return the action space of the agent with this name, a float32 box [1]; the same object on each call."""
         return self.action_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observations], Infos]:
-        """Start an episode; see docs/episodes.md."""
+        """Start an episode; return observations and infos by agent name.
+
+        Args:
+            seed: restart the stream of worlds from the first world of this seed; None: continue in the stream.
+            options: ``{"initial_state": ...}`` or ``{"listed_world": {"seed": 7, "number": 3}}`` choose the world; see
+                docs/episodes.md.
+
+        """
         self._restart(seed, options)
         self.agents = self.possible_agents[:]
         self.viewer.began()
@@ -161,10 +173,14 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
     def step(
         self, actions: Mapping[str, Any]
     ) -> tuple[dict[str, Observations], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
-        """Advance by one time step. Raises ``InvalidInput`` naming the agent whose action is missing or unusable."""
+        """Advance by one time step; return observations, rewards, terminations, truncations and infos by agent name.
+
+        ``actions`` maps agent names to actions [1] in [-1, 1]. Raises ``InvalidInput`` naming the learner whose action
+        is missing or invalid.
+        """
         if not self.agents:
             raise InvalidInput("step: no episode is running; call reset first")
-        if not isinstance(actions, (dict, Mapping)):  # dict first: it is found out sooner
+        if not isinstance(actions, (dict, Mapping)):  # dict first, because that check is faster
             raise InvalidInput(f"step: actions = {actions!r}: must be a mapping such as {{'vehicle_2': [-1.0]}}")
         for agent in actions:
             if agent not in self.action_spaces:
@@ -191,13 +207,13 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         )
 
     def state(self) -> Observations:
-        """The full state of all vehicles, float32 [S] within ``state_space``."""
+        """Return the full state of all vehicles, float32 [S] within ``state_space``."""
         self._check_started("state")
         state: Observations = full_state(self.engine.worlds, self.engine.scenario)[0].copy()
         return state
 
     def _warn_of_ignored(self, actions: Mapping[str, Any]) -> None:
-        """Warn once of actions that are ignored, since their vehicles follow scripts."""
+        """Warn once about actions that are ignored because their vehicles follow scripts."""
         ignored = [agent for agent in self._scripted if actions.get(agent) is not None]
         if not ignored:
             return
@@ -221,7 +237,7 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
 
 
 def _agent_vehicles(engine: Engine, agents: WhoIsAgent) -> Ints:
-    """Indices of the vehicles that are agents."""
+    """Return the indices of the vehicles that are agents; raise ``InvalidInput`` unless ``agents`` is a known word."""
     if agents not in get_args(WhoIsAgent):
         raise InvalidInput(f"agents = {agents!r}: must be 'all' or 'learners'")
     if agents == "all":
@@ -237,7 +253,9 @@ parallel_env = EthBrakeParallelEnv
 
 
 def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
-    """The same environment with agents acting in turn (AEC), front to rear; arguments as ``parallel_env``.
+    """Return the environment with agents acting in turn (AEC), front to rear.
+
+    ``scenario`` and ``settings`` are the arguments of ``parallel_env``.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.raw_env("paper-random")
@@ -250,9 +268,9 @@ def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[s
 
 
 def env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
-    """The AEC environment with PettingZoo's usual wrapper, order enforcement, which ``raw_env`` already has.
+    """Return the environment with agents acting in turn (AEC), the same as ``raw_env``.
 
-    Actions are not clipped and nothing ends an episode early: an unusable action is an ``InvalidInput`` in its agent's
-    turn, which stays.
+    ``scenario`` and ``settings`` are the arguments of ``parallel_env``. Actions are not clipped, and nothing ends an
+    episode early: an invalid action raises ``InvalidInput`` in its agent's turn, and the turn stays with that agent.
     """
     return raw_env(scenario, **settings)

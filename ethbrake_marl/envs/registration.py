@@ -1,4 +1,4 @@
-"""Ids under which Gymnasium and PettingZoo know this environment. Naming an interface does not import it."""
+"""Ids of this environment in Gymnasium and PettingZoo. Registration does not import the interfaces."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ PETTINGZOO_ID = "ethbrake/ethbrake-v0"
 
 
 def register_environments() -> None:
-    """Register every id that is not registered yet; calling it again changes nothing."""
-    import gymnasium  # takes longer than the command line may take for --help
+    """Register the environment's ids in Gymnasium and PettingZoo. A second call changes nothing."""
+    import gymnasium  # imported here because it would slow down --help
     import pettingzoo
 
     for id_ in (GYMNASIUM_ID, f"ethbrake/{GYMNASIUM_ID}"):

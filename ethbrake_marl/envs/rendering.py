@@ -1,4 +1,4 @@
-"""``render()`` of every interface: a moment of a world as numbers, text or pixels."""
+"""Pictures of ``render()``: one moment of a world as text or pixels."""
 
 from __future__ import annotations
 
@@ -17,76 +17,78 @@ if TYPE_CHECKING:
 
 Frame = NDArray[np.uint8]  # [HEIGHT, WIDTH, 3]
 
-BODY_M = 4.5  # length that vehicles are drawn with; the physics knows none
+BODY_M = 4.5  # drawn length of a vehicle; in the physics, vehicles have no length
 
-FLASH_S = 0.3  # how long an impact is shown
+FLASH_S = 0.3  # time for which an impact is shown
 
-# Okabe and Ito's palette without its yellow (invisible on white), which colour-blind readers tell apart.
+# The palette of Okabe and Ito for colour-blind readers, without its yellow, which is invisible on white.
 COLOURS = ("#000000", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
-_TEXT_WIDTH = 100  # characters of road
+_TEXT_WIDTH = 100  # width of the road in characters
 
-BEHIND_M, AHEAD_M = 3.0, 5.0  # of free road in view at least
+BEHIND_M, AHEAD_M = 3.0, 5.0  # least length of free road in view
 
-LEAST_WIDTH_M = 40.0
+LEAST_WIDTH_M = 40.0  # least length of road in view
 
-LATE_S = 3.0  # of a latency that the view makes room for
+LATE_S = 3.0  # longest latency that the view makes room for
 
 
 class View(NamedTuple):
-    """The road in view (m from the front of Vehicle 1 at the alert), the same for a whole episode if possible."""
+    """The stretch of road in a picture, as positions relative to Vehicle 1's front at the alert."""
 
-    left_m: float
-    right_m: float
+    left_m: float  # position of the left end (m)
+    right_m: float  # position of the right end (m)
 
 
 class Struck(NamedTuple):
-    """An impact that is being shown."""
+    """An impact that a picture shows."""
 
-    pair: int  # -1: Vehicle 1 and the obstacle
-    closing_mps: float
-    time_s: float
+    pair: int  # index of the pair, 0 for Vehicles 1 and 2; -1: Vehicle 1 and the obstacle
+    closing_mps: float  # closing speed (m/s)
+    time_s: float  # time since the alert (s)
 
     @property
     def who(self) -> str:
-        """Who met whom."""
+        """The two parties of the impact in words, such as "Vehicles 1 and 2"."""
         return "Vehicle 1 and the obstacle" if self.pair < 0 else f"Vehicles {self.pair + 1} and {self.pair + 2}"
 
     @property
     def speed(self) -> str:
-        """Its closing speed; an impact never reads 0.0."""
+        """The closing speed in words, such as "3.2 m/s" or "< 0.1 m/s"."""
         return f"{self.closing_mps:.1f} m/s" if self.closing_mps >= 0.05 else "< 0.1 m/s"
 
 
 class Scene(NamedTuple):
-    """One world at one moment."""
+    """One world at one moment, with everything that a picture shows."""
 
     title: str  # name of the scenario
-    time_s: float  # since the alert
-    view: View
-    front_m: Floats  # [N] front bumpers, from that of Vehicle 1 at the alert; bodies of BODY_M apart by the true gaps
-    gaps_m: Floats  # [P]
-    speeds_mps: Floats  # [N]
-    command_mps2: Floats  # [N] in force; 0 before the latency has elapsed
-    braking_mps2: Floats  # [N] capacities
-    driving_mps2: Floats  # [N]
-    latency_s: Floats  # [N]
-    hit: Bools  # [P] pairs that have had an impact
-    struck: tuple[Struck, ...]  # impacts of the last moments
-    first_harm: float  # of the line so far, first impacts only (m2/s2)
-    total_harm: float  # of every impact
-    obstacle_m: float  # its place; infinite: there is none
-    learners: tuple[int, ...]
-    shield: bool | None  # whether a shield stepped in; None: there is none
-    ended: bool  # the episode is over
+    time_s: float  # time since the alert (s)
+    view: View  # the stretch of road that is shown
+    # [N] positions at which the front bumpers are drawn (m from Vehicle 1's at the alert). Vehicles have no length in
+    # the physics, but are drawn BODY_M long; the drawn gaps are the true ones.
+    front_m: Floats
+    gaps_m: Floats  # [P] gap of each pair of neighbours (m)
+    speeds_mps: Floats  # [N] speed of each vehicle (m/s)
+    command_mps2: Floats  # [N] command in force (m/s2); 0 before the latency has elapsed
+    braking_mps2: Floats  # [N] braking capacities (m/s2)
+    driving_mps2: Floats  # [N] driving capacities (m/s2)
+    latency_s: Floats  # [N] time since the alert at which each vehicle may act (s)
+    hit: Bools  # [P] whether the pair has had an impact
+    struck: tuple[Struck, ...]  # impacts within the last FLASH_S seconds
+    first_harm: float  # first-impact harm of the line so far (m2/s2)
+    total_harm: float  # total harm of the line so far (m2/s2)
+    obstacle_m: float  # position of the obstacle (m from Vehicle 1's front at the alert); infinite: none
+    learners: tuple[int, ...]  # indices of the learners (0 = front)
+    shield: bool | None  # whether a shield replaced the action; None: no shield
+    ended: bool  # whether the episode is over
 
     @property
     def shield_words(self) -> str:
-        """What the shield did in this step."""
+        """The shield's decision in this step in words, such as "shield: stepped in"."""
         return "shield: stepped in" if self.shield else "shield: let it pass"
 
     def command_words(self, i: int) -> str:
-        """The command in force of vehicle ``i``."""
+        """Return the command in force of the vehicle with index ``i`` in words, such as "brakes 3.0 m/s2"."""
         command = float(self.command_mps2[i])
         if self.latency_s[i] > self.time_s:
             return f"acts from {self.latency_s[i]:.2f} s" if math.isfinite(self.latency_s[i]) else "never acts"
@@ -95,14 +97,14 @@ class Scene(NamedTuple):
         return f"{'brakes' if command < 0.0 else 'drives'} {abs(command):.1f} m/s2"
 
     def text(self) -> str:
-        """The moment as plain text, without control characters: the road to scale, then a line for each vehicle."""
+        """Return the scene as text without control characters: the road to scale, then one line for each vehicle."""
         left, right = self.view
 
         def column(place_m: float) -> int:
             return min(max(int((float(place_m) - left) / (right - left) * _TEXT_WIDTH), 0), _TEXT_WIDTH - 1)
 
         road, lines = ["."] * _TEXT_WIDTH, []
-        for i in range(len(self.front_m) - 1, -1, -1):  # a number stands where that vehicle's body is
+        for i in range(len(self.front_m) - 1, -1, -1):  # the number of a vehicle stands in its body
             first, last = column(self.front_m[i] - BODY_M), column(self.front_m[i])
             road[first : last + 1] = list(f"[{i + 1}>".center(last + 1 - first, "=")[: last + 1 - first])
             gap = f"gap ahead {self.gaps_m[i - 1]:6.2f} m" if i else ""
@@ -124,7 +126,7 @@ class Scene(NamedTuple):
         return "\n".join([*told, self.shield_words] if self.shield is not None else told) + "\n"
 
     def frame(self) -> Frame:
-        """The moment as a picture [H, W, 3]; the same moment gives the same bytes."""
+        """Return the scene as a picture [H, W, 3] uint8; the same scene gives the same bytes."""
         from PIL import Image, ImageDraw
 
         image = Image.new("RGB", (WIDTH * _FINE, HEIGHT * _FINE), _PAPER)
@@ -142,25 +144,31 @@ class Scene(NamedTuple):
 
 
 def vehicle_colour(i: int) -> str:
-    """Colour of Vehicle ``i + 1`` in every picture."""
+    """Return the colour of the vehicle with index ``i`` in every picture, such as ``#0072B2``."""
     return COLOURS[(i + 1) % len(COLOURS)]
 
 
 def follow(view: View, front_m: Floats) -> View:
-    """The view moved on, and widened where it must be, until the whole line is in it."""
+    """Return the view moved forward and widened as far as needed to contain the whole line.
+
+    ``front_m`` [N] are the drawn positions of the front bumpers, m.
+    """
     on = max(float(front_m[0]) + AHEAD_M - view.right_m, 0.0)
     left = min(view.left_m + on, float(front_m[-1]) - BODY_M - BEHIND_M)
     return View(left if on else min(left, view.left_m), view.right_m + on)
 
 
 def star(x: float, y: float, far: float, near: float) -> list[tuple[float, float]]:
-    """A star of eight points."""
+    """Return the 16 corners (x, y) of a star with eight points around (x, y).
+
+    ``far`` is the radius of the points, ``near`` the radius of the corners between them.
+    """
     return [
         (x + r * math.cos(k * math.pi / 8), y + r * math.sin(k * math.pi / 8)) for k, r in enumerate([far, near] * 8)
     ]
 
 
-WIDTH, HEIGHT = 800, 304  # multiples of 16, as video codecs want them
+WIDTH, HEIGHT = 800, 304  # multiples of 16, for video codecs
 
 _MARGIN = 12
 
@@ -172,9 +180,9 @@ _BODY = 13  # half of a body's height
 
 _PANEL_TOP = 172
 
-_TITLE = 540  # width that is left beside the clock
+_TITLE = 540  # largest width of the title, beside the clock
 
-_FINE = 2  # shapes are drawn so many times larger, for smooth edges
+_FINE = 2  # factor by which shapes are drawn larger, for smooth edges
 
 _PAPER, _INK, _GREY = "#ffffff", "#1a1a1a", "#6b6b6b"
 
@@ -184,28 +192,28 @@ _BRAKE, _DRIVE, _FLASH, _SHIELD = "#c1121f", "#2a7f3f", "#ffd60a", "#6a3d9a"
 
 
 class _Pen:
-    """Draws shapes at the larger scale, from pixels of the picture."""
+    """Draws shapes from coordinates in pixels of the final picture, ``_FINE`` times as large for smooth edges."""
 
     def __init__(self, draw: ImageDraw.ImageDraw) -> None:
         self._draw = draw
 
     def box(self, left: float, top: float, right: float, bottom: float, fill: str, edge: str | None = None) -> None:
-        """A box with slightly round corners."""
+        """Draw a box with slightly round corners; ``fill`` is its colour, ``edge`` the colour of its edge, or None."""
         corners = [value * _FINE for value in (left, top, max(right, left + 1), max(bottom, top + 1))]
         self._draw.rounded_rectangle(corners, 2 * _FINE, fill=fill, outline=edge, width=_FINE * 2)
 
     def line(self, x1: float, y1: float, x2: float, y2: float, colour: str, width: float = 1.0) -> None:
-        """A straight line."""
+        """Draw a straight line from (x1, y1) to (x2, y2), ``width`` pixels wide."""
         self._draw.line([x1 * _FINE, y1 * _FINE, x2 * _FINE, y2 * _FINE], fill=colour, width=round(width * _FINE))
 
     def shape(self, points: list[tuple[float, float]], fill: str, edge: str | None = None) -> None:
-        """A polygon."""
+        """Draw a polygon with these corners (x, y); ``fill`` and ``edge`` are colours, ``edge`` may be None."""
         self._draw.polygon([(x * _FINE, y * _FINE) for x, y in points], fill=fill, outline=edge, width=_FINE)
 
 
 def _draw_road(pen: _Pen, scene: Scene) -> None:
     pen.box(0, _ROAD_TOP, WIDTH, _ROAD_BOTTOM, _ASPHALT)
-    for place in _marks(scene, 5.0):  # dashes of the lane's edges, 2 m each: they stand still as the line moves
+    for place in _marks(scene, 5.0):  # dashes of the lane's edges, 2 m each, fixed to the road
         left, right = _x(scene, place), _x(scene, place + 2.0)
         for y in (_ROAD_TOP + 5, _ROAD_BOTTOM - 5):
             pen.line(left, y, right, y, _DASH, 1.5)
@@ -238,7 +246,7 @@ def _draw_vehicle(pen: _Pen, scene: Scene, i: int) -> None:
 
 
 def _draw_panel(pen: _Pen, scene: Scene, i: int) -> None:
-    """The share of its capacity that the command takes: braking to the left, driving to the right."""
+    """Draw the command of vehicle ``i`` as a share of its capacity: braking to the left, driving to the right."""
     left, width = _panel(scene, i)
     pen.box(left, _PANEL_TOP, left + 20, _PANEL_TOP + 18, vehicle_colour(i))
     middle, half, top = left + width / 2, width / 2, _PANEL_TOP + 62
@@ -277,14 +285,14 @@ def _write_road(text: ImageDraw.ImageDraw, scene: Scene) -> None:
         middle = _x(scene, scene.front_m[i] - BODY_M * 0.55)
         text.text((middle, _LANE), str(i + 1), _PAPER, _font(16), anchor="mm")
     free = math.inf
-    for left, right, gap_m, hit in _spaces(scene):  # from the right; a label without room stands one line higher
+    for left, right, gap_m, hit in _spaces(scene):  # from the right; a label that does not fit is put one line higher
         middle, words = (left + right) / 2, f"{gap_m:.1f} m"
         half = _font(14).getlength(words) / 2 + 3
         high = middle + half > free
         colour = _BRAKE if hit else _INK
         text.text((middle, _ROAD_TOP - (27 if high else 13)), words, colour, _font(14), anchor="ms")
         free = math.inf if high else middle - half
-    if scene.struck:  # above the line, the hardest impact of each pair that is being shown, the two hardest of them
+    if scene.struck:  # name the hardest current impact of each pair, at most the two hardest
         hardest = {struck.pair: struck for struck in sorted(scene.struck, key=lambda struck: struck.closing_mps)}
         told = sorted(hardest.values(), key=lambda struck: -struck.closing_mps)[:2]
         words = "impact of " + ", ".join(f"{struck.who} at {struck.speed}" for struck in told)
@@ -309,19 +317,19 @@ def _write_panel(text: ImageDraw.ImageDraw, scene: Scene, i: int) -> None:
 
 
 def _fitting(words: list[str], width: float, size: int) -> str:
-    """The first of these that is not wider than ``width``, else the last."""
+    """Return the first of ``words`` that is at most ``width`` pixels wide in a font of this size; else the last."""
     return next((each for each in words if _font(size).getlength(each) <= width), words[-1])
 
 
 def _share(scene: Scene, i: int) -> float:
-    """The command in force as a share of the vehicle's capacity; below 0 it brakes."""
+    """Return the command in force of vehicle ``i`` as a share of its capacity, -1 to 1; negative for braking."""
     command = float(scene.command_mps2[i])
     capacity = float((scene.braking_mps2 if command < 0.0 else scene.driving_mps2)[i])
     return command / capacity if command != 0.0 else 0.0
 
 
 def _panel(scene: Scene, i: int) -> tuple[float, float]:
-    """Left edge and width (pixels) of a vehicle's numbers, in the order of the line, Vehicle 1 on the right."""
+    """Return left edge and width (pixels) of the panel of vehicle ``i``; Vehicle 1's panel is on the right."""
     count = len(scene.front_m)
     gap = 24.0 if count <= 5 else 10.0
     width = min((WIDTH - 2 * _MARGIN - gap * (count - 1)) / count, 240.0)
@@ -329,14 +337,15 @@ def _panel(scene: Scene, i: int) -> tuple[float, float]:
 
 
 def _x(scene: Scene, place_m: float) -> float:
-    """Pixels from the left edge of a place on the road."""
+    """Return the horizontal position (pixels) of the place ``place_m`` on the road (m)."""
     return (float(place_m) - scene.view.left_m) / (scene.view.right_m - scene.view.left_m) * WIDTH
 
 
 def _spaces(scene: Scene) -> list[tuple[float, float, float, bool]]:
-    """Free road from the front backwards, to the obstacle, if there is one, and between the vehicles.
+    """Return the free stretches of road, from the front backwards: to an obstacle, and between the vehicles.
 
-    Its left and its right end (pixels), its length (m), and whether the two beside it hit each other.
+    Each is a tuple: left and right end (pixels), length (m), and whether the bodies at its two ends have hit each
+    other.
     """
     front, obstacle = float(scene.front_m[0]), scene.obstacle_m
     spaces = [(_x(scene, front), _x(scene, obstacle), obstacle - front, any(s.pair < 0 for s in scene.struck))]
@@ -347,19 +356,19 @@ def _spaces(scene: Scene) -> list[tuple[float, float, float, bool]]:
 
 
 def _marks(scene: Scene, every_m: float) -> list[float]:
-    """Places in view that are multiples of ``every_m``."""
+    """Return the places on the road (m) that are in view and multiples of ``every_m``."""
     first, last = math.ceil(scene.view.left_m / every_m), math.floor(scene.view.right_m / every_m)
     return [k * every_m for k in range(first, last + 1)]
 
 
 def _spacing(scene: Scene) -> float:
-    """Metres between two marks with a number: at most a dozen of them."""
+    """Return the distance (m) between two labelled marks on the road, such that at most a dozen fit."""
     width = scene.view.right_m - scene.view.left_m
     return next((every for every in (5.0, 10.0, 20.0, 50.0, 100.0, 200.0) if width <= 12 * every), 500.0)
 
 
 def _contact(scene: Scene, struck: Struck) -> float:
-    """Where an impact is shown (pixels): between the two bodies."""
+    """Return the horizontal position (pixels) at which the impact ``struck`` is shown: between the two bodies."""
     if struck.pair < 0:
         return _x(scene, scene.front_m[0])
     return (_x(scene, scene.front_m[struck.pair + 1]) + _x(scene, scene.front_m[struck.pair] - BODY_M)) / 2
@@ -367,7 +376,7 @@ def _contact(scene: Scene, struck: Struck) -> float:
 
 @cache
 def _font(size: int) -> ImageFont.FreeTypeFont:
-    """Pillow's own font: the same on every machine that has this Pillow."""
+    """Return Pillow's built-in font in this size; it is the same on every machine with this version of Pillow."""
     from PIL import ImageFont
 
     font = ImageFont.load_default(size)

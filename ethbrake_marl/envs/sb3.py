@@ -1,4 +1,4 @@
-"""Stable-Baselines3's interface: a native ``VecEnv`` whose rows are learners. Importing this file imports torch."""
+"""Stable-Baselines3's interface: a native ``VecEnv`` whose rows are learners. Importing this module imports torch."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ethbrake_marl.envs.making import (
     make_engine,
     warn_of_unknown,
 )
-from ethbrake_marl.envs.motion import Viewer
+from ethbrake_marl.envs.viewer import Viewer
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.actions import own_actions
 from ethbrake_marl.game.full_state import Appended, full_state, row_features
@@ -50,23 +50,22 @@ def make_sb3_vec_env(
     step_infos: bool = False,
     render_mode: str | None = None,
 ) -> EthBrakeVecEnv:
-    """``n_envs`` worlds for Stable-Baselines3.
+    """Return ``n_envs`` worlds as a ``VecEnv`` for Stable-Baselines3.
 
     Args:
         scenario: a shipped name, the path of a YAML file, or a ``Scenario``.
-        n_envs: worlds that are advanced together, at least 1.
-        seed: of the stream of worlds; None: fresh entropy.
+        n_envs: number of worlds that are advanced together, at least 1.
+        seed: seed of the stream of worlds; None: fresh entropy.
         learners: vehicles that learn instead of the scenario's, by name (``vehicle_2``) or index from 0; any number.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         observation: what the learners observe; None: ``observation_for(scenario)``.
-        horizon_is_end: infos report no truncation, so that an algorithm does not add the value it expects beyond the
-            horizon. Harm is counted to the horizon: nothing lies beyond it, and what is imagined there can grow without
-            limit (docs/exploits.md). False: ``TimeLimit.truncated`` says which episodes the horizon cut off.
-        appended: numbers of a row behind the vehicle's own observation. ``number``: the learner's place among the
-            learners (0 = the foremost); ``state``: the full state of the line (``observations.state``), for a central
+        horizon_is_end: report no truncation in the infos, so that an algorithm does not add an estimated value beyond
+            the horizon. Harm is counted up to the horizon only, and an estimate beyond it can grow without limit
+            (docs/exploits.md). False: ``TimeLimit.truncated`` marks episodes that the horizon cut off.
+        appended: numbers appended to a learner's own observation. ``number``: the learner's index among the learners
+            (0 = the foremost); ``state``: the full state of the line (``game.full_state.full_state``), for a central
             critic.
-        step_infos: infos tell what the other interfaces tell in every step, not at the end of an episode alone; that
-            costs time.
+        step_infos: fill the infos of every step as the other interfaces do, not only at the end of an episode; slower.
         render_mode: ``rgb_array`` or None; ``render`` and ``VecVideoRecorder`` show all worlds side by side.
 
     >>> import ethbrake_marl as eb
@@ -82,21 +81,22 @@ def make_sb3_vec_env(
 
 
 class EthBrakeVecEnv(Begun, VecEnv):
-    """Rows are learners: row ``k * L + l`` is learner l (front to rear) of world k, for L learners in each world.
+    """``VecEnv`` whose rows are learners: row ``k * L + l`` is learner l of L (front to rear) in world k.
 
-    With several learners all rows share one policy, and the rows of a world end together. All worlds take their
-    episodes from one stream. At the end of an episode its rows' infos hold
-    ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return ``r``, steps ``l``; ``t`` is always 0, no
-    clock is read), and harm under both counts; all other infos are empty, unless ``step_infos``. Attributes and
-    methods belong to the whole batch: there are no environments inside.
+    With several learners, all rows share one policy, and the rows of a world end together. All worlds take their
+    episodes from one stream. At the end of an episode, its rows' infos hold ``TimeLimit.truncated``,
+    ``terminal_observation``, ``episode`` (return ``r``, steps ``l``; ``t`` is always 0, because no clock is read), and
+    harm under both counts. All other infos are empty, unless ``step_infos``. Attributes and methods belong to the whole
+    batch: there are no inner environments.
 
     Args:
-        engine: the running worlds; ``make_sb3_vec_env`` makes them.
-        seed: of the stream of worlds.
-        horizon_is_end: as in ``make_sb3_vec_env``.
-        appended: as in ``make_sb3_vec_env``.
-        step_infos: as in ``make_sb3_vec_env``.
-        render_mode: as in ``make_sb3_vec_env``.
+        engine: the engine of the worlds; ``make_sb3_vec_env`` builds it.
+        seed: seed of the stream of worlds.
+        horizon_is_end: report no truncation at the horizon in the infos, as explained in ``make_sb3_vec_env``.
+        appended: numbers appended to each observation: ``number``, the learner's index among the learners; ``state``,
+            the full state of the line. None: nothing.
+        step_infos: fill the infos of every step, not only at the end of an episode.
+        render_mode: ``rgb_array`` or None.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -137,20 +137,24 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self._return = np.zeros(rows)
         self._steps = np.zeros(rows, np.int64)
         self._begun = np.zeros(0)  # values of the report at each episode's beginning
-        self._begun_shield: Columns = {}  # ... and what a shield reported then
+        self._begun_shield: Columns = {}  # infos of a shield at each episode's beginning
         super().__init__(rows, feature_box(features), action_box())
         self.metadata = {**self.viewer.metadata, "render_modes": ["rgb_array"]}
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Start the stream of ``seed`` at the next reset (None: fresh entropy); one stream serves all rows."""
+        """Start the stream of ``seed`` at the next reset (None: a random seed); return the seed, once per row.
+
+        All rows share one stream.
+        """
         self._set_seed(chosen_seed(seed))
         self._goes_on = False
         return [self.np_random_seed] * self.num_envs
 
     def reset(self) -> Observations:
-        """Start an episode in every world, with the seed and options set before (``seed``, ``set_options``).
+        """Start an episode in every world; return the observations, [rows, F] float32.
 
-        Options hold for one reset; unusable ones are an ``InvalidInput`` of that reset, and the next one is without.
+        Seed and options are those set before (``seed``, ``set_options``). Options hold for one reset. Invalid options
+        raise ``InvalidInput`` at that reset, and are then forgotten.
         """
         try:
             worlds = self._read_options()
@@ -163,11 +167,15 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return self._observe()
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Keep actions [rows, 1] for ``step_wait``."""
+        """Store the actions [rows, 1] in [-1, 1] for ``step_wait``."""
         self._actions = own_actions(actions, "the learners")
 
     def step_wait(self) -> tuple[Observations, Rewards, Bools, list[dict[str, Any]]]:
-        """Advance every world by one time step; worlds that end start their next episode at once."""
+        """Advance every world by one time step with the stored actions.
+
+        Worlds that end start their next episode at once. Returns observations [rows, F], rewards [rows], whether each
+        row's episode ended [rows], and one dictionary of infos per row.
+        """
         if not self._started or self._actions is None:
             raise InvalidInput("step: no episode is running; call reset first")
         actions, self._actions = self._actions, None
@@ -185,7 +193,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
             if self.step_infos
             else plain_rows(shield_columns(engine), learners, self.num_envs)
         )
-        over = engine.ended  # all that have ended: an interrupted step may have left some that nobody renewed
+        over = engine.ended  # includes worlds that an interrupted step left without renewal
         ended = np.flatnonzero(over)
         if len(ended):
             self._close_episodes(ended, step, infos)
@@ -196,19 +204,25 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return self._observe(), reward.astype(np.float32), self._by_row(over), infos
 
     def get_images(self) -> list[NDArray[np.uint8]]:
-        """A frame [H, W, 3] of each world."""
+        """Return the picture of each world, a list of frames [H, W, 3] uint8."""
         return list(self.viewer.render())
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing: there is nothing to release."""
 
     def snapshot(self) -> Arrays:
-        """Copies of everything that changes while it runs, between two steps."""
+        """Return copies of everything that changes while the environment runs, by name, for ``restore``.
+
+        Call it between two steps.
+        """
         arrays = {f"engine.{name}": array for name, array in self.engine.snapshot().items()}
         return arrays | {"return": self._return.copy(), "steps": self._steps.copy(), "begun": self._begun.copy()}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Go on from a ``snapshot`` of the same scenario and size, without a reset; raises ``InvalidInput``."""
+        """Continue from ``arrays``, a ``snapshot`` of the same scenario and size, without a reset.
+
+        Raises ``InvalidInput`` for a snapshot that does not fit.
+        """
         prefix = "engine."
         self.engine.restore({n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)})
         rows = {"return": self._return, "steps": self._steps, "begun": Report.of(self.engine).values}
@@ -222,25 +236,31 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self._started = self._goes_on = True
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """The batch's attribute, once per row asked for."""
+        """Return the attribute ``attr_name`` of the batch, once per requested row."""
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set the batch's attribute; for some rows only is an ``InvalidInput``."""
+        """Set the attribute ``attr_name`` of the batch; raise ``InvalidInput`` if ``indices`` names only some rows."""
         self._refuse_some_rows("set_attr", indices)
         setattr(self, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        """Call the batch's method once, and return its result once per row; for some rows only is an error."""
+        """Call the method ``method_name`` of the batch once, and return its result once per row.
+
+        ``args`` and ``kwargs`` are its arguments. Raises ``InvalidInput`` if ``indices`` names only some rows.
+        """
         self._refuse_some_rows("env_method", indices)
         return [getattr(self, method_name)(*args, **kwargs)] * self.num_envs
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """False for every row: nothing is wrapped."""
+        """Return False once per requested row: there are no inner wrappers."""
         return [False for _ in self._get_indices(indices)]
 
     def _close_episodes(self, ended: Ints, step: Step, infos: list[dict[str, Any]]) -> None:
-        """Fill in the infos of the rows whose world has ended, before the next episodes start."""
+        """Fill in the final infos of the rows of the worlds ``ended``, before their next episodes start.
+
+        ``step`` is the last step; ``infos``, one dictionary per row, is changed in place.
+        """
         rows, final = self._rows(ended), self._observe(ended)
         told = Report.of(self.engine, step, ended).plain_infos(self._learners)
         truncated = self._by_row(step.truncated[ended]).tolist()
@@ -253,13 +273,13 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self._return[rows], self._steps[rows] = 0.0, 0
 
     def _rows(self, worlds: Ints) -> Ints:
-        """Rows of all learners of these worlds, in order."""
+        """Return the rows of all learners of the worlds with the indices ``worlds``, in order."""
         width = len(self.engine.learners)
         return (worlds[:, np.newaxis] * width + np.arange(width)).reshape(-1)
 
     @property
     def reset_infos(self) -> list[dict[str, Any]]:
-        """The infos with which the running episodes began, row by row; made when they are asked for."""
+        """Infos at the start of the running episodes, one dictionary per row, computed at each access."""
         if not self._started:
             return [{} for _ in range(self.num_envs)]
         begun = Report.of(self.engine)._replace(values=self._begun, shield=self._begun_shield)
@@ -267,10 +287,13 @@ class EthBrakeVecEnv(Begun, VecEnv):
 
     @reset_infos.setter
     def reset_infos(self, infos: list[dict[str, Any]]) -> None:
-        """Nothing: SB3's constructor assigns empty ones."""
+        """Ignore the empty infos that SB3's constructor assigns."""
 
     def _observe(self, worlds: Ints | None = None) -> Observations:
-        """Observations of all learners, row by row, in their own memory; only of some worlds if given."""
+        """Return the observations of all learners, [rows, F] float32, in new arrays.
+
+        ``worlds`` are the indices of the worlds to include; None: all.
+        """
         every = self.engine.observe_all(self._learners, worlds)
         rows = every.reshape(-1, every.shape[2])
         if self.appended is None:
@@ -288,7 +311,10 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return worlds.repeat(len(self._learners))
 
     def _read_options(self) -> Worlds | None:
-        """The worlds that the options of the rows ask for; None for the stream's."""
+        """Return the worlds that the options set for the rows request; None: worlds of the stream.
+
+        Raises ``InvalidInput`` if only some rows have an initial state, or the rows of one world differ.
+        """
 
         def bytes_of(start: Worlds) -> list[bytes]:
             return [part.tobytes() for part in Packed.of(start)]

@@ -1,4 +1,4 @@
-"""Gymnasium's vector interface: one learner, many worlds, advanced together."""
+"""Gymnasium's vector interface: one learner in each of many worlds, which are advanced together."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ethbrake_marl.envs.making import (
     only_learner,
     warn_of_unknown,
 )
-from ethbrake_marl.envs.motion import Viewer
+from ethbrake_marl.envs.viewer import Viewer
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.game.actions import own_actions
 from ethbrake_marl.game.observations import Observation, Observations
@@ -34,15 +34,15 @@ from ethbrake_marl.physics.state import Bools, Floats
 
 
 class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArray[Any]]):
-    """Cost as a value of its own: ``step`` gives observation, reward, cost, terminated, truncated, info.
+    """Wrapper with a separate cost: ``step`` returns observation, reward, cost, terminated, truncated, info.
 
-    That is what Safety-Gymnasium gives and OmniSafe expects. Cost is the harm that the step added to the line (m2/s2),
-    as the reward counts impacts, whatever else the reward says.
+    This is the format of Safety-Gymnasium, which OmniSafe expects. The cost is the harm that the step added to the line
+    (m2/s2). It counts first impacts only, or all impacts, as the reward does; other terms of the reward do not enter.
 
     Args:
-        env: ``EthBrakeEnv``, or anything around it that hands on its infos.
+        env: ``EthBrakeEnv``, or a wrapper of one that passes its infos on.
 
-    Raises ``InvalidInput`` if ``env`` is another, or has a cost of its own already.
+    Raises ``InvalidInput`` for another environment, or one with a ``CostEnv`` inside.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.CostEnv(eb.EthBrakeEnv("paper-random"))
@@ -64,7 +64,10 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
     def step(  # type: ignore[override]  # six values, as safe-RL libraries have it
         self, action: NDArray[Any]
     ) -> tuple[Observations, float, float, bool, bool, dict[str, Any]]:
-        """One decision; see ``EthBrakeEnv.step``."""
+        """Advance by one time step; return observation, reward, cost, terminated, truncated and info.
+
+        ``action`` is [1] in [-1, 1]. The cost is the harm that the step added to the line (m2/s2).
+        """
         observation, reward, terminated, truncated, info = self.env.step(action)
         if "cost" not in info:
             raise InvalidInput(f"CostEnv: {self.env!r:.80} hands on no info['cost']; put CostEnv inside it")
@@ -74,21 +77,22 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
 class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
     """Many worlds of ``EthBrakeEnv``: ``gymnasium.make_vec("EthBrake-v0", num_envs=4096, scenario=...)``.
 
-    All worlds take their episodes from one stream: row k of ``reset(seed=s)`` is world k of s, and each new episode is
-    the next world of it. Every array that is returned has its own memory.
+    All worlds take their episodes from one stream: row k of ``reset(seed=s)`` is world k of seed s, and each new
+    episode is the next world of that stream. All returned arrays are new.
 
     Args:
-        num_envs: worlds that are advanced together, at least 1.
+        num_envs: number of worlds that are advanced together, at least 1.
         scenario: a shipped name, the path of a YAML file, or a ``Scenario``.
-        render_mode: ``rgb_array``, ``ansi``, or None; ``render`` gives one frame or text for each world.
+        render_mode: ``rgb_array``, ``ansi``, or None; ``render`` returns one frame or text for each world.
         learners: the one vehicle that learns instead of the scenario's, by name (``vehicle_2``) or index from 0.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         observation: what the learner observes; None: ``observation_for(scenario)``.
-        autoreset_mode: Gymnasium's. ``NextStep``, its default and ours, returns the last observation and spends the
-            next step, whose action is ignored and whose reward is 0, on the reset. ``SameStep`` returns the first
-            observation of the new episode, with the last one of the old in ``infos["final_obs"]`` and its infos in
-            ``infos["final_info"]``. ``Disabled`` never resets: the next step wants ended rows reset by hand.
-        max_episode_steps: truncates an episode after so many steps; None: the horizon does.
+        autoreset_mode: Gymnasium's autoreset mode. ``NextStep``, the default, returns the last observation and uses the
+            next step for the reset; that step's action is ignored and its reward is 0. ``SameStep`` returns the first
+            observation of the new episode, with the old episode's last observation in ``infos["final_obs"]`` and its
+            infos in ``infos["final_info"]``. ``Disabled`` never resets: the caller must reset ended rows before the
+            next step.
+        max_episode_steps: truncates an episode after this many steps; None: only at the horizon.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -130,7 +134,14 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode in every world, or where ``options["reset_mask"]`` says; see docs/episodes.md."""
+        """Start an episode in every world; return observations [n, F] and infos.
+
+        Args:
+            seed: restart the stream of worlds from the first world of this seed; None: continue in the stream.
+            options: ``initial_state`` or ``listed_world`` choose the worlds; ``reset_mask`` [n] restricts the reset to
+                the worlds that it marks. See docs/episodes.md.
+
+        """
         rows = self._rows_to_reset(options)
         if rows.all():
             self._restart(seed, options)
@@ -140,7 +151,11 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         return self.engine.observe(self.learner), told
 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
-        """Advance every world by one time step, and start new episodes as the autoreset mode says."""
+        """Advance every world by one time step with the actions [n, 1] in [-1, 1].
+
+        Ended worlds start new episodes according to the autoreset mode. Returns observations [n, F], rewards,
+        terminated, truncated (each [n]) and infos in Gymnasium's vector format.
+        """
         if not self._started:
             raise InvalidInput("step: no episode is running; call reset first")
         engine, before = self.engine, self.engine.ended
@@ -152,7 +167,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         step = engine.step(self._fill_ignored(actions, before))
         if self.max_episode_steps is not None:
             engine.cut(step, self.max_episode_steps)
-        # all that have ended: an interrupted step may have left some that nobody renewed
+        # includes worlds that an interrupted step left without renewal
         renewed = engine.ended if self.autoreset_mode is AutoresetMode.SAME_STEP else before
         infos: dict[str, Any] = {}
         if self.autoreset_mode is AutoresetMode.SAME_STEP and renewed.any():
@@ -164,11 +179,17 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         return engine.observe(self.learner), reward, step.terminated, step.truncated, infos
 
     def render(self) -> tuple[Any, ...]:
-        """A frame [H, W, 3] uint8, or a text, of every world; of a world that has just been renewed, its start."""
+        """Return a tuple with the picture of every world: a frame [H, W, 3] uint8, or a text.
+
+        A world whose episode has just been renewed shows the start of the new one.
+        """
         return tuple(self.viewer.render())
 
     def _fill_ignored(self, actions: NDArray[Any], before: Bools) -> NDArray[Any]:
-        """The actions with those that the autoreset mode ignores replaced: their worlds had ended ``before``."""
+        """Return the actions with 0 for the worlds whose actions are ignored.
+
+        In mode ``NextStep`` these are the worlds whose episodes had ended ``before`` [n] the step.
+        """
         if self.autoreset_mode is not AutoresetMode.NEXT_STEP or not before.any():
             return actions
         heeded = own_actions(actions, "the learners")
@@ -177,7 +198,10 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         return heeded
 
     def _rows_to_reset(self, options: Any) -> Bools:
-        """The rows [n] that ``options["reset_mask"]`` marks; all without one. ``InvalidInput`` for what is no mask."""
+        """Return the rows [n] that ``options["reset_mask"]`` marks, or all rows without a mask.
+
+        Raises ``InvalidInput`` for an invalid mask.
+        """
         if not isinstance(options, Mapping) or RESET_MASK not in options:
             return np.ones(self.num_envs, np.bool_)
         mask = options[RESET_MASK]
@@ -189,7 +213,11 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         return np.array(mask)
 
     def _renew(self, rows: Bools, seed: int | None, options: Mapping[str, Any]) -> None:
-        """Start the next episodes of the stream in these rows, as an automatic reset does; the others go on."""
+        """Start the next episodes of the stream in the worlds that ``rows`` [n] marks; the other worlds continue.
+
+        Raises ``InvalidInput`` for a ``seed`` or an option that would choose the worlds, because these apply to all
+        rows.
+        """
         warn_of_unknown(options, self._known_options)
         starts = [name for name in (INITIAL_STATE, LISTED_WORLD) if name in options]
         starts += ["seed"] * (seed is not None)
@@ -199,7 +227,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         self.engine.renew(np.flatnonzero(rows))
 
     def _final_infos(self, step: Step) -> dict[str, Any]:
-        """The last observation and infos of the episodes that ended with this step."""
+        """Return the infos ``final_obs`` and ``final_info``, with masks, of the episodes that ended with this step."""
         ended = step.ended
         observations = self.engine.observe(self.learner)
         final = np.full(self.num_envs, None, dtype=object)

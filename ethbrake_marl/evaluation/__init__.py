@@ -1,4 +1,4 @@
-"""Measuring agents on fixed lists of worlds: inputs, rollouts, measures, statistics, tables, results, episodes."""
+"""Evaluation of agents on fixed lists of worlds: rollouts, measures, statistics, tables, results files, episodes."""
 
 from typing import TYPE_CHECKING
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
         make_agents as make_agents,
         make_lineup as make_lineup,
     )
-    from ethbrake_marl.evaluation.measures import (
+    from ethbrake_marl.evaluation.measure_sets import (
         MEASURE_SETS as MEASURE_SETS,
         Measure as Measure,
         MeasureSet as MeasureSet,
@@ -39,12 +39,7 @@ if TYPE_CHECKING:
     )
     from ethbrake_marl.evaluation.motion import EpisodeMotion as EpisodeMotion, follow_episodes as follow_episodes
     from ethbrake_marl.evaluation.outcome import LeftOut as LeftOut, Outcome as Outcome
-    from ethbrake_marl.evaluation.own_measures import (
-        MEASURES as MEASURES,
-        REGISTERED as REGISTERED,
-        load_measures as load_measures,
-        register_measure as register_measure,
-    )
+    from ethbrake_marl.evaluation.own_measures import load_measures as load_measures
     from ethbrake_marl.evaluation.per_world import (
         read_result as read_result,
         results_to_json as results_to_json,

@@ -1,6 +1,4 @@
-"""Watches beside harm while episodes are driven: how far Vehicle 1 is shoved, and the paper's sum over
-samples.
-"""
+"""Watchers that measure more than harm during episodes: how far Vehicle 1 is shoved, and the paper's sampled harm."""
 
 from __future__ import annotations
 
@@ -19,11 +17,16 @@ from ethbrake_marl.scenario.task import Task
 
 
 class ShovedFront:
-    """Watches episodes: how far Vehicle 1 ends beyond where it would by itself, following its script undisturbed.
+    """Watcher that measures how far Vehicle 1 ends beyond the point that it would reach undisturbed.
 
-    ``shoved = way - solo way to the horizon``. At rest, that is the distance from its own stopping point; where the
-    horizon cuts an episode off, from where it would be by then. Negative where Vehicle 1 ends short of it, as by an
-    obstacle that throws it back. See ``of`` for whom it exists.
+    ``shoved = distance driven - distance driven alone up to the horizon``. For a line at rest, this is the distance
+    from Vehicle 1's own stopping point. Negative where Vehicle 1 ends short of that point, for instance after an
+    obstacle threw it back. Create it with ``of``; the engine calls ``see`` after each step.
+
+    Args:
+        worlds: the n worlds at the alert.
+        own_way_m: [n] distance that Vehicle 1 drives undisturbed until the horizon.
+
     """
 
     def __init__(self, worlds: Worlds, own_way_m: Floats) -> None:
@@ -32,9 +35,9 @@ class ShovedFront:
 
     @classmethod
     def of(cls, worlds: Worlds, task: Task) -> ShovedFront | None:
-        """What watches these worlds (at the alert).
+        """Return a watcher for ``worlds`` at the alert, or None if the measure is not defined for the task.
 
-        None where Vehicle 1 is driven, its script needs the state, or brakes build up.
+        It is not defined if Vehicle 1 is controlled, if its script depends on the state, or if brakes build up.
         """
         script = None if 0 in task.vehicles else task.scenario.scripts.get(0)
         vehicles = worlds.vehicles
@@ -47,26 +50,41 @@ class ShovedFront:
         return cls(worlds, way[:, 0])
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Add the way of one step, by a post ahead: the world's own obstacle, or one out of reach."""
+        """Add the distance that Vehicle 1 drives in one step.
+
+        It is measured as the change of Vehicle 1's gap to an obstacle, the world's own or one placed out of reach.
+
+        Args:
+            before: the worlds at the beginning of the step.
+            command_mps2: [n, N] commanded accelerations during the step.
+            until_s: [n] time at which the step ends.
+
+        """
         post = before.with_post_ahead(until_s - before.time_s)
         after, _ = advance(post, command_mps2, until_s=until_s)
         self._way_m += post.obstacle_gap_m - after.obstacle_gap_m
 
     @property
     def metres(self) -> Floats:
-        """How far Vehicle 1 was shoved in each world so far, [n]."""
+        """Distance by which Vehicle 1 was shoved in each world so far, [n] m."""
         shoved: Floats = self._way_m - self._own_way_m
         return shoved
 
 
-VEHICLE_2 = 1  # the map's samples begin with its latency
+VEHICLE_2 = 1  # index of the vehicle whose latency sets the time of the map's first sample
 
 
 class SampledHarm:
-    """Watches episodes and replays their commands, step by step, through the map of ``advance_sampled``.
+    """Watcher that computes the harm of the episodes as the paper does, which samples the motion at fixed steps.
 
-    Each world goes to the horizon; after the end of its exact episode the last commands are held. The agent decided on
-    the exact motion; nobody decides anew. See ``of`` for whom it exists.
+    It replays the commands through ``advance_sampled``, the paper's equations of motion. Every world runs to the
+    horizon; after its exact episode has ended, the last commands are held. The agents saw the exact motion and do not
+    decide again. Create it with ``of``; the engine calls ``see`` after each step, and ``finish`` returns the harm.
+
+    Args:
+        worlds: the n worlds at the alert; they are copied.
+        scenario: scenario of the worlds, for time step and horizon.
+
     """
 
     def __init__(self, worlds: Worlds, scenario: Scenario) -> None:
@@ -75,14 +93,14 @@ class SampledHarm:
         self._harm = np.zeros(worlds.n)
         self._start_s = worlds.first_decision_s([VEHICLE_2])
         self._step_s, self._horizon_s = scenario.time_step_s, scenario.horizon_s
-        self._samples = -1  # steps of the map so far; the time before its first sample is the first
+        self._samples = -1  # number of the last sample; the first step of the map ends at sample 0
 
     @classmethod
     def of(cls, worlds: Worlds, task: Task) -> SampledHarm | None:
-        """What watches these worlds (at the alert).
+        """Return a watcher for ``worlds`` at the alert, or None if the measure is not defined for the task.
 
-        None with an obstacle or brakes that build up, which the map does not know, or if others decide than Vehicle 2,
-        whose decisions are its samples.
+        It is not defined with an obstacle or brakes that build up, which the paper's map does not model, nor if another
+        vehicle than Vehicle 2 decides, because the samples of the map are Vehicle 2's decisions.
         """
         obstacle = task.scenario.has_obstacle or worlds.obstacle_ahead.any()
         if task.vehicles != (VEHICLE_2,) or obstacle or worlds.vehicles.build_up.any():
@@ -92,13 +110,20 @@ class SampledHarm:
         return cls(worlds, task.scenario)
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Replay one step; the commands of a world whose episode has ended stay what they were."""
+        """Replay one step. Worlds whose episodes have ended keep their last commands.
+
+        Args:
+            before: the worlds at the beginning of the step.
+            command_mps2: [n, N] commanded accelerations during the step.
+            until_s: [n] time at which the step ends; equal to the beginning if the world's episode has ended.
+
+        """
         running = until_s > before.time_s
         self._command = np.where(running[:, np.newaxis] | (self._samples < 0), command_mps2, self._command)
         self._move()
 
     def _move(self) -> None:
-        """Go on by one step: every world to its next sample, none beyond its first one at or after the horizon."""
+        """Advance every world to its next sample, or to the horizon if that comes first."""
         self._samples += 1
         next_s = np.minimum(Decisions(self._start_s, self._step_s).at(self._samples), self._horizon_s)
         until_s = np.maximum(next_s, self._worlds.time_s)
@@ -106,7 +131,7 @@ class SampledHarm:
         self._harm += sum_rows(impacts.total_harm)
 
     def finish(self) -> Floats:
-        """Go on to the horizon; gives the sum of each world, [n] m2/s2."""
+        """Advance every world to the horizon, and return its sampled harm, [n] m2/s2."""
         while (self._worlds.time_s < self._horizon_s - 1e-6 * self._step_s).any():
             self._move()
         return self._harm

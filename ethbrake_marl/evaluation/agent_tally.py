@@ -1,6 +1,6 @@
-"""Sums of one agent's measures over some worlds, and the estimates made of them.
+"""Sums of one agent's measures over some worlds, and the estimates computed from them.
 
-Sums are exact, so they can be added in any order to the same bits.
+The sums are exact, so the order of addition does not change a bit.
 """
 
 from __future__ import annotations
@@ -12,20 +12,23 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.evaluation.measures import BASELINE, Measure, MeasureSet, every_set
+from ethbrake_marl.evaluation.measure_sets import BASELINE, Measure, MeasureSet, every_set
 from ethbrake_marl.evaluation.outcome import COLUMN, Outcome, Values
-from ethbrake_marl.evaluation.own_measures import REGISTERED, registered_measure
+from ethbrake_marl.evaluation.own_measures import registered_measure
 from ethbrake_marl.evaluation.statistics import Moments, exact_sum, rate
 from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.game.measures import REPORTED
 
 
 @dataclass(frozen=True, slots=True)
 class AgentTally:
-    """What one agent did in some worlds, by measure."""
+    """Exact sums of one agent's measures over some worlds; tallies of different worlds can be added with ``+``."""
 
-    counts: Mapping[str, tuple[int, int]] = field(default_factory=dict)  # worlds in which it is so, of how many
-    moments: Mapping[str, Moments] = field(default_factory=dict)
-    products: Mapping[str, Fraction] = field(default_factory=dict)  # with the baseline's
+    # True/false measures, by name: number of worlds in which it is true, number of worlds with a value.
+    counts: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    moments: Mapping[str, Moments] = field(default_factory=dict)  # measures that are numbers, by name
+    # Measures that are compared with a baseline, by name: sum over worlds of own value times the baseline's value.
+    products: Mapping[str, Fraction] = field(default_factory=dict)
 
     def __add__(self, other: AgentTally) -> AgentTally:
         counts = dict(self.counts)
@@ -38,16 +41,22 @@ class AgentTally:
         return AgentTally(counts, moments, products)
 
     def count(self, name: str) -> int:
-        """Worlds in which it is so."""
+        """Return the number of worlds in which the true/false measure ``name`` is true; 0 for an unknown name."""
         return self.counts.get(name, (0, 0))[0]
 
     def share(self, name: str, worlds: int) -> float | None:
-        """Their share; None unless all of the worlds have it."""
+        """Return the share, 0 to 1, of worlds in which the true/false measure ``name`` is true.
+
+        ``worlds`` is the number of evaluated worlds. Returns None if the measure lacks a value in some of them.
+        """
         so, of = self.counts.get(name, (0, 0))
         return so / worlds if of == worlds else None
 
     def sums(self, name: str, worlds: int) -> Moments | None:
-        """The moments of a number; None unless all of the worlds have it."""
+        """Return count, sum and sum of squares of the measure ``name``, whose values are numbers.
+
+        ``worlds`` is the number of evaluated worlds. Returns None if the measure lacks a value in some of them.
+        """
         moments = self.moments.get(name)
         return moments if moments is not None and moments.count == worlds else None
 
@@ -59,13 +68,14 @@ def tally_agents(
     baseline: str = BASELINE,
     objectives: Sequence[str] | None = None,
 ) -> dict[str, AgentTally]:
-    """The tally of every agent in the same worlds.
+    """Return the sums of every agent's measures over the same worlds, by the agent's name.
 
     Args:
-        outcomes: by agent.
-        contexts: what each set of measures knows of these worlds; see ``contexts_of``.
-        baseline: the agent to compare with, for sets that have none of their own.
-        objectives: also sum up what each vehicle bears, and what these make of it; None: neither.
+        outcomes: outcome of each agent, by the agent's name.
+        contexts: what each set of measures prepared for these worlds; see ``contexts_of``.
+        baseline: name of the agent to compare with, for sets of measures without a baseline of their own.
+        objectives: objectives such as ``"social:45"``, which weigh a vehicle's own harm against the others'. Also sum
+            the harm that each vehicle bears, and its value under each objective; None: neither.
 
     """
     values: dict[str, dict[str, Values]] = {}
@@ -101,10 +111,18 @@ def tally_agents(
 def estimate_all(
     tallies: Mapping[str, AgentTally], agent: str, worlds: int, *, baseline: str
 ) -> dict[str, Estimate | None]:
-    """Estimate of every measure of one agent in so many worlds; None for what not all of them have."""
+    """Return the estimate (value and 95 % interval) of every measure of one agent, by the measure's name.
+
+    Args:
+        tallies: sums of every agent, by the agent's name.
+        agent: name of the agent.
+        worlds: number of evaluated worlds. A measure that lacks a value in some of them has the estimate None.
+        baseline: name of the agent to compare with; comparisons are None if it was not evaluated.
+
+    """
     own = tallies[agent]
     columns = [name.removeprefix(COLUMN) for name in (*own.counts, *own.moments) if name.startswith(COLUMN)]
-    registered = list(REGISTERED.values())
+    registered = list(REPORTED.values())
     columns.sort(key=lambda column: registered.index(each) if (each := registered_measure(column)) else len(registered))
     return {
         measure.name: _estimate(measure, own, tallies.get(each.baseline or baseline), worlds, each.whole)
@@ -116,7 +134,17 @@ def estimate_all(
 def _estimate(
     measure: Measure, own: AgentTally, baseline: AgentTally | None, worlds: int, whole: str | None
 ) -> Estimate | None:
-    """Estimate of one measure; of one that compares, only where ``whole`` holds in every world."""
+    """Return the estimate of one measure; None if it lacks a value in some of the ``worlds``, or cannot be compared.
+
+    Args:
+        measure: the measure.
+        own: the agent's sums.
+        baseline: the sums of the agent to compare with; None: there is none.
+        worlds: number of evaluated worlds.
+        whole: name of a true/false measure (``MeasureSet.whole``). The agent is compared with the baseline only if this
+            is true in all worlds; None: no such condition.
+
+    """
     name = measure.name if callable(measure.of) else measure.of
     if own.share(name, worlds) is not None:
         return rate(own.count(name), worlds)
@@ -131,7 +159,12 @@ def _estimate(
 
 
 def lower_bounds(tally: AgentTally, worlds: int) -> frozenset[str]:
-    """Means that are only lower bounds, because what their set needs holds in some of the worlds alone."""
+    """Return the names of the measures whose means are only lower bounds for one agent.
+
+    ``tally`` holds the agent's sums over ``worlds`` worlds. A set of measures may name a true/false measure
+    (``MeasureSet.whole``) that says whether a world's values are complete. If this is false in some world, the means of
+    the set are lower bounds.
+    """
 
     def is_partial(each: MeasureSet) -> bool:
         share = None if each.whole is None else tally.share(each.whole, worlds)

@@ -1,7 +1,7 @@
-"""Lists of worlds, evaluated chunk by chunk: here, in several processes, or on a Ray.
+"""Evaluation of lists of worlds in chunks: in this process, in several processes, or on a Ray cluster.
 
-Chunks have a fixed size, and sums over worlds are exact. So no figure depends on how many processes there are, nor on
-whether the worlds are held in memory.
+Chunks have a fixed size, and sums over worlds are exact. So no result depends on the number of processes, or on whether
+the worlds are held in memory.
 """
 
 from __future__ import annotations
@@ -15,20 +15,21 @@ from pathlib import Path
 from typing import Any
 
 from ethbrake_marl.agents.protocol import Driver, Knowledge, Team
-from ethbrake_marl.agents.registry import parse_spec
+from ethbrake_marl.agents.spec import parse_spec
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import CHUNK, own_versions, policies_of, result_versions, scenario_sha256
 from ethbrake_marl.evaluation.lineup import make_lineup
-from ethbrake_marl.evaluation.measures import MEASURE_SETS, silent_in_long_lists
+from ethbrake_marl.evaluation.measure_sets import MEASURE_SETS, silent_in_long_lists
 from ethbrake_marl.evaluation.outcome import Outcome
-from ethbrake_marl.evaluation.own_measures import LOADED, REGISTERED, load_measures
+from ethbrake_marl.evaluation.own_measures import LOADED, load_measures
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise_sums
 from ethbrake_marl.evaluation.tally import Tally
 from ethbrake_marl.files.python_file import file_sha256
 from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.game.measures import REPORTED
 from ethbrake_marl.parallel import Call, run_each
 from ethbrake_marl.registry import versions_used
 from ethbrake_marl.scenario.sample import Sample
@@ -39,23 +40,24 @@ MOST_EPISODES = 10**12
 
 OnDone = Callable[[int], None]  # worlds done so far
 
-_MADE: dict[str, Mapping[str, Driver]] = {}  # the last lineup of this process; an evaluation drives copies
+_MADE: dict[str, Mapping[str, Driver]] = {}  # agents of this process's last lineup; an evaluation drives copies
 
 
 @dataclass(frozen=True, slots=True)
 class Lineup:
-    """Who drives, by specs: plain data, of which every process makes the same agents.
+    """The agents of an evaluation as plain data, from which every worker process builds the same agents.
 
     Args:
-        agents: specs, as on the command line.
-        scenario: whose learners they drive.
-        harm_count: harm that agents minimise.
-        uncertainty: what shields do not know that take one, as text.
-        measures: that evaluations tell, too, as ``load_measures`` takes them; with those that it was given before.
-        told: names of all measures that evaluations tell, whatever is registered later.
-        sets: names of the sets of measures in the process that asks.
-        same: what must be the same in every process; see ``Lineup.of``.
-        packages: name -> version of each that gave a part to the process that asks: no other may be installed.
+        agents: specs (texts that name agents, such as ``full_brake``), as on the command line.
+        scenario: the scenario whose learners they drive.
+        harm_count: harm that agents minimise: each pair's first impact only (``first``) or all impacts (``total``).
+        uncertainty: uncertainty for shields that need one, as text: ``gaps_m=0.5``.
+        measures: names or ``FILE:NAME`` of user measures to load, as ``load_measures`` takes them.
+        told: names of all user measures that the evaluation reports; measures registered later are not added.
+        sets: names of the sets of measures in the requesting process.
+        same: hash of everything that must be equal in every process; see ``Lineup.of``.
+        packages: name and version of each package that provided a part in the requesting process; workers must have the
+            same.
 
     """
 
@@ -71,13 +73,21 @@ class Lineup:
 
     @classmethod
     def of(cls, agents: Sequence[str], scenario: Scenario, **how: Any) -> Lineup:
-        """A lineup that other processes make only from the same policies, measures and versions.
+        """Return the lineup of these agents, with a hash that worker processes compare with their own.
+
+        A worker with other policies, measures or versions refuses the lineup (``make``).
+
+        Args:
+            agents: specs, as on the command line.
+            scenario: the scenario whose learners they drive.
+            how: ``harm_count``, ``uncertainty`` and ``measures`` of the class.
 
         Raises what ``make_lineup`` raises.
+
         """
         load_measures(how.pop("measures", ()))
         sets = tuple(name for name, _ in MEASURE_SETS.items())  # loads them, so that their versions are known
-        lineup = cls(tuple(agents), scenario, measures=tuple(LOADED), told=tuple(REGISTERED), sets=sets, **how)
+        lineup = cls(tuple(agents), scenario, measures=tuple(LOADED), told=tuple(REPORTED), sets=sets, **how)
         made = lineup._make_anew()
         same = lineup._same(made)
         _MADE.clear()
@@ -85,13 +95,14 @@ class Lineup:
         return replace(lineup, same=same, packages=versions_used())
 
     def make(self) -> Mapping[str, Driver]:
-        """The agents in this process; raises ``InvalidInput`` where they are others than in the process that asks."""
+        """Return the agents by spec, built once per process.
+
+        Raises ``InvalidInput`` if policies, measures or versions differ from those where the lineup was created.
+        """
         if self.same not in _MADE:
             load_measures(self.measures)
             made = self._make_anew()
-            same = (
-                self._same(made) == self.same and {*self.told} <= REGISTERED.keys() and {*self.sets} <= {*MEASURE_SETS}
-            )
+            same = self._same(made) == self.same and {*self.told} <= REPORTED.keys() and {*self.sets} <= {*MEASURE_SETS}
             if not same or any(_installed(name) != used for name, used in self.packages.items()):
                 raise InvalidInput(
                     "evaluate: a worker has other policies, measures or versions than the process that asks it;"
@@ -111,7 +122,7 @@ class Lineup:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _digests(self) -> list[str]:
-        """SHA-256 of every file that it names: code, and weights of an agent that is code."""
+        """Return the SHA-256 of every file that specs and measures name: Python files, and weights for such agents."""
         named = [part for spec in map(parse_spec, self.agents) if spec.file for part in (spec.file[0], spec.policy)]
         named += [name.rpartition(":")[0] for name in self.measures]
         return [file_sha256(Path(each)) for each in named if each is not None and Path(each).is_file()]
@@ -133,7 +144,17 @@ def evaluate_held(
     ray: str | None = None,
     on_done: OnDone | None = None,
 ) -> Evaluation:
-    """``evaluate`` all worlds of a sample; ``jobs`` and ``ray`` as in ``run_each``."""
+    """Let the agents of a lineup drive every world of a sample, in several processes if requested.
+
+    Args:
+        lineup: the agents.
+        sample: the worlds, all in memory.
+        seed: seed of the worlds, which is recorded in the result; None for worlds of other origin.
+        jobs: number of processes; None: one, or as many as Ray has cores.
+        ray: address of a Ray cluster, or ``local``; None: no Ray.
+        on_done: called with the number of worlds done so far.
+
+    """
     calls: Iterator[Call] = ((_drive, lineup, part, seed, first) for first, part in chunks_of(sample))
     parts: list[Evaluation] = []
     for part in run_each(calls, jobs, ray):
@@ -148,7 +169,7 @@ def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evalua
 
 
 def _only(outcome: Outcome, names: Sequence[str]) -> Outcome:
-    """The outcome with these registered measures alone."""
+    """Return the outcome without user measures (``Outcome.metrics``) other than those called ``names``."""
     kept = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
     return replace(outcome, metrics=kept)
 
@@ -163,9 +184,20 @@ def tally_list(
     ray: str | None = None,
     on_done: OnDone | None = None,
 ) -> Tally:
-    """The statistics of the worlds 0 to ``episodes - 1`` of a list of any length; no world is kept.
+    """Return the statistics of worlds 0 to ``episodes - 1`` of a list of any length.
 
-    Sets of measures that take longer than driving are not in them. ``jobs`` and ``ray`` as in ``run_each``.
+    The worlds are not held in memory together. Sets of measures that take longer than driving are omitted.
+
+    Args:
+        lineup: the agents.
+        episodes: number of worlds.
+        seed: seed from which the worlds are drawn.
+        objectives: objectives such as ``"social:45"``, which weigh a vehicle's own harm against the others'. Also sum
+            the harm that each vehicle bears, and its value under each objective.
+        jobs: number of processes; None: one, or as many as Ray has cores.
+        ray: address of a Ray cluster, or ``local``; None: no Ray.
+        on_done: called with the number of worlds done so far.
+
     """
     check_whole_number("episodes", episodes, 1, MOST_EPISODES)
     check_whole_number("seed", seed, 0)
@@ -190,7 +222,16 @@ def _tell(on_done: OnDone | None, chunks: int, worlds: int) -> None:
 
 
 def summarise_tally(lineup: Lineup, tally: Tally, seed: int) -> SummaryTable:
-    """One row per agent, as ``summarise``. Raises ``PhysicsError`` if no world is left."""
+    """Return the results table of a list that ``tally_list`` evaluated, one row per agent, as ``summarise`` does.
+
+    Args:
+        lineup: the evaluated agents.
+        tally: result of ``tally_list``.
+        seed: seed of the list.
+
+    Raises ``PhysicsError`` if every world was left out.
+
+    """
     if not tally.worlds:
         raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in tally.left_out})
     scenario = lineup.scenario

@@ -1,4 +1,4 @@
-"""Two results compared: the same worlds of the same scenario, or no comparison."""
+"""Comparison of two results files on the same worlds of the same scenario."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from ethbrake_marl.physics.state import Floats
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """What one agent does more in the second result than in the first, mean per world (m2/s2)."""
+    """Difference between two results in the mean harm per world of one agent: second minus first (m2/s2)."""
 
-    agent: str
-    policy: Literal["same", "other", "none"]  # whether both drove by the same one
-    harms: Mapping[str, Estimate]  # by the name of the harm
-    exploits: tuple[Exploits, Exploits]  # in the first result and in the second: what harm does not count
+    agent: str  # name of the agent, the same in both results
+    policy: Literal["same", "other", "none"]  # trained policies in both results: equal, different, or not any
+    harms: Mapping[str, Estimate]  # harm (``first_impact_harm``, ``total_harm``) -> difference with interval
+    exploits: tuple[Exploits, Exploits]  # behaviour that harm does not count, in the first and in the second result
 
     @property
     def marked(self) -> str:
-        """Its agent, marked where it exploits what harm does not count, in either result."""
+        """Name of the agent, followed by ‡ if in either result its behaviour does damage that harm does not count."""
         return f"{self.agent} {MARK}" if any(each.names for each in self.exploits) else self.agent
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data for JSON."""
+        """Return plain data for JSON: ``agent``, ``policy``, ``exploits``, each harm's difference with its interval."""
         harms = {f"{name}_difference": estimate for name, estimate in self.harms.items()}
         exploits = [list(each.names) for each in self.exploits]
         return {"agent": self.agent, "policy": self.policy, **Estimate.side_by_side(harms), "exploits": exploits}
@@ -40,19 +40,22 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Two results on the same worlds, the second minus the first, agent by agent."""
+    """Comparison of two results files on the same worlds, agent by agent."""
 
-    differences: tuple[Difference, ...]
-    unpaired_because: str | None  # None: intervals are paired by world
-    left_over: tuple[tuple[str, ...], tuple[str, ...]]  # agents of the first alone, and of the second
-    other_settings: Mapping[
-        str, tuple[str | None, str | None]
-    ]  # of the agents of the first and of the second, likewise
-    other_versions: Mapping[str, tuple[str | None, str | None]]  # of the first and of the second, where they differ
+    differences: tuple[Difference, ...]  # second result minus first, one entry per agent of both
+    unpaired_because: str | None  # reason why the intervals are not paired by world; None: they are paired
+    left_over: tuple[tuple[str, ...], tuple[str, ...]]  # names of agents in the first result only, in the second only
+    # Settings of the agents that differ, by name: value in the first and in the second result; None: not there.
+    other_settings: Mapping[str, tuple[str | None, str | None]]
+    # Versions of packages that differ, by name: version in the first and in the second result; None: not there.
+    other_versions: Mapping[str, tuple[str | None, str | None]]
 
     @property
     def exploits_line(self) -> str:
-        """Who exploits in which result what harm does not count, as a sentence; empty where nobody does."""
+        """Sentence about agents whose behaviour does damage that harm does not count (``Exploits``).
+
+        It says in which result they do; it is empty if no agent does.
+        """
         found: dict[str, Exploits] = {}
         for each in self.differences:
             first, second = each.exploits
@@ -62,7 +65,7 @@ class Comparison:
         return Exploits.sentence(found)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data for JSON."""
+        """Return the comparison as plain data for JSON, with one object per agent under ``agents``."""
         return {
             "intervals": "paired" if self.unpaired_because is None else "unpaired",
             "unpaired_because": self.unpaired_because,
@@ -75,10 +78,10 @@ class Comparison:
 
 
 def compare_results(first: Result, second: Result) -> Comparison:
-    """What agents of the same name did in both, the second minus the first.
+    """Compare the mean harms of agents of the same name in two results, as second minus first.
 
-    Paired by world where both have every world beside them. Raises ``InvalidInput`` for results of different kinds, on
-    different worlds or scenarios, or without a common agent.
+    The comparison is paired by world if both results come with a file of every world. Raises ``InvalidInput`` for
+    results of different kinds, on different worlds or scenarios, or without a common agent.
     """
     for key, what in SAME.items():
         told, told_second = (told_of(result.about, key) for result in (first, second))
@@ -117,11 +120,14 @@ def compare_results(first: Result, second: Result) -> Comparison:
     return Comparison(tuple(differences), because, (left_over[0], left_over[1]), *changed)
 
 
-Worlds = dict[str, tuple[Floats, Floats]]  # agent -> harms [n, 2] of the first and of the second, world by world
+Worlds = dict[str, tuple[Floats, Floats]]  # agent -> harms [n, 2] of every world, in the first and second result
 
 
 def _worlds_of_both(first: Result, second: Result, common: Sequence[str]) -> tuple[Worlds | None, str | None]:
-    """The harms to pair, or why there are none."""
+    """Return the harms of every world in both results, and None; or None, and the reason why they cannot be paired.
+
+    ``common``: names of the agents that both results have.
+    """
     try:
         one, other = first.harms(), second.harms()
     except InvalidInput as error:

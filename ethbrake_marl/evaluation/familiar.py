@@ -1,4 +1,4 @@
-"""Warnings of policies that drive in worlds beyond those of their training."""
+"""Warnings about trained policies that drive in worlds unlike those of their training."""
 
 from __future__ import annotations
 
@@ -14,16 +14,23 @@ from ethbrake_marl.policies.manifest import Manifest
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.schema import Scenario
 
-_MOST_BEYOND = 0.05  # share of the worlds: as many may lie beyond without a word
+_MOST_BEYOND = 0.05  # share of worlds outside the training's range that is tolerated without a warning
 
-_TRAINED = 2_000  # worlds of a training that say where it took place
+_TRAINED = 2_000  # number of worlds drawn from the training's scenario to find the range of each quantity
 
 
 def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, vehicles: Sequence[int]) -> None:
-    """Warn (``Unfamiliar``) where a trained policy drives in worlds beyond those that it was trained in.
+    """Warn (``Unfamiliar``) about each trained policy that is to drive in worlds outside the range of its training.
 
-    These are drawn from the scenario in its manifest. Where that cannot be drawn here, nothing is said. Of the channel
-    only what a world has of it is compared: latencies.
+    The training's worlds are drawn from the scenario in the policy's manifest. If that scenario cannot be drawn here,
+    there is no warning. Of the V2X channel, only the latencies are compared.
+
+    Args:
+        agents: agents by name; those that are not trained policies are ignored.
+        worlds: worlds at the alert in which they are to drive.
+        scenario: scenario of these worlds.
+        vehicles: indices (0 = front) of the vehicles that each agent drives.
+
     """
     drives: dict[str, tuple[str, Manifest, dict[str, None]]] = {}  # by hash: the first agent, vehicles in order
     for name, agent in agents.items():
@@ -49,7 +56,10 @@ def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scen
 
 
 def _beyond(before: Worlds, worlds: Worlds) -> list[str]:
-    """The quantities that lie beyond those ``before``."""
+    """Return descriptions of quantities of ``worlds`` that lie outside the range of the training's worlds ``before``.
+
+    Example: ``["latency_s in 40 % of the worlds", "no friction"]``.
+    """
     found, known, here = [], QUANTITY.of(before), QUANTITY.of(worlds)
     for key, rule in here.items():
         if key not in known:

@@ -1,4 +1,4 @@
-"""An evaluation by group: the worlds of each scenario of a mixture, or those in which a vehicle is of one type."""
+"""Results tables by group of worlds: one table for each scenario of a mixture, or for each type of a vehicle."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.measures import BASELINE
+from ethbrake_marl.evaluation.measure_sets import BASELINE
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
 
-NO_TYPE = "no type"  # of a vehicle of a mixture's member without types
+NO_TYPE = "no type"  # group of worlds in which the vehicle has no type
 
 
 def summarise_by(evaluation: Evaluation, by: str, *, baseline: str = BASELINE) -> dict[str, SummaryTable]:
-    """Rows as ``summarise`` for each group of worlds, by the group's name, sorted.
+    """Return one results table (``summarise``) for each group of worlds, by the group's name, in alphabetical order.
 
     Args:
-        evaluation: of a mixture, or of a scenario with types of vehicles.
-        by: ``scenario``, or whose type: ``vehicle_2_type``.
-        baseline: as in ``summarise``.
+        evaluation: evaluation on a mixture, or on a scenario with types of vehicles.
+        by: kind of group: ``scenario``, or a vehicle's type such as ``vehicle_2_type``.
+        baseline: name of the agent to compare with.
 
-    Raises ``InvalidInput`` for worlds that were drawn without such, ``UnknownName`` for another column.
+    Raises ``InvalidInput`` for worlds without groups, ``UnknownName`` for an unknown ``by``.
 
     >>> import ethbrake_marl as eb
     >>> delays = eb.load_scenario("mixture-delays")

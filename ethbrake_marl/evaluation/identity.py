@@ -1,7 +1,7 @@
-"""The identity of a result: the worlds, the scenario and the policies that it is about, and what computed it.
+"""Identity of a result: hashes of its worlds, scenario and policies, and the versions that computed it.
 
-Two results can be compared where worlds and scenario have the same hashes. Versions are told, and no reason to
-refuse.
+Two results can be compared if their worlds and scenarios have the same hashes. Different versions are reported, but do
+not prevent a comparison.
 """
 
 from __future__ import annotations
@@ -27,23 +27,29 @@ Kind = Literal["evaluate", "shield", "best-harm", "ablate", "learning-curves"]
 
 _PACKAGES = ("ethbrake-marl", "numba", "numpy")
 
-_WORDS = {"name", "title", "description", "source"}  # what a scenario is called changes nothing
+_WORDS = {"name", "title", "description", "source"}  # texts of a scenario, which do not affect an episode
 
-_BLOCK = 50_000  # worlds hashed at once: news of a world may be a view that takes no memory
+_BLOCK = 50_000  # worlds hashed at once; arrays of messages may be views that would take much memory when copied
 
-CHUNK = 2_500  # worlds advanced together: bounds memory; of results only ``worlds_sha256`` of a long list has it
+CHUNK = 2_500  # worlds advanced together, to limit memory; affects no result but ``worlds_sha256`` of a long list
 
-EPISODES, LIST_SEED = 10_000, 7  # of the list on which everything is measured; a training has a seed of its own
+EPISODES, LIST_SEED = 10_000, 7  # size and seed of the standard evaluation list; trainings use other seeds
 
-HELD = 100_000  # worlds of a list that is held in memory as a whole, unless each of its worlds is asked for
+HELD = 100_000  # largest list that is held in memory as a whole
 
-HASHES = 1 << 256  # sums of hashes are kept modulo this
+HASHES = 1 << 256  # modulus of sums of hashes
 
 
 def worlds_sha256(worlds: Worlds, index: Ints) -> str:
-    """SHA-256 of a list of worlds: of every array (little-endian, by name) and the worlds' numbers in the list.
+    """Return a hash of a list of worlds, as 64 hexadecimal digits: equal lists have equal hashes on every machine.
 
-    Of more than ``HELD`` worlds it is ``hash_of_chunks``, which needs no more than one chunk of them at once.
+    It is the SHA-256 of every array (little-endian, by name) and of the numbers of the worlds. For more than 100,000
+    worlds it is ``hash_of_chunks``, which needs less memory.
+
+    Args:
+        worlds: the n worlds at the alert.
+        index: [n] number of each world in its list.
+
     """
     if worlds.n > HELD:
         return f"{hash_of_chunks(worlds, index):064x}"
@@ -55,7 +61,10 @@ def _hash_at_once(worlds: Worlds, index: Ints) -> str:
 
 
 def hash_of_chunks(worlds: Worlds, index: Ints) -> int:
-    """Sum modulo 2^256 of the SHA-256 of the worlds of each chunk: those numbered 0 to 2,499, 2,500 to 4,999, ..."""
+    """Return the sum modulo 2^256 of the SHA-256 of each chunk of 2,500 worlds.
+
+    ``index`` [n] is the number of each world in its list; chunks are numbers 0 to 2,499, 2,500 to 4,999, and so on.
+    """
     chunks = [np.flatnonzero(index // CHUNK == number) for number in np.unique(index // CHUNK)]
     return sum(int(_hash_at_once(worlds.take(chunk), index[chunk]), 16) for chunk in chunks) % HASHES
 
@@ -71,9 +80,10 @@ def _arrays_sha256(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _arrays(value: Any) -> dict[str, np.ndarray]:
-    """The arrays of a dataclass and of those inside it, by name; not those that say nothing.
+    """Return the arrays of the dataclass ``value`` and of the dataclasses inside it, by name.
 
-    These are messages that none sends and pieces that nobody brakes in, and rates of brakes that are there at once.
+    Arrays that say nothing are omitted: those of messages and braking profiles if the worlds have none, and build-up
+    rates of brakes that are all infinite.
     """
     found: dict[str, np.ndarray] = {}
     for field in fields(value):
@@ -86,36 +96,49 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
 
 
 def scenario_sha256(scenario: Scenario) -> str:
-    """SHA-256 of all that shapes an episode: every value of the scenario, defaults too, but neither name nor texts."""
+    """Return the SHA-256 of everything in a scenario that affects an episode, including defaults, in hexadecimal.
+
+    Name, title and other texts are excluded.
+    """
     content = scenario.content(without=_WORDS)
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def policies_of(drivers: Mapping[int, object]) -> dict[str, str]:
-    """Vehicle's name -> SHA-256 of the policy that drives it; none of who has no policy."""
+    """Return the SHA-256 of each vehicle's trained policy: ``{"vehicle_2": "3f..."}``.
+
+    ``drivers`` maps the index of a vehicle (0 = front) to its agent. Vehicles with an untrained agent are omitted.
+    """
     return {f"vehicle_{i + 1}": sha for i, agent in drivers.items() if (sha := policy_sha256(agent)) is not None}
 
 
 def result_versions() -> dict[str, str]:
-    """Name -> version of Python and of every package that a result's numbers depend on.
+    """Return name -> version of Python and of every package on which a result's numbers depend.
 
-    Packages that gave a part to this process are among them; of the user's own files that it ran the SHA-256 is told.
+    This includes packages that provided a part in this process, and the SHA-256 of the user's own Python files that it
+    ran.
     """
     return own_versions() | versions_used() | {name: f"SHA-256 {sha256}" for name, sha256 in files_run().items()}
 
 
 def own_versions() -> dict[str, str]:
-    """Those of them that every process has, whatever else it loaded."""
+    """Return name -> version of Python, this package, numba and numpy, without other loaded packages."""
     return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
 
 
 def result_identity(
     kind: Kind, scenario: Scenario, sample: Sample | None, left_out: Collection[int] = ()
 ) -> dict[str, Any]:
-    """What a results file of this kind says of itself: ``kind``, hashes of worlds and scenario, ``versions``.
+    """Return the entries that identify a result, for its JSON file: ``kind``, hashes and ``versions``.
 
-    ``left_out`` are rows of the sample that no figure counts. Without a sample nothing is said of worlds: they differ
-    inside the file, which says it there.
+    The hashes are ``scenario_sha256`` and ``worlds_sha256``.
+
+    Args:
+        kind: kind of results, such as ``evaluate`` or ``shield``.
+        scenario: scenario of the worlds.
+        sample: the worlds; None if parts of the file have different worlds: then there is no ``worlds_sha256``.
+        left_out: rows of the sample that the results do not count; they are not hashed.
+
     """
     found: dict[str, Any] = {"kind": kind, "scenario_sha256": scenario_sha256(scenario), "versions": result_versions()}
     if sample is not None:

@@ -1,19 +1,14 @@
-"""Several agents by their specs, as the command line takes them."""
+"""Build several agents from their specs, as the command line takes them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
 from ethbrake_marl.agents.driving import episode_engine, script_agents
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Agent, Driver, Team
-from ethbrake_marl.agents.registry import (
-    agents_of_group,
-    make_agent,
-    parse_spec,
-    settings_needed,
-    shields_with,
-    split_specs,
-)
+from ethbrake_marl.agents.registry import agents_of_group, settings_needed, shields_with
+from ethbrake_marl.agents.spec import parse_spec, split_specs
 from ethbrake_marl.engine.memory import ask_script, begin_script
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.evaluation.familiar import warn_unfamiliar
@@ -23,10 +18,16 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, *, warn: bool = False) -> None:
-    """Try every agent before the first of them starts a long evaluation; raises what it would raise then.
+    """Let every agent decide once, so that its errors show before a long evaluation; raise what it would raise.
 
-    Scripts that need no state are tried on all worlds, which takes no time; all others on the first. ``warn``: as
-    ``warn_unfamiliar``.
+    An agent that does not depend on the state decides in all worlds, any other only in the first.
+
+    Args:
+        agents: agents or teams by name.
+        worlds: worlds at the alert.
+        scenario: scenario whose learners the agents drive.
+        warn: also warn about policies in worlds unlike those of their training (``warn_unfamiliar``).
+
     """
     if warn:
         warn_unfamiliar(agents, worlds, scenario, scenario.learners)
@@ -52,13 +53,20 @@ def make_lineup(
     alone: bool = False,
     bare: bool = False,
 ) -> dict[str, Driver]:
-    """One fresh agent per spec of ``make_agent``, by its spec, to drive the scenario's learners.
+    """Make one agent for each spec, to drive the scenario's learners, and return spec -> agent.
 
-    A text has commas between specs. ``ladder`` and other names of groups stand for several agents.
-    ``harm_count`` is the harm that optimising and choosing agents minimise. ``uncertainty`` is for shields that
-    do not know the world. ``alone``: each drives one vehicle. ``bare``: they go behind a shield, and have none.
-    Raises ``InvalidInput`` for a spec given twice, an uncertainty that is missing or that nobody uses, a team or a
-    shield that has no place, and what ``make_agent`` raises.
+    Args:
+        specs: texts that name agents, as ``make_agent`` takes them (``"full_brake"``, ``"ppo@shipped+step"``): a list,
+            or one text with commas between them. A name of a group, such as ``ladder``, stands for several agents.
+        scenario: the scenario whose learners they drive.
+        harm_count: harm that agents minimise, if they optimise: ``first`` or ``total``.
+        uncertainty: uncertainty for the shields that need one, as ``make_agent`` takes it.
+        alone: refuse teams, which drive several vehicles.
+        bare: refuse agents with a shield, because the caller adds one; with one learner, also refuse teams.
+
+    Raises ``InvalidInput`` for a repeated spec, a missing or unused uncertainty, a team or a shield where none is
+    allowed, and whatever ``make_agent`` raises.
+
     """
     listed = split_specs(specs) if isinstance(specs, str) else specs
     specs = [each for spec in listed for each in agents_of_group(spec) or (spec,)]
@@ -85,5 +93,9 @@ def make_lineup(
 
 
 def make_agents(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCount = "first") -> dict[str, Agent]:
-    """``make_lineup`` where one vehicle is driven."""
+    """Make one agent for each spec, to drive a single vehicle, and return spec -> agent; see ``make_lineup``.
+
+    ``specs`` are texts that name agents, such as ``full_brake``. ``harm_count`` is the harm that agents minimise, if
+    they optimise. Raises ``InvalidInput`` for a team.
+    """
     return make_lineup(specs, scenario, harm_count=harm_count, alone=True)  # type: ignore[return-value]  # no teams

@@ -1,15 +1,15 @@
-"""The motion of whole episodes, exact at every moment."""
+"""Exact motion of whole episodes: pieces of cubic polynomials from which the state at any time follows."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ethbrake_marl.agents.driving import Episodes, episode_engine
 from ethbrake_marl.agents.protocol import Driver, Team
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.evaluation.impacts import Tape
+from ethbrake_marl.evaluation.tape import Tape
 from ethbrake_marl.game.harm import HARM_COUNTS, Ledger
 from ethbrake_marl.physics.left_out import ImpactRows
 from ethbrake_marl.physics.state import Floats, Worlds
@@ -17,39 +17,43 @@ from ethbrake_marl.physics.trace import segment_pieces
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
 
-_SAME = 1e-9  # m, m/s: a piece that goes on like the one before it is part of it
+_SAME = 1e-9  # tolerance (m, m/s) within which a piece continues the piece before it, so both are joined
 
-_SHORT_S = 1e-4  # pieces of a cascade of tiny bounces may be shorter; they are not told apart
+_SHORT_S = 1e-4  # time (s) within which the pieces of a cascade of tiny bounces are joined
 
 
 @dataclass(frozen=True, slots=True)
 class EpisodeMotion:
-    """One world from the alert to the end of its episode, driven by one agent."""
+    """Exact motion of one world from the alert to the end of its episode, with its impacts and harm."""
 
-    world: Worlds  # n = 1, at the alert
-    # [k, 1 + 4 N] time (s), place of Vehicle 1 (m), gaps, speeds, accelerations and jerks where each begins
+    world: Worlds  # the world at the alert, n = 1
+    # Motion as k pieces in order of time, [k, 1 + 4 N], during each of which all jerks are constant. A row holds the
+    # state at the beginning of a piece: time (s), position of Vehicle 1 (m), gaps (N - 1, m), speeds (N, m/s),
+    # accelerations (N, m/s2) and jerks (N, m/s3). ``state_at`` returns the state at any time within a piece.
     pieces: Floats
-    end_s: float
-    impacts: ImpactRows  # in order of time; world is 0
-    stepped_in_s: Floats  # beginnings of the decisions in which a shield replaced what was proposed
-    ledger: Ledger  # n = 1
-    final: Worlds  # n = 1, as the episode left it
-    at_rest: bool  # the line came to rest; else the horizon cut the episode off
+    end_s: float  # time since the alert at which the episode ends (s)
+    impacts: ImpactRows  # all impacts in order of time; their column ``world`` is 0
+    stepped_in_s: Floats  # times (s) of the decisions in which a shield replaced the policy's action, ascending
+    ledger: Ledger  # harm of all impacts of the episode, n = 1
+    final: Worlds  # the world at the end of the episode, n = 1
+    at_rest: bool  # whether the line came to rest before the horizon
 
     @property
     def harm(self) -> tuple[float, float]:
-        """Harm of the line, by first impacts and in total (m2/s2)."""
+        """First-impact harm and total harm of the whole line (m2/s2), as a pair."""
         first, total = (float(self.ledger.world_harm(count)[0]) for count in HARM_COUNTS)
         return first, total
 
 
 def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[EpisodeMotion]:
-    """Let an agent drive the scenario's learners through every world, as ``evaluate`` does, and keep every motion.
+    """Let an agent drive the scenario's learners through every world, as ``evaluate`` does.
+
+    Returns one ``EpisodeMotion`` per world, in their order.
 
     Args:
-        worlds: at the alert.
-        agent: drives each learner, or, as a team, its vehicles; it is left as it is.
-        scenario: of the worlds; its scripts drive the other vehicles.
+        worlds: worlds at the alert.
+        agent: an agent, of which each learner gets a copy, or a team; it is not changed.
+        scenario: scenario of the worlds, whose scripts drive the other vehicles.
 
     Raises ``PhysicsError`` naming the worlds that could not be advanced.
 
@@ -62,7 +66,14 @@ def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[E
 
 
 class _Follower(Tape):
-    """Keeps the steps, and in which decisions a shield stepped in."""
+    """Recorder of every step, and of the decisions in which a shield replaced the policy's action.
+
+    Args:
+        worlds: the worlds at the alert.
+        team: agents that drive.
+        engine: engine that runs the episodes, from which the shield's decisions are read.
+
+    """
 
     def __init__(self, worlds: Worlds, team: Team, engine: Engine) -> None:
         super().__init__(worlds)
@@ -72,23 +83,27 @@ class _Follower(Tape):
         self._engine, self._ruling = engine, engine.ruling
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Keep one step."""
+        """Record one step.
+
+        Args:
+            before: the worlds at the beginning of the step.
+            command_mps2: [n, N] commanded accelerations during the step.
+            until_s: [n] time at which the step ends.
+
+        """
         super().see(before, command_mps2, until_s)
         ruling = self._engine.ruling
-        if ruling is not None and ruling is not self._ruling:  # a step is shown in parts
+        if ruling is not None and ruling is not self._ruling:  # ``see`` may be called several times in a step
             for k in np.flatnonzero(ruling.stepped_in & ruling.asked).tolist():
                 self._stepped_in[k].append(float(before.time_s[k]))
             self._ruling = ruling
 
     def motions(self, episodes: Episodes) -> list[EpisodeMotion]:
-        """What was seen, world by world."""
+        """Return the recorded motion of each world; ``episodes`` is the result of the finished run."""
         n, N = self.worlds.n, self.worlds.N
-        impacts, pieces = self.impacts(), self._pieces()
-        ends = np.searchsorted(impacts.world, np.arange(n + 1))
+        impacts, pieces = self.episodes(), self._pieces()
         found = []
         for k in range(n):
-            mine = slice(*ends[k : k + 2])
-            rows = ImpactRows(*(getattr(impacts, f.name)[mine] for f in fields(ImpactRows)))
             ledger = episodes.ledger.take([k])
             final, taken_over = episodes.final.take([k]), list(self._stepped_in[k])
             chosen = [memory["chosen_policy"][k] for i, memory in episodes.memories.items() if i in self._hybrids]
@@ -99,7 +114,7 @@ class _Follower(Tape):
                     self.worlds.take([k]),
                     join_pieces(pieces[k], N),
                     float(final.time_s[0]),
-                    replace(rows, world=np.zeros_like(rows.world)),
+                    impacts.take(np.array([k])).rows,
                     np.array(sorted(taken_over)),
                     ledger,
                     final,
@@ -109,7 +124,10 @@ class _Follower(Tape):
         return found
 
     def _pieces(self) -> list[Floats]:
-        """The pieces of each world's motion, one after the other; one piece where it ends at once."""
+        """Return the motion of each world as pieces, [k, 1 + 4 N] as in ``EpisodeMotion``.
+
+        A world whose episode ends at once has a single piece.
+        """
         parts: list[list[Floats]] = [[] for _ in range(self.worlds.n)]
         way_m = np.zeros(self.worlds.n)
         for before, command, until_s in self.steps:
@@ -128,7 +146,16 @@ class _Follower(Tape):
 
 
 def join_pieces(pieces: Floats, vehicles: int) -> Floats:
-    """The pieces without those that go on like the one before; of many within ``_SHORT_S`` the last one stays."""
+    """Return the same motion with fewer pieces; a piece is a stretch of time in which all jerks are constant.
+
+    A piece is dropped if the piece before it, continued, gives its state within rounding. Of several pieces that begin
+    within the same 0.1 ms, only the last is kept.
+
+    Args:
+        pieces: [k, 1 + 4 N] time and state at the beginning of each piece, as in ``EpisodeMotion``.
+        vehicles: number of vehicles, N.
+
+    """
     last_of_many = np.append(np.diff(np.floor(pieces[:, 0] / _SHORT_S)) > 0.0, True)
     last_of_many[0] = True
     kept: list[Floats] = []
@@ -139,7 +166,16 @@ def join_pieces(pieces: Floats, vehicles: int) -> Floats:
 
 
 def state_at(piece: Floats, time_s: float, vehicles: int) -> Floats:
-    """Place of Vehicle 1, gaps, speeds, accelerations and jerks [4 N] at a time of a piece [1 + 4 N]."""
+    """Return the state [4 N] at a time within a piece of constant jerks.
+
+    The state is the position of Vehicle 1 (m), gaps (m), speeds (m/s), accelerations (m/s2) and jerks (m/s3).
+
+    Args:
+        piece: [1 + 4 N] time and state at the beginning of the piece.
+        time_s: time since the alert (s).
+        vehicles: number of vehicles, N.
+
+    """
     t, N = time_s - piece[0], vehicles
     speeds, rates, jerks = (piece[1 + part * N : 1 + (part + 1) * N] for part in (1, 2, 3))
     way = (speeds + 0.5 * (rates + jerks * t / 3.0) * t) * t

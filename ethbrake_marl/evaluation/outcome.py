@@ -1,4 +1,4 @@
-"""``Outcome``: what one agent achieved in each world of a list."""
+"""``Outcome``: the results of one agent in each world of a list."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount, Ledger
 from ethbrake_marl.game.objectives import Declared, scored
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
-_NAMED = 10  # worlds left out that are named one by one; all stand in the JSON
+_NAMED = 10  # number of left-out worlds that a note lists; JSON lists all of them
 
-COLUMN = "metric_"  # before the name of a registered measure, in JSON and in files with every world
+COLUMN = "metric_"  # prefix of a registered measure's name, in JSON and in files with every world
 
-Values = NDArray[Any]  # [n]
+Values = NDArray[Any]  # values of a measure in n worlds, [n]
 
-# Of an agent that does not say what it knows.
+# Knowledge of an agent that does not state what it knows.
 UNSTATED = Knowledge((Source.UNSTATED,))
 
-_COLUMNS = ("at_rest", "predicted_harm", "chosen_policy", "shoved_m", "sampled_harm")  # of an outcome, [n]
+_COLUMNS = ("at_rest", "predicted_harm", "chosen_policy", "shoved_m", "sampled_harm")  # fields [n] of an outcome
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What one agent achieved, world by world.
+    """Results of one agent in n worlds: harm, final state and what was measured, world by world.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -40,16 +40,20 @@ class Outcome:
 
     """
 
-    ledger: Ledger  # of every impact
-    final: Worlds  # each world as its episode left it
-    at_rest: Bools  # [n] the line came to rest; else the horizon cut the episode off
-    predicted_harm: Floats | None  # [n] what the agent expected at the alert, if it predicts and drives alone
-    chosen_policy: Bools | None  # [n] a hybrid drove by its policy; else by its backup
-    knows: Knowledge = UNSTATED  # what the agent says it knows of the line
-    shoved_m: Floats | None = None  # [n] how far Vehicle 1 ends beyond where it would by itself
-    sampled_harm: Floats | None = None  # [n] the paper's sum over samples of the same commands
+    ledger: Ledger  # harm of all impacts in each world, by pair and vehicle
+    final: Worlds  # each world at the end of its episode
+    at_rest: Bools  # [n] whether the line came to rest before the horizon
+    predicted_harm: Floats | None  # [n] harm that the agent predicted at the alert (m2/s2); None if it predicts none
+    # [n] whether the policy behind a shield drove to the end: episode mode chose it at the alert, or step mode replaced
+    # none of its actions. None without a shield.
+    chosen_policy: Bools | None
+    knows: Knowledge = UNSTATED  # the agent's statement of what it knows about the line
+    # [n] distance by which Vehicle 1 was shoved beyond its own stopping point; None: not measured.
+    shoved_m: Floats | None = None
+    # [n] harm by the paper's sum over samples of the motion, for the same commands (m2/s2); None: not measured.
+    sampled_harm: Floats | None = None
     policies: Mapping[str, str] = field(default_factory=dict)  # vehicle's name -> SHA-256 of its policy's manifest
-    metrics: Mapping[str, Floats] = field(default_factory=dict)  # registered measures by column, [n]
+    metrics: Mapping[str, Floats] = field(default_factory=dict)  # measures that the user registered, [n], by column
 
     def __repr__(self) -> str:
         n, means = len(self.collided), "no harm"
@@ -58,7 +62,7 @@ class Outcome:
         return f"Outcome({count_of(n, 'world')}, {int(self.collided.sum()):,} collided, {means})"
 
     def take(self, rows: Ints | Bools) -> Outcome:
-        """The outcome restricted to ``rows``."""
+        """Return the same outcome with only the worlds ``rows``: row numbers, or a mask [n]."""
         found = {name: getattr(self, name) for name in _COLUMNS}
         columns: dict[str, Any] = {name: None if column is None else column[rows] for name, column in found.items()}
         metrics = {name: column[rows] for name, column in self.metrics.items()}
@@ -66,9 +70,12 @@ class Outcome:
 
     @classmethod
     def join(cls, parts: Sequence[Outcome]) -> Outcome:
-        """One outcome of consecutive worlds."""
+        """Join one agent's outcomes on the parts of a list, in order, into the outcome on the whole list.
+
+        A column that is None in one part is None in the result.
+        """
         first, columns = parts[0], dict[str, Any]()
-        for name in _COLUMNS:  # what one part cannot tell is not told of the whole
+        for name in _COLUMNS:  # None in one part makes the whole column None
             told = [getattr(part, name) for part in parts]
             columns[name] = None if any(each is None for each in told) else np.concatenate(told)
         ledger = Ledger(*(np.concatenate([getattr(part.ledger, f.name) for part in parts]) for f in fields(Ledger)))
@@ -78,30 +85,36 @@ class Outcome:
 
     @property
     def collided(self) -> Bools:
-        """Whether any impact happened, [n]."""
+        """Whether at least one impact happened, for each world: [n] bool."""
         return self.ledger.collided
 
     @property
     def impacts(self) -> Ints:
-        """Number of impacts of all pairs, and with an obstacle ahead, [n]."""
+        """Number of impacts in each world, between vehicles and with an obstacle ahead, [n]."""
         return self.ledger.impacts
 
     def world_harm(self, harm_count: HarmCount) -> Floats:
-        """Harm of all vehicles under a counting rule, [n] m2/s2."""
+        """Return the harm of the whole line in each world, [n] m2/s2.
+
+        ``harm_count`` says which impacts count: each pair's first one (``first``) or all (``total``).
+        """
         return self.ledger.world_harm(harm_count)
 
     @property
     def first_impact_harm(self) -> Floats:
-        """Harm of all vehicles, each pair's first impact only, [n] m2/s2."""
+        """Harm of all vehicles, counting only each pair's first impact, [n] m2/s2."""
         return self.ledger.world_harm("first")
 
     @property
     def total_harm(self) -> Floats:
-        """Harm of all vehicles, every impact, [n] m2/s2."""
+        """Harm of all vehicles, counting every impact, [n] m2/s2."""
         return self.ledger.world_harm("total")
 
     def vehicle_harm(self, harm_count: HarmCount) -> Floats:
-        """Harm of each vehicle, [n, N] m2/s2."""
+        """Return the harm that each vehicle bears in each world, [n, N] m2/s2.
+
+        ``harm_count`` says which impacts count: each pair's first one (``first``) or all (``total``).
+        """
         return self.ledger.vehicle_harm(harm_count)
 
     @property
@@ -110,9 +123,10 @@ class Outcome:
         return np.where(self.at_rest, "at_rest", "horizon")
 
     def borne(self, objectives: Sequence[Declared] = ()) -> dict[str, Floats]:
-        """What each vehicle bears under both counts, ``total_harm_2``, and what each objective makes of it [n] (m2/s2).
+        """Return the harm that each vehicle bears, and its value under each objective, as columns [n] by name (m2/s2).
 
-        That is ``social:45_first_2``.
+        First-impact and total harm are both included. The columns of Vehicle 2 are ``first_impact_harm_2``,
+        ``total_harm_2`` and, with ``objectives=["social:45"]``, ``social:45_first_2`` and ``social:45_total_2``.
         """
         told = {"first_impact_harm": self.vehicle_harm("first"), "total_harm": self.vehicle_harm("total")}
         for objective in objectives:
@@ -122,9 +136,9 @@ class Outcome:
         return {f"{name}_{i + 1}": each[:, i] for name, each in told.items() for i in range(each.shape[1])}
 
     def columns(self) -> dict[str, Values | None]:
-        """What happened in each world, by the names of ``--per-world``; None where the agent says nothing."""
+        """Return the results of each world as columns [n], by the names in docs/per-world.md; None: not measured."""
         final, obstacle = self.final, {}
-        if (ahead := final.obstacle_ahead).any():  # of the harm above, what Vehicle 1's impacts with the obstacle did
+        if (ahead := final.obstacle_ahead).any():  # part of the harm that comes from impacts with the obstacle
             obstacle = {
                 "obstacle_first_impact_harm": np.where(ahead, self.ledger.obstacle_harm("first"), np.nan),
                 "obstacle_total_harm": np.where(ahead, self.ledger.obstacle_harm("total"), np.nan),
@@ -145,22 +159,22 @@ class Outcome:
             "ended": self.ended,
             "predicted_harm": self.predicted_harm,
             "chosen_policy": None if self.chosen_policy is None else self.chosen_policy + 0,
-            **{COLUMN + name: column + 0 for name, column in self.metrics.items()},  # truths as 0 and 1
+            **{COLUMN + name: column + 0 for name, column in self.metrics.items()},  # true/false as 1 and 0
         }
 
 
 def none_for_nan(column: Values) -> list[Any]:
-    """The values of a column, None where there is no number."""
+    """Return the values of ``column`` [n] as a list, in which None replaces NaN."""
     return [None if value != value else value for value in column.tolist()]
 
 
 class LeftOut(NamedTuple):
-    """A world that is in no outcome, because it could not be advanced with one of the agents."""
+    """A world that no agent's outcome contains, because the physics could not advance it with one of the agents."""
 
-    world: int  # number in its list
-    seed: int | None  # of the list; None for worlds that were given
-    agent: str  # the first one that met it
-    reason: str
+    world: int  # number of the world in its list, from 0
+    seed: int | None  # seed of the list; None for worlds that the caller passed
+    agent: str  # name of the first agent with which it failed
+    reason: str  # message of the error
 
     def __str__(self) -> str:
         of = "" if self.seed is None else f" of seed {self.seed}"
@@ -168,7 +182,13 @@ class LeftOut(NamedTuple):
 
     @staticmethod
     def line(worlds: Sequence[str], whole: int) -> str:
-        """That these of ``whole`` worlds, each named with its reason, count in no figure."""
+        """Return the note for users that some worlds were left out, with up to ten of them.
+
+        Args:
+            worlds: one text per left-out world, which names it and the reason.
+            whole: number of all worlds, including those.
+
+        """
         named = [*worlds[:_NAMED], *(["and so on"] if len(worlds) > _NAMED else [])]
         return (
             f"LEFT OUT for every agent: {len(worlds):,} of {whole:,} worlds, which the physics could not advance"

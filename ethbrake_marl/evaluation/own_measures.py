@@ -1,80 +1,25 @@
-"""Measures that a user registers: functions of every impact of an episode."""
+"""Measures that the user registered, as evaluations show them: loading, columns and headings."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from typing import Any
 
-import numpy as np
-
-from ethbrake_marl.errors import InvalidInput, describe_error
-from ethbrake_marl.evaluation.impacts import EpisodeImpacts
-from ethbrake_marl.evaluation.outcome import Values
 from ethbrake_marl.files.python_file import load_from_file
-from ethbrake_marl.physics.left_out import ImpactRows
-from ethbrake_marl.physics.state import make_worlds
-from ethbrake_marl.registry import Part, Registry
+from ethbrake_marl.game.impacts import EpisodeImpacts
+from ethbrake_marl.game.measures import MEASURES, REPORTED, NamedMeasure, register_measure
+from ethbrake_marl.registry import Part
 
-_NAME = re.compile(r"(?!.*_([0-9]+|interval|low|high)\Z)[a-z][a-z0-9_]{0,63}")  # x_2 is that of the second vehicle
-
-EpisodeFunction = Callable[[EpisodeImpacts], Values]
-
-
-@dataclass(frozen=True, slots=True)
-class _Registered:
-    """A measure beside the usual ones."""
-
-    name: str
-    unit: str
-    about: str
-    function: EpisodeFunction
-    form: str = ""  # what it gives: a truth or a number, per world or per vehicle
-
-
-def register_measure(name: str, function: EpisodeFunction, *, unit: str = "1") -> None:
-    """Make every evaluation from now on tell ``name`` with its interval: in tables, files and pages.
-
-    An installed package does the same, for evaluations that name it, with an entry point of the group
-    ``ethbrake_marl.measures``: its function, a ``Part`` of it, or a mapping of names to such.
-
-    Args:
-        name: 1 to 64 of ``a-z``, digits and ``_``, beginning with a letter, not ending in ``_`` and a number,
-            ``_interval``, ``_low`` or ``_high``; columns are called ``metric_NAME``.
-        function: from ``EpisodeImpacts`` to a number for each world [n], or one for each vehicle [n, N], which
-            become columns of their own; of truths a rate is told. Its docstring says what it is. It must work for
-            lines of any length.
-        unit: of its numbers.
-
-    Registering the same again changes nothing. Raises ``AlreadyExists`` for another one under a name that is taken,
-    ``InvalidInput`` for what cannot be used, a function among that which fails, or gives another shape or a number that
-    is not finite, in two worlds.
-
-    """
-    if not isinstance(name, str) or _NAME.fullmatch(name) is None:
-        raise InvalidInput(
-            f"measure {name!r:.80}: must be 1 to 64 of a-z, 0-9 and _, beginning with a letter, not ending in _"
-            " and a number, _interval, _low or _high"
-        )
-    if not callable(function) or not (function.__doc__ or "").strip():
-        raise InvalidInput(f"measure {name!r}: needs a function with a docstring that says what it is")
-    metric = _Registered(name, str(unit), " ".join((function.__doc__ or "").split()), function)
-    metric = replace(metric, form=_form(_checked(metric, _tried())))
-    MEASURES.add(name, metric, lambda other: other == metric)
-
-
-MEASURES: Registry[_Registered] = Registry("measure", "measures", register_measure)
-
-REGISTERED = MEASURES.loaded  # those that every evaluation tells
-
-LOADED: dict[str, None] = {}  # names that ``load_measures`` was given, in order
+LOADED: dict[str, None] = {}  # arguments of ``load_measures`` so far, in order
 
 
 def load_measures(names: Iterable[str]) -> None:
-    """Make every evaluation from now on tell these measures: those of installed packages, ``injury`` among them.
+    """Load measures by name, and show them in every evaluation from now on.
 
-    ``my_file.py:measure`` runs that file, which can do whatever you can: it names a function or a ``Part``. Raises
-    ``UnknownName`` with a suggestion, ``InvalidInput`` for what cannot be loaded.
+    A name is ``risk``, ``injury``, or the name of a measure of an installed package. ``my_file.py:measure`` runs that
+    Python file, with your permissions, and takes ``measure`` from it: a function, or a ``Part``, which holds a function
+    with the settings of ``register_measure``. Raises ``UnknownName`` with a suggestion, and ``InvalidInput`` for a
+    measure that cannot be loaded.
     """
     for name in names:
         file, colon, own = name.rpartition(":")
@@ -83,75 +28,37 @@ def load_measures(names: Iterable[str]) -> None:
             given, settings = (part.given, part.settings) if isinstance(part, Part) else ((part,), {})
             register_measure(own, *given, **settings)
         else:
-            MEASURES.load(name)
+            REPORTED.update({each: MEASURES[each] for each in MEASURES.load(name)})
         LOADED[name] = None
 
 
 def heading_of(column: str) -> str:
-    metric = registered_measure(column)
-    if metric is None:  # of results that were computed before it was forgotten
+    measure = registered_measure(column)
+    if measure is None:  # of results that were computed before it was forgotten
         return column
-    vehicle = column.removeprefix(metric.name).removeprefix("_")
-    return f"{metric.name}{f', vehicle {vehicle}' if vehicle else ''} ({metric.unit})"
+    vehicle = column.removeprefix(measure.name).removeprefix("_")
+    return f"{measure.name}{f', vehicle {vehicle}' if vehicle else ''} ({measure.unit})"
 
 
-def registered_measure(column: str) -> _Registered | None:
-    return REGISTERED.get(column) or REGISTERED.get(column.rpartition("_")[0])
+def registered_measure(column: str) -> NamedMeasure | None:
+    return REPORTED.get(column) or REPORTED.get(column.rpartition("_")[0])
 
 
-def _form(values: Values) -> str:
-    return f"a {'truth' if values.dtype == np.bool_ else 'number'} per {'world' if values.ndim == 1 else 'vehicle'}"
+def measure_columns(terms: Mapping[str, Any], episodes: EpisodeImpacts | None) -> dict[str, Any]:
+    """Return every reported measure of some episodes as columns [n], by name.
 
+    A measure with one value per vehicle has the columns ``NAME_1``, ``NAME_2`` and so on.
 
-def _checked(metric: _Registered, episodes: EpisodeImpacts) -> Values:
-    """What it gives, [n] or [n, N], checked."""
-    what, (n, vehicles) = f"measure {metric.name!r}", episodes.worlds.speeds_mps.shape
-    try:
-        given = metric.function(episodes)
-        value = np.asarray(None if np.ma.isMaskedArray(given) else given)
-    except Exception as error:
-        raise InvalidInput(f"{what}: its function fails: {describe_error(error)}") from error
-    if value.shape not in ((n,), (n, vehicles)) or value.dtype.kind not in "fiub":
-        raise InvalidInput(
-            f"{what}: gave {value.dtype} of shape {value.shape}; must be numbers of shape ({n},), one per world, or"
-            f" ({n}, {vehicles}), one per vehicle too"
-        )
-    finite = np.isfinite(value).reshape(n, -1).all(axis=1)
-    if not finite.all():
-        world = int(np.argmin(finite))
-        raise InvalidInput(f"{what}: is {value[world]} in world {world}; must be finite")
-    return value if value.dtype == np.bool_ else value.astype(np.float64)
+    Args:
+        terms: measures that are computed at each step, summed over the episodes, [n] or [n, N], by name.
+        episodes: impacts of the episodes, from which the other measures are computed; None if there are none.
 
-
-def _tried() -> EpisodeImpacts:
-    """Two lines of three, one with an impact of its second pair."""
-    worlds = make_worlds(
-        [[8.0, 6.0], [3.0, 21.0]],
-        [[20.0, 18.0, 22.0], [9.0, 13.0, 11.0]],
-        braking_capacity_mps2=[6.0, 7.0, 5.0],
-        driving_capacity_mps2=[1.0, 2.0, 3.0],
-        latency_s=[0.0, 0.5, 0.25],
-        mass_t=[4.5, 15.5, 5.9],
-        restitution=[0.0, 0.3],
-    )
-    one = (np.array([each]) for each in (2.5, 4.0, True, 1.2, -3.1))
-    return EpisodeImpacts.unwritable(worlds, ImpactRows(np.array([0]), np.array([1]), *one))
-
-
-def measure_impacts(episodes: EpisodeImpacts) -> dict[str, Values]:
-    """Every registered measure of these episodes by column, [n]: ``NAME``, or ``NAME_1``, ``NAME_2``, ...
-
-    Raises ``InvalidInput`` that names measure and world.
     """
-    columns: dict[str, Values] = {}
-    for metric in REGISTERED.values():
-        values = _checked(metric, episodes)
-        if _form(values) != metric.form:
-            raise InvalidInput(
-                f"measure {metric.name!r}: gave {_form(values)}; when it was registered it gave {metric.form}"
-            )
+    columns: dict[str, Any] = {}
+    for name, measure in REPORTED.items():
+        values = terms[name] if episodes is None or measure.by == "step" else measure.of(episodes)
         if values.ndim == 1:
-            columns[metric.name] = values
+            columns[name] = values
         else:
-            columns |= {f"{metric.name}_{i + 1}": column.copy() for i, column in enumerate(values.T)}
+            columns |= {f"{name}_{i + 1}": column.copy() for i, column in enumerate(values.T)}
     return columns

@@ -1,4 +1,4 @@
-"""One row per agent and world: its columns, and its file, written whole and never over another by accident."""
+"""Results files: tables with one row per agent and world, and the JSON files that refer to them."""
 
 from __future__ import annotations
 
@@ -30,11 +30,21 @@ _HARMS = ("agent", "world", *HARMS)
 def write_per_world(
     path: str | Path, evaluation: Evaluation, *, objectives: Sequence[Declared] = (), force: bool = False
 ) -> None:
-    """Write one row per agent and world: Parquet where the name ends in ``.parquet``, else CSV.
+    """Write a table with one row per agent and world: Parquet if the name ends in ``.parquet``, else CSV.
 
-    docs/per-world.md lists the columns; ``objectives`` adds theirs. A world that was left out has a row with nothing
-    but its number and, in ``ended``, why. The file appears whole or not at all. Raises ``AlreadyExists`` unless
-    ``force``, ``InvalidInput`` without a folder or for another ending, ``MissingExtra`` without pyarrow for Parquet.
+    docs/per-world.md lists the columns. The row of a left-out world holds only its number and the reason, in ``ended``.
+    The file is written completely or not at all.
+
+    Args:
+        path: the file to write.
+        evaluation: results of the agents.
+        objectives: objectives such as ``"social:45"``, which weigh a vehicle's own harm against the others'. Each adds
+            columns with its value for every vehicle.
+        force: replace an existing file.
+
+    Raises ``AlreadyExists`` for an existing file unless ``force``, ``InvalidInput`` for a missing folder or another
+    ending, ``MissingExtra`` for Parquet without pyarrow.
+
     """
     ending = Path(path).suffix.lower()
     if ending not in (CSV, PARQUET):
@@ -55,9 +65,16 @@ def write_per_world(
 
 
 def read_harms(path: Path, data: bytes) -> dict[str, dict[int, tuple[float, ...]]]:
-    """Agent -> world -> harm (m2/s2) under both counts, of ``data``, what ``write_per_world`` wrote to ``path``.
+    """Return the harms in a file of ``write_per_world``: agent -> world -> (first-impact harm, total harm) in m2/s2.
 
-    Worlds that were left out are not among them. Raises ``InvalidInput`` for a file without these columns.
+    Left-out worlds are omitted.
+
+    Args:
+        path: name of the file, whose ending decides the format; it is not opened.
+        data: content of the file.
+
+    Raises ``InvalidInput`` for a file without these columns.
+
     """
     try:
         if path.suffix.lower() == PARQUET:
@@ -80,22 +97,22 @@ def read_harms(path: Path, data: bytes) -> dict[str, dict[int, tuple[float, ...]
         raise InvalidInput(f"{path}: is no file of --per-world: {error}") from None
 
 
-USUAL: Mapping[str, str] = {"harm_count": "first"}  # settings of agents
+USUAL: Mapping[str, str] = {"harm_count": "first"}  # default settings of agents
 
-COMPARED: dict[Kind, tuple[str, ...]] = {  # harms of each
+COMPARED: dict[Kind, tuple[str, ...]] = {  # harms that are compared, by kind of results
     "evaluate": HARMS,
     "shield": ("harm",),
 }
 
-_LIMIT_BYTES, _MOST_BYTES = 64 << 20, 4 << 30  # of a results file, and of one with every world
+_LIMIT_BYTES, _MOST_BYTES = 64 << 20, 4 << 30  # size limits of a results file, and of a file with every world
 
 _MOST_EPISODES = 10**12
 
-_MOST_HARM = 1e100  # m2/s2; a number that can be squared
+_MOST_HARM = 1e100  # m2/s2; the square of a larger number could overflow
 
 _HASHES = {"worlds_sha256": "another list of worlds", "scenario_sha256": "another scenario"}
 
-SAME = {  # all but the hashes: where they are told
+SAME = {  # keys that must agree for a comparison; all but the hashes may be missing
     "kind": "another kind of results",
     "worlds_sha256": _HASHES["worlds_sha256"],
     "controlled_vehicle": "another driven vehicle",
@@ -121,12 +138,15 @@ def results_to_json(
     per_world: Path | None = None,
     settings: Mapping[str, str] = USUAL,
 ) -> list[dict[str, Any]]:
-    """What a results file holds: one object per row, with what was ``told`` of it under other objectives.
+    """Return the content of a results file: one object per row.
 
-    ``settings`` are those of all agents: the harm that they minimise.
+    Args:
+        rows: rows of the results table, one per agent.
+        told: mean harms under other objectives (``Evaluation.rescore``), added to each agent's object.
+        groups: name of a group of worlds -> rows of the same agents on that group (``summarise_by``).
+        per_world: existing file with one row per world; its name and hash go into every object.
+        settings: settings of all agents by name: ``{"harm_count": "first"}`` is the harm that they minimise.
 
-    ``groups``, by name, are rows of the same agents on parts of the worlds (``summarise_by``).
-    ``per_world`` is the file with one row per world, written before; its name and hash go into every object.
     """
     found = [row.to_json() | {"agent_settings": dict(settings)} for row in rows]
     if told:
@@ -143,24 +163,35 @@ def results_to_json(
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """One results file."""
+    """Content of one results file (JSON) that was read and checked."""
 
-    path: Path
-    rows: Mapping[str, Mapping[str, Any]]  # by agent; of ``ethbrake shield`` by agent and mode
+    path: Path  # the file
+    # JSON object of each agent, by its name; for results of ``ethbrake shield``, by ``AGENT (MODE)``.
+    rows: Mapping[str, Mapping[str, Any]]
 
     @property
     def about(self) -> Mapping[str, Any]:
-        """Any of the rows: what they say of the worlds is the same in all."""
+        """JSON object of the first agent, from which to read entries that are the same for all, such as the hashes."""
         return next(iter(self.rows.values()))
 
     def estimate(self, agent: str, harm: str) -> Estimate:
-        """The mean of a harm, with its interval."""
+        """Return the mean harm of an agent with its interval.
+
+        Args:
+            agent: key of ``rows``.
+            harm: key of the harm in the JSON object: ``first_impact_harm``, ``total_harm`` or ``harm``.
+
+        """
         row = self.rows[agent]
         mean, interval = row[harm], row.get(f"{harm}_interval")
         return Estimate(float(mean), None if interval is None else (float(interval[0]), float(interval[1])))
 
     def harms(self) -> dict[str, dict[int, tuple[float, ...]]]:
-        """Those of every world; raises ``InvalidInput`` where the file that holds them is not to be had."""
+        """Read the harms of every world from the file that was written beside this one with ``--per-world``.
+
+        Returns agent -> world -> (first-impact harm, total harm) in m2/s2. Raises ``InvalidInput`` if that file is
+        missing or was changed.
+        """
         beside = self.about.get("per_world")
         if not isinstance(beside, dict) or not isinstance(beside.get("file"), str):
             raise InvalidInput(f"{self.path} has none (--per-world)")
@@ -174,10 +205,10 @@ class Result:
 
 
 def read_result(path: Path) -> Result:
-    """Read what ``evaluate`` or ``shield`` printed with ``--json``, or ``ethbrake run`` wrote.
+    """Read and check a results file (JSON) that ``ethbrake evaluate``, ``shield`` or ``run`` wrote or printed.
 
-    Raises ``InvalidInput`` for anything else, also for other kinds of results, in which no agents stand beside each
-    other, and for a result without hashes.
+    Raises ``InvalidInput`` for any other file, including kinds of results that cannot be compared, and results without
+    hashes.
     """
     try:
         content = parse_strict_json(read_plain(path, _LIMIT_BYTES))
@@ -213,14 +244,20 @@ def read_result(path: Path) -> Result:
 
 
 def told_of(row: Mapping[str, Any], key: str) -> str | None:
-    """What a row says of itself, or its parameters do; None for neither."""
+    """Return the value of ``key`` in ``row`` (an agent's JSON object), or else in its ``parameters``, as text.
+
+    None if it is in neither.
+    """
     parameters = row.get("parameters")
     told = row.get(key, parameters.get(key) if isinstance(parameters, dict) else None)
     return None if told is None else str(told)
 
 
 def _is_mean(mean: Any, interval: Any, episodes: int) -> bool:
-    """Whether these are a mean harm and its interval, which no single episode has."""
+    """Return whether these JSON values are a mean harm and an interval ``[low, high]`` around it.
+
+    ``interval`` may be None; for ``episodes`` = 1 it must be.
+    """
     ends = [mean, mean] if interval is None else interval
     if not isinstance(ends, list) or len(ends) != 2 or (interval is not None and episodes == 1):
         return False
@@ -230,7 +267,10 @@ def _is_mean(mean: Any, interval: Any, episodes: int) -> bool:
 
 
 def _rows_of(path: Path, content: Any) -> list[dict[str, Any]]:
-    """The objects of a results file, one for each agent; ``InvalidInput`` where it is none, or of a kind without."""
+    """Return the objects of a results file, one for each agent; raise ``InvalidInput`` for other content.
+
+    ``content`` is the parsed JSON; ``path`` is named in errors.
+    """
     several = [content] if isinstance(content, dict) else content
     if not isinstance(several, list) or not several or not all(isinstance(row, dict) for row in several):
         raise InvalidInput(f"{path}: is no results file, as ethbrake evaluate --json prints one")

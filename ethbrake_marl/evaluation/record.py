@@ -1,7 +1,7 @@
-"""One episode at fine time resolution: what a figure or a viewer draws.
+"""Record of one episode at fine time resolution, for figures and viewers.
 
-Between decisions the motion follows from the state and the command alone, so the episode is first run as in an
-evaluation, and then sampled inside its steps: every sample is advanced straight from the beginning of its step.
+Between two decisions, the motion follows from the state and the command alone. So the episode is first run as in an
+evaluation; then each step is sampled, and every sample is advanced directly from the beginning of its step.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ import numpy as np
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import InvalidInput, count_of
-from ethbrake_marl.evaluation.impacts import Tape
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
+from ethbrake_marl.evaluation.tape import Tape
 from ethbrake_marl.game.harm import HARM_COUNTS, Ledger
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.left_out import ImpactRows
 from ethbrake_marl.physics.state import Floats, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 
-SAMPLE_S = 0.02
+SAMPLE_S = 0.02  # default time between two samples (s)
 
 
 @dataclass(frozen=True, slots=True)
 class EpisodeRecord:
-    """One world from the alert to its end, at k times; row 0 is the alert.
+    """One world from the alert to its end, sampled at k times; row 0 is the alert.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -39,18 +39,18 @@ class EpisodeRecord:
 
     """
 
-    agent: str  # its name
-    scenario: Scenario  # of the world
-    vehicle: int  # index (0 = front) of the vehicle that the agent drove
-    initial: Worlds  # n = 1, at the alert
-    time_s: Floats  # [k] since Vehicle 1 began to brake, ascending
-    gaps_m: Floats  # [k, P]
-    speeds_mps: Floats  # [k, N]
-    positions_m: Floats  # [k, N] front bumpers along the road; a vehicle's length is not counted
-    command_mps2: Floats  # [k, N] signed acceleration asked for from then on; 0 before the latency has elapsed
-    impacts: ImpactRows  # in order of time; world is 0
-    ledger: Ledger  # n = 1
-    at_rest: bool  # the line came to rest; else the horizon cut the episode off
+    agent: str  # name of the agent
+    scenario: Scenario  # scenario of the world
+    vehicle: int  # index (0 = front) of the controlled vehicle
+    initial: Worlds  # the world at the alert, n = 1
+    time_s: Floats  # [k] time since the alert, ascending
+    gaps_m: Floats  # [k, P] gap of each pair
+    speeds_mps: Floats  # [k, N] speed of each vehicle
+    positions_m: Floats  # [k, N] position of each vehicle along the road; vehicles have no length here
+    command_mps2: Floats  # [k, N] commanded signed acceleration from this time on; 0 before the latency has elapsed
+    impacts: ImpactRows  # all impacts in order of time; their column ``world`` is 0
+    ledger: Ledger  # harm of all impacts of the episode, n = 1
+    at_rest: bool  # whether the line came to rest before the horizon
 
     def __repr__(self) -> str:
         first, total = (float(self.ledger.world_harm(harm_count)[0]) for harm_count in HARM_COUNTS)
@@ -67,12 +67,12 @@ def record_episode(
     """Record one world from the alert on, exactly as ``evaluate`` runs it.
 
     Args:
-        world: at the alert, n = 1.
-        agent: drives one vehicle; it is left as it is.
-        scenario: of the world; its scripts drive the other vehicles.
-        vehicle: the one that is driven, by name (``vehicle_2``) or index (0 = front); None: the scenario's only
+        world: the world at the alert, n = 1.
+        agent: agent that drives one vehicle; it is not changed.
+        scenario: scenario of the world, whose scripts drive the other vehicles.
+        vehicle: the controlled vehicle, by name (``vehicle_2``) or index (0 = front); None: the scenario's only
             learner.
-        sample_s: samples lie at most so far apart (s), and at every decision.
+        sample_s: largest time between two samples (s); every decision is a sample, too.
 
     Raises ``InvalidInput`` for more than one world or ``sample_s`` not above 0.
 
@@ -89,16 +89,18 @@ def record_episode(
     samples = list(_samples(tape.steps, sample_s))
     time, gaps, speeds, positions, command = (np.concatenate(column) for column in zip(*samples, strict=True))
     return EpisodeRecord(
-        agent.name, scenario, driven, world, time, gaps, speeds, positions, command, tape.impacts(), episodes.ledger,
-        bool(episodes.at_rest[0]),
+        agent.name, scenario, driven, world, time, gaps, speeds, positions, command, tape.episodes().rows,
+        episodes.ledger, bool(episodes.at_rest[0]),
     )  # fmt: skip
 
 
 def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float) -> Iterator[tuple[Floats, ...]]:
-    """Rows of (time, gaps, speeds, positions, command from then on), segment by segment, the last with its end.
+    """Yield the samples of each step: time [k], gaps [k, P], speeds [k, N], positions [k, N], commands [k, N].
 
-    Worlds know gaps and speeds only. An obstacle ahead of Vehicle 1, the world's own or one that is out of reach, makes
-    its position one more gap.
+    ``segments`` are the steps of one world, each with the world before, the commands [1, N], and the end time [1]. Two
+    samples of a step are at most ``sample_s`` apart (s). Only the last step includes its end. Worlds hold gaps and
+    speeds, not positions. So Vehicle 1's position is measured as its gap to an obstacle ahead, which is the world's own
+    or one out of reach.
     """
     front = 0.0  # position of Vehicle 1 at the start of the segment
     for number, (before, command, until_s) in enumerate(segments):
@@ -118,5 +120,5 @@ def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float)
 
 
 def line_positions(front: Floats, gaps: Floats) -> Floats:
-    """Positions [k, N] from those of Vehicle 1 [k] and the gaps [k, P]."""
+    """Return the positions [k, N] of all vehicles, ``front`` [k] being that of Vehicle 1, from the gaps [k, P]."""
     return np.concatenate([front[:, np.newaxis], front[:, np.newaxis] - np.cumsum(gaps, axis=1)], axis=1)

@@ -1,6 +1,6 @@
-"""Evaluate agents: draw a fixed list of worlds, let every agent drive each world once, measure what it did.
+"""Evaluate agents: draw a fixed list of worlds, let every agent drive each world once, and measure the results.
 
-Counting "the first episodes that finish" instead would over-count short episodes, and crashes end early.
+The list is fixed because "the first episodes that finish" would contain too many short episodes, and crashes end early.
 """
 
 from __future__ import annotations
@@ -29,10 +29,11 @@ from ethbrake_marl.evaluation.aftermath import SampledHarm, ShovedFront
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.familiar import warn_unfamiliar
 from ethbrake_marl.evaluation.identity import CHUNK, EPISODES, LIST_SEED, policies_of
-from ethbrake_marl.evaluation.impacts import Tape
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.outcome import LeftOut, Outcome
-from ethbrake_marl.evaluation.own_measures import REGISTERED, measure_impacts
+from ethbrake_marl.evaluation.own_measures import measure_columns
+from ethbrake_marl.evaluation.tape import Tape
+from ethbrake_marl.game.measures import REPORTED
 from ethbrake_marl.physics.left_out import leaving_out_failed
 from ethbrake_marl.physics.state import Ints, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
@@ -40,7 +41,7 @@ from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
 
-OnWorlds = Callable[[str, int], None]  # agent, worlds done so far
+OnWorlds = Callable[[str, int], None]  # callback with an agent's name and its number of worlds done so far
 
 
 def evaluate(
@@ -58,23 +59,25 @@ def evaluate(
     """Let each agent drive every world once, from the alert to the episode's end.
 
     The other vehicles follow the scenario's scripts. A world's outcome depends neither on ``chunk`` nor on the other
-    worlds. A world that cannot be advanced (a defect of the physics) is left out for all agents; ``left_out`` names it.
+    worlds. A world that cannot be advanced (a defect of the physics) is left out for all agents; ``left_out`` lists it.
 
     Args:
-        worlds: at the alert, or a sample of the scenario's list; None: draw the first ``episodes`` of ``seed``.
-        agents: specs as on the command line (``"full_brake,ppo@shipped"``, or a list), made for first-impact harm; or
-            name -> agent or ``Team``. Each controlled vehicle gets a copy of its agent; the originals do not change.
-        scenario: of the worlds, also by name or path.
+        worlds: worlds at the alert, or a sample that ``scenario.sample`` drew; None: draw ``episodes`` worlds from
+            ``seed``.
+        agents: specs as on the command line (``"full_brake,ppo@shipped"``, or a list), which minimise first-impact
+            harm; or a mapping from name to agent or ``Team``. Each controlled vehicle gets a copy of its agent; the
+            originals do not change.
+        scenario: scenario of the worlds, also by name or path.
         vehicle: the controlled vehicle, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
         episodes: number of worlds to draw; None: 10,000.
-        seed: of the list; None: 7. With given worlds it is only noted in the result.
-        chunk: worlds advanced together; None: 2,500.
+        seed: seed of the list; None: 7. With ``worlds``, it is only recorded in the result.
+        chunk: number of worlds advanced together; None: 2,500.
         on_progress: called after each chunk with an agent's name and the number of its worlds done.
-        aftermath: also measure how far Vehicle 1 is shoved, the paper's sum over samples, and registered measures;
-            takes longer.
+        aftermath: also measure how far Vehicle 1 is shoved, the paper's sampled harm, and measures that the user
+            registered; takes longer.
 
-    Warns (``Unfamiliar``) of policies beyond their training. Raises ``PhysicsError`` if no world is left;
-    ``InvalidInput`` for worlds of another scenario or after the alert, and if agents and vehicles do not fit.
+    Warns (``Unfamiliar``) about policies in worlds unlike those of their training. Raises ``PhysicsError`` if no world
+    is left; ``InvalidInput`` for worlds of another scenario or after the alert, and if agents and vehicles do not fit.
 
     """
     scenario = load_scenario(scenario)
@@ -102,7 +105,7 @@ def evaluate(
 
 
 def chunks_of(sample: Sample, size: int = CHUNK) -> Iterator[tuple[int, Sample]]:
-    """The worlds in parts of this size, each with the row of its first."""
+    """Yield consecutive parts of at most ``size`` worlds, each as (row of its first world in the sample, part)."""
     for first in range(0, sample.worlds.n, size):
         yield first, sample.take(np.arange(first, min(first + size, sample.worlds.n)))
 
@@ -116,13 +119,23 @@ def drive_chunk(
     first: int = 0,
     aftermath: bool = True,
 ) -> Evaluation:
-    """Let each agent drive all of these worlds at the alert together.
+    """Let each agent drive all of these worlds together, from the alert to the end of their episodes.
 
-    ``first`` is the row of the first world, for messages. If every world was left out, the evaluation has none.
+    If every world fails, the evaluation is empty.
+
+    Args:
+        sample: the worlds, a part of a list.
+        agents: agents or teams by name.
+        scenario: scenario of the worlds.
+        seed: seed of the list, which is recorded in the result.
+        vehicles: indices (0 = front) of the controlled vehicles.
+        first: row of the part's first world in the list, for error messages.
+        aftermath: also measure how far Vehicle 1 is shoved, sampled harm, and measures that the user registered.
+
     """
     n, others = sample.worlds.n, [script.name for script in script_agents(scenario, except_for=vehicles).values()]
     outcomes: dict[str, Outcome] = {}
-    advanced: dict[str, Ints] = {}  # rows of the worlds that are in each outcome
+    advanced: dict[str, Ints] = {}  # rows of the worlds in each outcome
     lost: dict[int, LeftOut] = {}
     for name, agent in agents.items():
         roll_out = partial(_roll_out, sample.worlds, agent, vehicles, scenario, aftermath)
@@ -142,7 +155,7 @@ def drive_chunk(
 
 
 def _check_request(worlds: object, agents: object, chunk: object) -> None:
-    """Refuse arguments of ``evaluate`` that are not what they must be."""
+    """Raise ``InvalidInput`` if one of these arguments of ``evaluate`` has a wrong type or value."""
     if not isinstance(worlds, Worlds | Sample):
         raise InvalidInput(
             f"evaluate: worlds = {worlds!r}: must be worlds or a sample, as scenario.sample(n, seed) gives"
@@ -155,20 +168,28 @@ def _check_request(worlds: object, agents: object, chunk: object) -> None:
         raise InvalidInput("evaluate: no agents given; at least one is needed, for instance full_brake")
     for name, agent in agents.items():
         check_agent(agent, f"evaluate: agent {name!r}", alone=False)
-        Knowledge.of(agent)  # refuses what is no statement
+        Knowledge.of(agent)  # raises for an invalid ``knows``
     if chunk is not None:
         check_whole_number("evaluate: chunk", chunk, 1)
 
 
 def driven_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mapping[str, Driver]) -> tuple[int, ...]:
-    """Indices of the controlled vehicles: the given one, or all learners; none if the agents are teams of nobody."""
+    """Return the indices (0 = front) of the vehicles that the agents are to control.
+
+    This is ``vehicle`` (name or index), or all learners of the scenario if ``vehicle`` is None. Without learners the
+    result is empty if all agents are teams; otherwise raises ``InvalidInput``.
+    """
     if vehicle is not None or (not scenario.learners and any(not isinstance(a, Team) for a in agents.values())):
         return (controlled_vehicle(scenario, vehicle),)
     return scenario.learners
 
 
 def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
-    """Index of the controlled vehicle: the given one, or the scenario's only learner; raises ``InvalidInput``."""
+    """Return the index (0 = front) of the single controlled vehicle.
+
+    This is ``vehicle`` (name or index), or the scenario's only learner if ``vehicle`` is None. Raises ``InvalidInput``
+    if there is not exactly one learner, or another learner than ``vehicle``.
+    """
     learners = scenario.learners
     names = [scenario.vehicle_names[i] for i in learners]
     if vehicle is None:
@@ -191,27 +212,34 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
 def _roll_out(
     whole: Worlds, agent: Driver, vehicles: tuple[int, ...], scenario: Scenario, aftermath: bool, rows: Ints
 ) -> Outcome:
-    """Outcome of a fresh team in the worlds of these rows."""
+    """Let a new team of copies of ``agent`` drive the worlds with the row numbers ``rows`` of ``whole``.
+
+    ``vehicles`` are the indices of the controlled vehicles. With ``aftermath``, also measure how far Vehicle 1 is
+    shoved, sampled harm, and measures that the user registered.
+    """
     team = Team.of(agent, vehicles)
     worlds = scenario.play_pieces(whole.take(rows), tuple(team.drivers))
     task = Task(scenario, tuple(team.drivers))
     shoved = ShovedFront.of(worlds, task) if aftermath else None
     sampled = SampledHarm.of(worlds, task) if aftermath else None
-    impacts = Tape(worlds, steps=False) if aftermath and REGISTERED else None
-    episodes = drive(worlds, team, scenario, watched_by=[w for w in (shoved, sampled, impacts) if w is not None])
+    by_step = [measure.name for measure in REPORTED.values() if measure.by == "step" and aftermath]
+    impacts = Tape(worlds, steps=False) if aftermath and len(REPORTED) > len(by_step) else None
+    watches = [w for w in (shoved, sampled, impacts) if w is not None]
+    episodes = drive(worlds, team, scenario, watched_by=watches, summed=by_step)
     outcome = outcome_of(team, episodes)
     return replace(
         outcome,
         shoved_m=None if shoved is None else shoved.metres,
         sampled_harm=None if sampled is None else sampled.finish(),
-        metrics={} if impacts is None else measure_impacts(impacts.episodes()),
+        metrics=measure_columns(episodes.terms, None if impacts is None else impacts.episodes()) if aftermath else {},
     )
 
 
 def outcome_of(team: Team, episodes: Episodes) -> Outcome:
-    """What a team achieved in its episodes, without their aftermath.
+    """Return the ``Outcome`` of the episodes that a team has driven.
 
-    What an agent predicts about a world counts where it drives alone, or where its shield predicts.
+    It lacks what watchers measure during the episodes: ``shoved_m``, ``sampled_harm`` and ``metrics``. The fields
+    ``predicted_harm`` and ``chosen_policy`` come from the memory of an agent that drives alone, or from a shield.
     """
     memory: Any = next(iter(episodes.memories.values()), None) if len(team.drivers) == 1 else None
     if episodes.guarded is not None:
@@ -231,7 +259,10 @@ def outcome_of(team: Team, episodes: Episodes) -> Outcome:
 
 
 def _read_column(team: Team, memory: Any, what: str, n: int) -> NDArray[np.generic] | None:
-    """A column of an agent's memory, one number per world; None where the memory has no such column."""
+    """Return the entry ``what`` of an agent's memory, one number per world [n]; None if there is no such entry.
+
+    ``team`` is named in errors.
+    """
     value = memory.get(what) if isinstance(memory, Mapping) else None
     if value is None:
         return None

@@ -1,7 +1,7 @@
-"""Statistics over trainings: a figure per seed, and what they say about the next seed.
+"""Statistics over trainings with different seeds: estimates that say what to expect of another seed.
 
-Few seeds are the rule, and one bad one moves a mean a lot. The interquartile mean leaves out the best and the worst
-quarter; the bootstrap says how far it may be off, drawing seeds anew within each task (stratified), since tasks are
+Usually there are few seeds, and a single bad one moves a mean a lot. The interquartile mean omits the best and the
+worst quarter. The bootstrap estimates its error by resampling seeds within each task (stratified), because tasks are
 chosen and not drawn.
 """
 
@@ -17,23 +17,29 @@ from ethbrake_marl.evaluation.statistics import CONFIDENCE, check, of_amounts, w
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.physics.state import Floats
 
-RESAMPLES = 10_000  # of seeds
+RESAMPLES = 10_000  # bootstrap resamples of seeds
 
-_RESAMPLES = 2_000  # of seeds and worlds
+_RESAMPLES = 2_000  # bootstrap resamples of seeds and worlds
 
-_CUT = 0.25
+_CUT = 0.25  # share of values that the interquartile mean omits at either end
 
-_AT_ONCE = 1 << 20  # drawn worlds in memory: 8 MB
+_AT_ONCE = 1 << 20  # resampled worlds in memory at once: 8 MB
 
 
 def interquartile_mean(tasks: Sequence[ArrayLike], *, resamples: int = RESAMPLES, seed: int = 0) -> Estimate:
-    """Mean of the middle half of all figures, with its stratified bootstrap interval (percentiles).
+    """Return the mean of the middle half of all values, with its stratified bootstrap interval (percentiles).
 
-    ``tasks`` holds one list of figures, one per seed, for each task (scenario); floor(n / 4) of all n figures are left
-    out at either end. The interval is None when no task has two seeds. Raises ``InvalidInput`` for a task without
-    figures, or with one that is not finite.
+    Of all n values, floor(n / 4) are omitted at either end. The interval is None if no task has two seeds.
+
+    Args:
+        tasks: for each task (scenario), the results of its trainings, one number per seed.
+        resamples: number of bootstrap resamples.
+        seed: seed of the bootstrap.
+
+    Raises ``InvalidInput`` for a task without values, or for a value that is not finite.
+
     """
-    from scipy.stats import bootstrap, trim_mean  # a second to load, and no table of an evaluation needs it
+    from scipy.stats import bootstrap, trim_mean  # imported here because it takes a second to load
 
     strata = [check(figures, f"interquartile_mean: task {k}", "seed") for k, figures in enumerate(tasks)]
     if not strata:
@@ -61,14 +67,20 @@ def interquartile_mean(tasks: Sequence[ArrayLike], *, resamples: int = RESAMPLES
 
 
 def mean_over_seeds(values: ArrayLike, baseline: ArrayLike | None = None, *, seed: int = 0) -> Estimate:
-    """Mean of ``values``, or of ``values - baseline`` on the same worlds, [seeds, worlds] each.
+    """Return the mean over seeds and worlds of ``values``, or of ``values - baseline``, with a bootstrap interval.
 
-    Numbers of seeds may differ. The bootstrap interval draws the seeds of either side and the worlds, which both sides
-    share, anew: an interval of differences that leaves out 0 holds for other seeds *and* other worlds. None with a
-    single world, and where all values are 0 and have no baseline. That is no interval of truths that hold nearly
-    always or never: draws of such worlds are all alike. So that of truths without a baseline reaches at least as far
-    as Wilson's of their share over the worlds. Raises ``InvalidInput`` for arrays that cannot be paired or are not
-    finite.
+    The bootstrap resamples the seeds of each side, and the worlds, which both sides share. So an interval of
+    differences that excludes 0 holds for other seeds *and* other worlds. There is no interval for a single world, nor
+    without a baseline if all values are 0. The interval of true/false values without a baseline also covers Wilson's
+    interval, because resamples of values that hardly ever differ are too narrow.
+
+    Args:
+        values: [seeds, worlds] result of the training with each seed in each world.
+        baseline: [seeds, worlds] results to subtract, in the same worlds; the number of seeds may differ.
+        seed: seed of the bootstrap.
+
+    Raises ``InvalidInput`` for arrays that cannot be paired or are not finite.
+
     """
     given = np.atleast_2d(np.asarray(values))
     sides = _pair_sides("mean_over_seeds", given, np.zeros((1, given.shape[-1])) if baseline is None else baseline)
@@ -85,10 +97,17 @@ def mean_over_seeds(values: ArrayLike, baseline: ArrayLike | None = None, *, see
 
 
 def share_over_seeds(values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, seed: int = 0) -> Estimate | None:
-    """``(mean(worst) - mean(values)) / (mean(worst) - mean(best))`` on the same worlds, [seeds, worlds] each.
+    """Return the share of the possible reduction that ``values`` reaches: 0 like ``worst``, 1 like ``best``.
 
-    Which part of the way from ``worst`` to ``best`` the values are; the interval is as in ``mean_over_seeds``. None
-    where ``best`` is not below ``worst``.
+    It is ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``, with the bootstrap interval of
+    ``mean_over_seeds``. Returns None unless ``best`` has a lower mean than ``worst``.
+
+    Args:
+        values: [seeds, worlds] harms to judge.
+        worst: [seeds, worlds] harms that count as share 0, in the same worlds.
+        best: [seeds, worlds] harms that count as share 1, in the same worlds.
+        seed: seed of the bootstrap.
+
     """
     sides = _pair_sides("share_over_seeds", values, worst, best)
     reached, high, low = (float(side.mean(axis=0).mean()) for side in sides)
@@ -104,7 +123,10 @@ def share_over_seeds(values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, se
 
 
 def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
-    """The sides as [seeds, worlds], all with the same worlds; raises ``InvalidInput``."""
+    """Return each of ``sides`` as an array [seeds, worlds].
+
+    Raises ``InvalidInput``, naming the function ``who``, if their numbers of worlds differ or a value is not finite.
+    """
     arrays = tuple(np.atleast_2d(np.asarray(given, np.float64)) for given in sides)
     if any(side.ndim != 2 or not side.size or side.shape[1] != arrays[0].shape[-1] for side in arrays):
         shapes = " and ".join(str(side.shape) for side in arrays)
@@ -115,7 +137,11 @@ def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
 
 
 def _resampled(value: float, sides: Sequence[Floats], of: Callable[[Floats], Floats], seed: int) -> Estimate:
-    """``value`` with the percentiles of what it is in means drawn anew; no interval with a single world."""
+    """Return ``value`` with a bootstrap interval, or without one for a single world.
+
+    The interval holds the percentiles of ``of(means)``, where ``means`` [resamples, sides] are the resampled means.
+    ``seed`` is the seed of the bootstrap.
+    """
     if sides[0].shape[1] < 2:
         return Estimate(value, None)
     tail = 50.0 * (1.0 - CONFIDENCE)
@@ -124,7 +150,10 @@ def _resampled(value: float, sides: Sequence[Floats], of: Callable[[Floats], Flo
 
 
 def _resample_means(sides: Sequence[Floats], resamples: int, seed: int) -> Floats:
-    """Means [resamples, sides] over seeds of each side and over worlds, which all sides share, drawn anew."""
+    """Return the mean of each of ``sides`` (arrays [seeds, worlds]) in each bootstrap resample, [resamples, sides].
+
+    Seeds are resampled separately for each side; worlds are resampled once for all sides.
+    """
     worlds = sides[0].shape[1]
     rng = np.random.default_rng(seed)
     parts: list[Floats] = []
@@ -135,7 +164,7 @@ def _resample_means(sides: Sequence[Floats], resamples: int, seed: int) -> Float
         means = np.empty((size, len(sides)))
         for column, side in enumerate(sides):
             seeds = rng.integers(len(side), size=(size, len(side)))
-            # Not a matrix product: its order of adding depends on the machine.
+            # No matrix product, because its order of addition depends on the machine.
             of_seeds = np.stack([(weights * row).sum(axis=1) for row in side], axis=1)
             means[:, column] = np.take_along_axis(of_seeds, seeds, axis=1).mean(axis=1)
         parts.append(means)

@@ -1,9 +1,9 @@
 """Estimates with 95 % intervals, from one number per world.
 
-The worlds of a list are independent draws, and every agent is measured on the same ones: rates get Wilson's score
-interval, means the t interval of the mean, and comparisons with a baseline are paired
-by world, so that the spread between easy and hard worlds cancels. Means and their errors come from exact sums: the
-order of the worlds changes no bit of them.
+The worlds of a list are independent draws, and every agent is measured on the same worlds. Rates have Wilson's score
+interval, means have the t interval, and comparisons with a baseline are paired by world, so that the spread between
+easy and hard worlds cancels. Means and their errors come from exact sums, so the order of the worlds does not change a
+bit.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from ethbrake_marl.physics.state import Floats, Ints
 
 
 def exact_sum(values: Floats, others: Floats | None = None) -> Fraction:
-    """Sum of ``values`` [n], or of their products with ``others`` [n], without any rounding.
+    """Return the exact sum of ``values`` [n], or of their products with ``others`` [n], without rounding.
 
-    A float64 is a whole number of 53 bits times a power of two. The whole numbers of each power are added as Python's
-    own, which have no largest one. So no order of the worlds, and no division into parts, changes a bit. ``math.fsum``
-    rounds the sum of each part, and a sum of parts once more. Raises ``InvalidInput`` for what is not finite.
+    A float64 is a whole number of 53 bits times a power of two. The whole numbers of each power are added as Python
+    integers, which never overflow. So neither the order of the worlds nor a division into parts changes a bit. By
+    contrast, ``math.fsum`` rounds the sum of each part. Raises ``InvalidInput`` unless all numbers are finite.
     """
     wholes, powers = _in_wholes(values)
     if others is not None:
@@ -37,7 +37,7 @@ def exact_sum(values: Floats, others: Floats | None = None) -> Fraction:
 
 
 def _in_wholes(values: Floats) -> tuple[NDArray[np.object_], Ints]:
-    """Whole numbers and powers, [n] each: ``values = whole * 2 ** power``."""
+    """Return integers and powers of two, [n] each, such that ``values = integer * 2 ** power`` exactly."""
     data = np.asarray(values, np.float64)
     if data.ndim != 1 or not np.isfinite(data).all():
         raise InvalidInput(f"exact sum: shape {data.shape}; finite numbers, as [n], are needed")
@@ -47,12 +47,12 @@ def _in_wholes(values: Floats) -> tuple[NDArray[np.object_], Ints]:
 
 CONFIDENCE = 0.95
 
-_UPPER = 0.5 + 0.5 * CONFIDENCE  # the quantile at the upper end of an interval
+_UPPER = 0.5 + 0.5 * CONFIDENCE  # quantile at the upper end of an interval
 
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Number, sum and sum of squares of some values, exact: they are added in any order.
+    """Number, exact sum and exact sum of squares of some values; moments of parts can be added in any order.
 
     >>> import numpy as np
     >>> from ethbrake_marl.evaluation.statistics import Moments
@@ -61,14 +61,19 @@ class Moments:
 
     """
 
-    count: int = 0
-    total: Fraction = Fraction()
-    squares: Fraction = Fraction()
-    negative: int = field(default=0, compare=False)  # number of values that are, or may be, below 0
+    count: int = 0  # number of values
+    total: Fraction = Fraction()  # sum of the values
+    squares: Fraction = Fraction()  # sum of their squares
+    # Number of negative values. If it is 0, intervals do not reach below 0. For differences (``minus``), whose signs
+    # are not known, it is the number of all values.
+    negative: int = field(default=0, compare=False)
 
     @classmethod
     def of(cls, values: Floats) -> Moments:
-        """Those of ``values`` [n]; raises as ``exact_sum``."""
+        """Return the moments (number, sum and sum of squares) of ``values`` [n].
+
+        Raises ``InvalidInput`` unless all values are finite.
+        """
         return cls(len(values), exact_sum(values), exact_sum(values, values), int(np.count_nonzero(values < 0.0)))
 
     def __add__(self, other: Moments) -> Moments:
@@ -76,45 +81,69 @@ class Moments:
         return Moments(self.count + other.count, self.total + other.total, self.squares + other.squares, negative)
 
     def minus(self, other: Moments, products: Fraction) -> Moments:
-        """The moments of the differences pair by pair; ``products``: the exact sum of the products."""
+        """Return the moments of the differences ``value - other``, paired by world.
+
+        ``products`` is the exact sum over all pairs of ``value * other`` (``exact_sum``).
+        """
         return Moments(self.count, self.total - other.total, self.squares - 2 * products + other.squares, self.count)
 
     @property
     def mean(self) -> float:
-        """The mean, rounded once; raises ``ZeroDivisionError`` without a value."""
+        """Mean of the values: exact, then rounded to a float; raises ``ZeroDivisionError`` without values."""
         return float(self.total / self.count)
 
     @property
     def standard_error(self) -> float:
-        """``s / sqrt(n)`` with n - 1 degrees of freedom; raises ``ZeroDivisionError`` for fewer than two values."""
+        """Standard error of the mean, ``s / sqrt(n)`` with n - 1 degrees of freedom.
+
+        Raises ``ZeroDivisionError`` for fewer than two values.
+        """
         n = self.count
         return root((n * self.squares - self.total**2) / (n * n * (n - 1)))
 
     @property
     def estimate(self) -> Estimate:
-        """The mean of at least one value, with the interval ``mean -+ t s / sqrt(n)``; see ``mean``."""
+        """Mean with the interval ``mean -+ t s / sqrt(n)``, as the function ``mean`` returns it.
+
+        Raises ``ZeroDivisionError`` without values.
+        """
         found = self._around(self.mean, self.standard_error if self.count > 1 else 0.0)
         return found if self.negative else of_amounts(found, nothing=not self.squares)
 
     def ratio_error(self, others: Moments, products: Fraction) -> float:
-        """Standard error of the ratio ``r`` of two paired means, by the delta method.
+        """Return the standard error of ``r = mean(values) / mean(others)``, paired by world, by the delta method.
 
-        The residuals ``values - r others`` have mean 0: ``s(residuals) / (sqrt(n) |mean(others)|)``. With sums S and
-        sums of products Q, ``n (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / (n - 1) / Sy^4`` is its square.
+        The residuals ``values - r * others`` have mean 0, so the error is
+        ``std(residuals) / (sqrt(n) * abs(mean(others)))``. With x the values, y the others, sums S and sums of products
+        Q, its square is ``n * (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / ((n - 1) * Sy^4)``.
+
+        Args:
+            others: moments of the denominator, in the same worlds.
+            products: exact sum over all pairs of ``value * other``.
+
         """
         n, x, y = self.count, self.total, others.total
         residuals = self.squares * y * y - 2 * x * y * products + x * x * others.squares
         return root(n * residuals / ((n - 1) * y**4))
 
     def decrease(self, baseline: Moments, products: Fraction) -> Estimate | None:
-        """``relative_decrease`` from exact moments and the exact sum of the products."""
+        """Return ``1 - mean(values) / mean(baseline)`` with its interval; None if the baseline's mean is 0.
+
+        Args:
+            baseline: moments of the baseline, in the same worlds.
+            products: exact sum over all pairs of ``value * baseline``.
+
+        """
         if baseline.total == 0:
             return None
         error = self.ratio_error(baseline, products) if self.count > 1 else 0.0
         return self._around(1.0 - float(self.total / baseline.total), error)
 
     def _around(self, value: float, error: float) -> Estimate:
-        """``value`` with the half-width ``t error`` of n - 1 degrees of freedom."""
+        """Return the estimate ``value`` with the interval ``value -+ t error``; no interval for a single value.
+
+        ``error`` is the standard error; t has n - 1 degrees of freedom.
+        """
         if self.count < 2:
             return Estimate(value, None)
         half = float(stdtrit(self.count - 1, _UPPER)) * error
@@ -122,10 +151,13 @@ class Moments:
 
 
 def of_amounts(found: Estimate, *, nothing: bool) -> Estimate:
-    """The estimate where no value is below 0: its interval is not either, and there is none where all values are 0.
+    """Return an estimate of a mean of non-negative values, with its interval cut off below 0.
 
-    Then nothing was seen of what may happen in other worlds: a bound of its share is that of ``rate``, a bound of the
-    mean there is not.
+    Args:
+        found: the estimate with the usual interval.
+        nothing: whether all values are 0. Then there is no interval, because such a sample bounds the share of worlds
+            with other values (see ``rate``), but not their mean.
+
     """
     if nothing or found.interval is None:
         return Estimate(found.value, None)
@@ -133,13 +165,13 @@ def of_amounts(found: Estimate, *, nothing: bool) -> Estimate:
 
 
 def root(number: Fraction) -> float:
-    """Square root of a fraction of any size, at least 0; no step of it overflows."""
+    """Return the square root of ``number`` >= 0 as a float, even if ``number`` itself is too large for a float."""
     shift = (number.numerator.bit_length() - number.denominator.bit_length()) // 2
     return math.ldexp(math.sqrt(number / Fraction(4) ** shift), shift)
 
 
 def rate(successes: int, count: int) -> Estimate:
-    """Share ``p = successes / count`` with Wilson's score interval, which stays inside [0, 1].
+    """Return the share ``p = successes / count`` with Wilson's score interval, which stays inside [0, 1].
 
     With z the normal quantile: centre ``(p + z^2/2n) / (1 + z^2/n)``, half-width
     ``z / (1 + z^2/n) sqrt(p (1 - p) / n + z^2/4n^2)``. Raises ``InvalidInput`` unless 0 <= successes <= count >= 1.
@@ -150,7 +182,13 @@ def rate(successes: int, count: int) -> Estimate:
 
 
 def wilson(p: float, count: int) -> tuple[float, float]:
-    """Wilson's score interval of a share ``p`` of ``count`` draws, which need not be a whole number of them."""
+    """Return the ends (low, high) of Wilson's 95 % score interval of a share.
+
+    Args:
+        p: observed share, 0 to 1; ``p * count`` need not be a whole number.
+        count: number of draws.
+
+    """
     z = float(ndtri(_UPPER))
     shrink = 1.0 + z * z / count
     centre = (p + z * z / (2.0 * count)) / shrink
@@ -161,26 +199,38 @@ def wilson(p: float, count: int) -> tuple[float, float]:
 
 
 def mean(values: Floats) -> Estimate:
-    """Mean of ``values`` [n] with the interval ``mean -+ t s / sqrt(n)``; t with n - 1 degrees of freedom.
+    """Return the mean of ``values`` [n] with the interval ``mean -+ t s / sqrt(n)``; t has n - 1 degrees of freedom.
 
-    At thousands of worlds the mean is normal whatever the harm's own distribution, and the interval equals the
-    bootstrap's. Where no value is below 0 the interval ends at 0; where all are 0 there is none. Raises
+    With thousands of worlds, the mean is nearly normal whatever the distribution of harm, and the interval equals the
+    bootstrap's. If no value is negative, the interval starts at 0 or above; if all are 0, there is no interval. Raises
     ``InvalidInput`` when ``values`` is empty or not finite.
     """
     return Moments.of(check(values)).estimate
 
 
 def paired_difference(values: Floats, baseline: Floats) -> Estimate:
-    """Mean of ``values - baseline`` world by world, with the t interval of that mean."""
+    """Return the mean of ``values - baseline`` with its t interval.
+
+    ``values`` and ``baseline`` are [n] each, in the same worlds. Raises ``InvalidInput`` if their lengths differ, or if
+    they are empty or not finite.
+    """
     data, reference, products = _check_pair(values, baseline)
     return data.minus(reference, products).estimate
 
 
 def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> Estimate:
-    """``value - baseline`` of two means over n and m worlds that are taken as independent, from their t intervals.
+    """Return ``value - baseline`` of two means over n and m independent worlds, with Welch's interval.
 
-    With half-widths ``h = t_(n-1) s``, Welch: ``s^2 = s_1^2 + s_2^2``, and degrees of freedom
-    ``s^4 / (s_1^4 / (n - 1) + s_2^4 / (m - 1))``. No interval where one of the two has none.
+    The half-width of each mean's t interval, divided by its t quantile, is its standard error (``s1``, ``s2``). The
+    difference has the standard error ``s = sqrt(s1^2 + s2^2)``, with ``s^4 / (s1^4 / (n - 1) + s2^4 / (m - 1))``
+    degrees of freedom. There is no interval if one of the two means has none.
+
+    Args:
+        value: first mean with its interval.
+        n: number of its worlds.
+        baseline: second mean with its interval.
+        m: number of its worlds.
+
     """
     difference = value.value - baseline.value
     if value.interval is None or baseline.interval is None:
@@ -199,16 +249,25 @@ def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> 
 
 
 def relative_decrease(values: Floats, baseline: Floats) -> Estimate | None:
-    """``1 - mean(values) / mean(baseline)``, paired by world; None when the baseline's mean is 0.
+    """Return ``1 - mean(values) / mean(baseline)`` of two arrays [n] in the same worlds, with its interval.
 
-    Interval by the delta method: with ``r`` the ratio of the means, the residuals ``values - r baseline`` have mean 0
-    and the standard error of r is ``s_residual / (sqrt(n) mean(baseline))``.
+    Returns None if the baseline's mean is 0. Interval by the delta method: with ``r`` the ratio of the means, the
+    residuals ``values - r baseline`` have mean 0 and the standard error of r is
+    ``s_residual / (sqrt(n) mean(baseline))``.
     """
     data, reference, products = _check_pair(values, baseline)
     return data.decrease(reference, products)
 
 
 def check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Floats:
+    """Return ``values`` as a float array [n]; raise ``InvalidInput`` unless it is one-dimensional, not empty, finite.
+
+    Args:
+        values: the numbers.
+        who: name of the caller, for the message.
+        each: what each number belongs to, for the message: ``world`` or ``seed``.
+
+    """
     data = np.asarray(values, np.float64)
     if data.ndim != 1 or len(data) < 1 or not np.isfinite(data).all():
         raise InvalidInput(f"{who}: shape {data.shape}; at least one finite number per {each} is needed, as [n]")
@@ -216,7 +275,7 @@ def check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Fl
 
 
 def _check_pair(values: Floats, baseline: Floats) -> tuple[Moments, Moments, Fraction]:
-    """The moments of both, and the exact sum of their products."""
+    """Return the moments of ``values`` and of ``baseline``, and the exact sum of their products."""
     data, reference = check(values), check(baseline)
     if data.shape != reference.shape:
         raise InvalidInput(f"statistics: {len(data)} values cannot be paired with {len(reference)} of the baseline")

@@ -1,4 +1,4 @@
-"""The table of an evaluation: a row per agent, for a terminal, a document and a notebook."""
+"""The table of an evaluation: one row per agent, for a terminal, a document and a notebook."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ethbrake_marl.evaluation.agent_tally import AgentTally, estimate_all, lower
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import result_versions, scenario_sha256, worlds_sha256
-from ethbrake_marl.evaluation.measures import BASELINE, EPISODE, MEASURE_SETS, contexts_of, every_set, measures
+from ethbrake_marl.evaluation.measure_sets import BASELINE, EPISODE, MEASURE_SETS, contexts_of, every_set, measures
 from ethbrake_marl.evaluation.notes import SEES_THROUGH, Note, notes_of, warnings_of
 from ethbrake_marl.evaluation.outcome import COLUMN
 from ethbrake_marl.evaluation.own_measures import heading_of, registered_measure
@@ -30,25 +30,25 @@ _HEAD = {
     " something here.",
 }
 
-# Columns that a narrow terminal shows, beside those of the last set that has values for its own.
+# Columns that a narrow terminal shows, in addition to the ``narrow`` columns of the last set that has values for them.
 _ALWAYS_SHOWN = ("collision_rate", "first_impact_harm", "total_harm", "sampled_harm", "vehicle_1_shoved_m")
 
-_BELOW = ("collision_rate", "first_impact_harm", "total_harm")  # a terminal shows their intervals; JSON has all
+_BELOW = ("collision_rate", "first_impact_harm", "total_harm")  # measures whose intervals a terminal shows
 
 
 @dataclass(frozen=True, slots=True)
 class RowsBeside:
-    """Printed rows of another source that stand below a table of ours, and what must be said of them.
+    """Rows from another source, such as the paper, to print below the rows of our own agents."""
 
-    A row is a name and texts by measure; a text alone begins a section.
-    """
-
+    # A row is a pair (name, measure's name -> text of the cell); a plain text is the heading of a section.
     rows: Sequence[str | tuple[str, Mapping[str, str]]]
-    notes: Sequence[Note]
+    notes: Sequence[Note]  # notes about these rows, to print below the table
 
 
 class SummaryTable(list[SummaryRow]):
-    """The rows of ``summarise``: a list that ``print`` and a notebook show as a table.
+    """Results table of an evaluation: a list of one row per agent, which ``print`` and a notebook show as a table.
+
+    ``beside``: rows from another source to print below; None: no such rows.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -78,16 +78,20 @@ class SummaryTable(list[SummaryRow]):
         return sheet.only(k for k, name in enumerate(sheet.names) if name in shown).html()
 
     def meanings(self) -> dict[str, str]:
-        """What the columns mean, by the beginning of their headings; those of registered measures last."""
+        """Return the explanations of the columns: heading (up to a comma) -> text.
+
+        Columns with the same beginning, such as "Decrease, total" and "Decrease, first-impact", share one. Measures
+        that the user registered come last, by their names.
+        """
         about = {each.heading.partition(",")[0]: each.about for each in measures() if each.about and each.heading}
         own = [registered_measure(column) for column in self[0].metrics] if self else []
-        return _HEAD | about | {metric.name: metric.about for metric in own if metric is not None}
+        return _HEAD | about | {metric.name: metric.meaning for metric in own if metric is not None}
 
     def sheet(self) -> Sheet:
-        """The table: agent, what it knows, and every measure that has a heading, registered measures last.
+        """Return the table with all columns: agent, its knowledge, and every measure that has a heading.
 
-        Where a set of measures holds in some of the worlds alone, its means are marked as lower bounds. Rows of other
-        sources stand below.
+        Measures that the user registered come last. Means that are only lower bounds (``SummaryRow.bounds``) are marked
+        ``≥``. Rows from other sources stand below.
         """
         columns = [each.column() for each in measures() if each.heading]
         columns += [Column(heading_of(name), COLUMN + name) for name in (self[0].metrics if self else ())]
@@ -111,7 +115,10 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", ["Agent", "Knows", *columns], lines)
 
     def terminal(self) -> Sheet:
-        """The table for a terminal of 80 columns or more: our rows, rows beside them, then the conditions of each."""
+        """Return the table to print in a terminal of 80 columns or more.
+
+        Below it stand rows from other sources, and a text about worlds, intervals and other notes.
+        """
         narrow = self._narrow()
         columns = [
             replace(each, wide=each.name not in narrow, interval="below" if each.name in _BELOW else "hidden")
@@ -125,7 +132,10 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", [Column("Agent,\nwhat it knows", text=True), *columns], lines, self._conditions(), gap=1)
 
     def _narrow(self) -> tuple[str, ...]:
-        """Columns of a narrow terminal: the usual ones, and those of the last set that has values for them."""
+        """Return the names of the measures that a narrow terminal shows.
+
+        These are the usual ones, and the ``narrow`` measures of the last set of measures that has values for them.
+        """
         last: tuple[str, ...] = EPISODE.narrow
         for _, each in every_set():
             if self and any(self[0].estimates.get(name) is not None for name in each.narrow):
@@ -133,13 +143,13 @@ class SummaryTable(list[SummaryRow]):
         return (*_ALWAYS_SHOWN, *last)
 
     def tables(self) -> list[Sheet]:
-        """``terminal``, and below it the registered measures: a line per agent, the mean per world, its interval."""
+        """Return the tables to print: ``terminal`` and, if the user registered measures, a second one with these."""
         lines = [(row.agent, heading_of(column), value) for row in self for column, value in row.metrics.items()]
         own = Sheet("Measures", ["Agent", Column("Measure", text=True), Column("Mean or rate")], lines)
         return [self.terminal(), own] if lines else [self.terminal()]
 
     def markdown(self) -> str:
-        """The table for a document, with the conditions of our rows and of those beside them below it."""
+        """Return the table as Markdown, with a text about worlds, intervals and other notes below it."""
         return f"{self.sheet().markdown()}\n\n{self._conditions()}\n"
 
     def _conditions(self) -> str:
@@ -152,16 +162,19 @@ class SummaryTable(list[SummaryRow]):
         return "\n\n".join([ours, *(text for _, text in self.notes())])
 
     def notes(self) -> list[Note]:
-        """What must be said below the table: of our rows, then of the rows beside them."""
+        """Return the notes to print below the table: those about the agents, then those about rows of other sources.
+
+        Each is a pair: kind (``note`` or ``quiet``) and text.
+        """
         return [*notes_of(self), *(self.beside.notes if self and self.beside else ())]
 
 
 def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTable:
-    """One row per agent, in the order of the evaluation.
+    """Return the results table of an evaluation: one row per agent, in the order of the evaluation.
 
     Args:
-        evaluation: of the agents.
-        baseline: agent to compare with, where it was evaluated.
+        evaluation: outcomes of the agents, from ``evaluate``.
+        baseline: name of the agent to compare with; comparisons are missing if it was not evaluated.
 
     """
     contexts = contexts_of(evaluation)
@@ -190,16 +203,16 @@ def summarise_sums(
     baseline: str = BASELINE,
     **shared: Any,
 ) -> SummaryTable:
-    """One row per agent, from the sums of what was measured in the worlds of a list.
+    """Return the results table, one row per agent, from sums of the measures over the worlds of a list.
 
     Args:
-        tallies: sums, by agent.
-        conditions: of the test.
-        contexts: what each set of measures knows of the worlds.
-        knows: what agents say they know, by agent.
-        policies: SHA-256 of policies, by agent and by the vehicle's name.
-        baseline: agent to compare with.
-        shared: fields of ``SummaryRow`` that all rows have in common.
+        tallies: name of the agent -> sums of its measures.
+        conditions: scenario, number and quantities of the worlds (``Conditions.of_test``).
+        contexts: name of a set of measures -> what it prepared for these worlds (``contexts_of``).
+        knows: name of the agent -> its statement of what it knows about the line.
+        policies: name of the agent -> vehicle's name -> SHA-256 of its policy.
+        baseline: name of the agent to compare with.
+        shared: fields of ``SummaryRow`` with the same value in all rows, such as ``worlds_sha256``.
 
     """
     worlds = conditions["count"]

@@ -1,4 +1,4 @@
-"""A scenario tried before it is used: whether its scripts can play, and what happens that may not be meant."""
+"""Trial of a scenario before use: whether its scripts can drive, and how often something unusual happens."""
 
 from __future__ import annotations
 
@@ -9,14 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from ethbrake_marl.agents.driving import Episodes, script_agents
-from ethbrake_marl.agents.registry import (
-    agents_of_group,
-    find_entry,
-    make_agent,
-    make_role,
-    settings_needed,
-    shield_forms,
-)
+from ethbrake_marl.agents.making import find_entry, make_agent, make_role
+from ethbrake_marl.agents.registry import agents_of_group, settings_needed, shield_forms
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.memory import ask_script, begin_script
 from ethbrake_marl.errors import AgentFailed, InvalidInput, check_one_learner
@@ -29,18 +23,23 @@ from ethbrake_marl.scenario.catalogue import load_scenario, scenario_path
 from ethbrake_marl.scenario.roles import ScriptSpec
 from ethbrake_marl.scenario.schema import Scenario
 
-TRIED_CANDIDATES = 16  # of a script that searches, when a scenario is only checked
+TRIED_CANDIDATES = 16  # number of candidates of a script that searches, when a scenario is only checked
 
 
 def load_runnable(
     name_or_path: str, settings: Sequence[Override] = (), *, drives: Literal["nobody", "one", "some"] = "nobody"
 ) -> Scenario:
-    """Load a scenario as ``load_scenario`` does, and try its scripts, which the file's own check cannot know.
+    """Load a scenario, and try its scripts in one world, because reading the file does not show whether they can drive.
 
-    ``settings`` are put in the place of what the file says. ``drives``: one vehicle, or some, must be a learner.
+    Args:
+        name_or_path: name of a scenario, or path of a YAML file.
+        settings: settings ``KEY=VALUE`` that override values of the file.
+        drives: number of learners that the scenario must have: exactly one (``one``), at least one (``some``), or any
+            number, also none (``nobody``).
 
-    Raises ``InvalidInput`` naming the file, line, role and script that no agent of that name and argument can play, and
-    when there is no learner, or several where one is needed.
+    Raises ``InvalidInput`` naming file, line, role and script if no agent can play the script, and if the number of
+    learners does not fit ``drives``.
+
     """
     scenario = load_scenario(name_or_path)
     if settings:
@@ -69,12 +68,17 @@ def load_runnable(
 
 
 def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
-    """Drive worlds at the alert, and tell, as plain data, in how many what happens that may not be meant.
+    """Drive ``worlds`` of a scenario to their ends, and count those in which something unusual happens.
 
-    Scripts are as they are, but for a search, which has few candidates; learners brake fully. Where a command is beyond
-    its vehicle's capacities, each world is driven alone: ``commands_out_of_range`` is vehicle -> row -> message.
-    ``refused_by`` is what does not take scripts that depend on the state -> its message. Raises ``InvalidInput`` for
-    whatever a script raises, ``PhysicsError`` as ``drive``.
+    The scripts drive (with few candidates if they search); learners brake fully. The result has the keys:
+
+    - ``early_impacts``, ``moving_at_horizon``, ``vehicle_1_late``: number of worlds with an impact before a learner may
+      act, with something moving at the horizon, and with a latency of Vehicle 1;
+    - ``commands_out_of_range``: vehicle -> row -> message, for commands beyond the vehicle's capacities;
+    - ``not_state_free``: vehicle -> script that depends on the state;
+    - ``refused_by``: agent, shield or setting that refuses such scripts -> message.
+
+    Raises ``InvalidInput`` for an error in a script, ``PhysicsError`` for worlds that cannot be advanced.
     """
     searches = {
         scenario.vehicle_names[i]: f"{ScriptSpec.parse(script).name}:{TRIED_CANDIDATES}"
@@ -90,7 +94,7 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
     def drive_rows(rows: Ints) -> None:
         some = worlds.take(rows)
         engine = Engine(scenario, some.n, learners=(), scripts=scripts, deciders=scenario.learners, worlds=some)
-        engine.roster.warns = False  # of a world that fails ``Episodes`` tells
+        engine.roster.warns = False  # ``Episodes`` reports failed worlds
         early[rows] = engine.ledger.count.any(axis=1) | (engine.ledger.obstacle_count > 0)
         moving[rows] = ~Episodes.of(engine, some).at_rest
 
@@ -120,7 +124,10 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
 
 
 def _refusals(scenario: Scenario, worlds: Worlds) -> dict[str, str]:
-    """What refuses the scenario, and why. Agents, shields and ``early_impacts: reject`` are asked themselves."""
+    """Return why agents, shields and settings refuse the scenario: agent's spec, ``+SHIELD`` or setting -> message.
+
+    Each of them is actually tried on ``worlds``.
+    """
 
     def drive_by(spec: str, needs: Mapping[str, Any]) -> None:
         check_agents(

@@ -1,1 +1,1 @@
-"""Files: strict reading, durable writing. Nothing else knows a format."""
+"""Reading and writing files: strict reading, atomic writing. No other folder knows a file format."""

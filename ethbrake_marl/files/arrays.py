@@ -1,7 +1,8 @@
-"""Arrays from files of other people: names, types, shapes and sizes are checked before any of them is unpacked.
+"""Read arrays from untrusted files: names, types, shapes and sizes are checked before any array is unpacked.
 
-Two formats: ``.npz`` (a zip archive of ``.npy``) and safetensors. Nothing in either is evaluated or unpickled: the
-header of a ``.npy`` is a Python expression, and only the one form that numpy writes is recognised, by its letters.
+There are two formats: ``.npz`` (a zip archive of ``.npy``) and safetensors. Nothing in either is evaluated or
+unpickled. The header of a ``.npy`` is a Python expression; only the exact form that numpy writes is accepted, by
+pattern.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.files.plain import parse_strict_json
 
-HEADER_LIMIT_BYTES = 1 << 20  # of a safetensors file
+HEADER_LIMIT_BYTES = 1 << 20  # largest header of a safetensors file
 
 _NPY_HEADER_LIMIT_BYTES = 4096
 
-_DIRECTORY_LIMIT_BYTES = 1 << 16  # of a zip archive
+_DIRECTORY_LIMIT_BYTES = 1 << 16  # largest directory of a zip archive
 
 _MEMBERS_LIMIT = 64
 
@@ -35,28 +36,38 @@ _NPY = re.compile(
 
 _SHAPE = re.compile(r"|[0-9]{1,18},|[0-9]{1,18}(, [0-9]{1,18}){1,7}", re.ASCII)
 
-_HARMLESS_FLAGS = 0x808  # of a zip member: sizes behind the data, name in UTF-8
+_HARMLESS_FLAGS = 0x808  # flags of a zip member: sizes after the data, name in UTF-8
 
 
 class ArrayHeader(NamedTuple):
-    """What a file says about an array: its type, as its format calls it, and its shape."""
+    """Type (in the notation of its format) and shape of an array, as its file states them."""
 
-    dtype: str
-    shape: tuple[int, ...]
+    dtype: str  # type of the numbers, such as ``<f8`` (.npy) or ``F32`` (safetensors)
+    shape: tuple[int, ...]  # length of each axis
 
 
 class ArrayRow(NamedTuple):
-    """An array as it should be. A letter in ``shape`` is a length that is the same wherever that letter stands."""
+    """Required name, type and shape of an array.
 
-    name: str
-    dtype: str
-    shape: tuple[int | str, ...]
+    A letter in ``shape`` is any length, but the same length wherever the letter occurs.
+    """
+
+    name: str  # name of the array
+    dtype: str  # type of its numbers, as in ``ArrayHeader``
+    shape: tuple[int | str, ...]  # such as ``("n", 3)``
 
 
 def check_arrays(found: Mapping[str, ArrayHeader], wanted: Sequence[ArrayRow], word: str = "array") -> dict[str, int]:
-    """The length that each letter stands for; raises ``ValueError`` naming the first array that is not as ``wanted``.
+    """Check that arrays have the required names, types and shapes; return the length of each letter in the shapes.
 
-    No array may be missing, and none may be more.
+    For example ``{"n": 5}`` if a required shape is ``("n", 3)`` and the array is [5, 3]. Raises ``ValueError`` naming
+    the first array that is missing, superfluous or different.
+
+    Args:
+        found: headers of the arrays in a file, by name.
+        wanted: required arrays.
+        word: what messages call an array.
+
     """
     names = {row.name for row in wanted}
     for name in sorted(names - found.keys()):
@@ -80,7 +91,10 @@ def check_arrays(found: Mapping[str, ArrayHeader], wanted: Sequence[ArrayRow], w
 
 
 def safetensors_headers(data: bytes) -> dict[str, ArrayHeader]:
-    """What a safetensors file holds by its header; raises ``ValueError`` where that is none."""
+    """Return name -> type and shape of the arrays that a safetensors file declares in its header.
+
+    ``data``: bytes of the file. Raises ``ValueError`` for an invalid file.
+    """
     length = int.from_bytes(data[:8], "little")
     if not 2 <= length <= min(len(data) - 8, HEADER_LIMIT_BYTES):
         raise ValueError(f"not a safetensors file (a header of {length} bytes in a file of {len(data)})")
@@ -91,15 +105,20 @@ def safetensors_headers(data: bytes) -> dict[str, ArrayHeader]:
 
 
 def _lengths(shape: object) -> tuple[int, ...]:
-    """A shape from JSON; what is no length is -1, which is never right."""
+    """Convert a shape from JSON to a tuple; an invalid length becomes -1, which never matches."""
     return tuple(each if type(each) is int else -1 for each in (shape if isinstance(shape, list) else [None]))
 
 
 class ArrayArchive:
-    """An ``.npz`` in memory whose headers have been read; at most ``limit_bytes`` when unpacked.
+    """An ``.npz`` archive in memory, whose headers have been read and checked.
 
-    Plain archives as ``numpy.savez`` and ``numpy.savez_compressed`` write them: no comment, no second disk, nothing
-    encrypted, deflated or stored, every name once. Raises ``ValueError`` for anything else.
+    Accepts plain archives as ``numpy.savez`` and ``numpy.savez_compressed`` write them: one disk, no comment, no
+    encryption, stored or deflated, every name once. Raises ``ValueError`` for anything else.
+
+    Args:
+        data: bytes of the archive.
+        limit_bytes: largest total size of the unpacked arrays.
+
     """
 
     def __init__(self, data: bytes, limit_bytes: int) -> None:
@@ -107,7 +126,7 @@ class ArrayArchive:
         with _damage():
             self._zip = zipfile.ZipFile(io.BytesIO(data))
             self._members = self._zip.infolist()
-        self._starts: dict[str, int] = {}  # of each array's numbers
+        self._starts: dict[str, int] = {}  # where each array's numbers start
         self.headers: dict[str, ArrayHeader] = {}
         size = sum(member.file_size for member in self._members)
         if size > limit_bytes:
@@ -116,14 +135,17 @@ class ArrayArchive:
             self._read_header(member)
 
     def unpack(self, wanted: Sequence[ArrayRow]) -> dict[str, NDArray[Any]]:
-        """The arrays by name, read-only, once ``check_arrays`` has found them to be as ``wanted``."""
+        """Return the arrays by name, read-only, after checking them against the required arrays ``wanted``.
+
+        Raises ``ValueError`` as ``check_arrays`` does.
+        """
         check_arrays(self.headers, wanted)
         arrays = {}
         for member in self._members:
             name = _name(member)
             with _damage(), self._zip.open(member) as stream:
                 data = stream.read(member.file_size)
-                stream.read(1)  # the checksum is compared at the end
+                stream.read(1)  # reading to the end compares the checksum
             header = self.headers[name]
             arrays[name] = np.frombuffer(data, header.dtype, offset=self._starts[name]).reshape(header.shape)
         return arrays
@@ -152,7 +174,10 @@ def _name(member: zipfile.ZipInfo) -> str:
 
 
 def _npy_header(name: str, beginning: bytes) -> tuple[ArrayHeader, int]:
-    """Type and shape of a ``.npy``, and where its numbers begin."""
+    """Return type and shape of a ``.npy``, and the byte at which its numbers start.
+
+    ``name``: name of the array, for messages; ``beginning``: first bytes of the ``.npy``, with the whole header.
+    """
     length = int.from_bytes(beginning[8:10], "little")
     match = _NPY.fullmatch(beginning[10 : 10 + length])
     if beginning[:8] != b"\x93NUMPY\x01\x00" or length > _NPY_HEADER_LIMIT_BYTES or match is None:
@@ -166,7 +191,10 @@ def _npy_header(name: str, beginning: bytes) -> tuple[ArrayHeader, int]:
 
 
 def _check_directory(data: bytes) -> None:
-    """Look at the end of a zip archive, before a reader makes an object of everything that its directory lists."""
+    """Raise ``ValueError`` unless the end of a zip archive is plain and its directory is small.
+
+    This is checked before a reader creates an object for every entry of the directory.
+    """
     if len(data) < 22 or data[-22:-18] != b"PK\x05\x06":
         raise ValueError("not a plain .npz archive")
     disk, first_disk, here, members, size, start, comment = struct.unpack("<4H2LH", data[-18:])
@@ -178,7 +206,7 @@ def _check_directory(data: bytes) -> None:
 
 @contextmanager
 def _damage() -> Iterator[None]:
-    """Whatever the zip reader meets in a damaged archive is a ``ValueError``."""
+    """Context manager: an error of the zip reader that is raised in the block becomes a ``ValueError``."""
     try:
         yield
     except (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, RuntimeError, OverflowError) as error:

@@ -1,6 +1,6 @@
-"""Models of files: what a file may say, and one clear message for the first mistake in it.
+"""Pydantic models of files, and one clear error message for the first mistake in a file.
 
-Where it stands, its value, and what would be right. No other file words its errors.
+The message says where the mistake is, the value, and what would be right. All such messages are made here.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.plain import parse_strict_json
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, parse_numeral, read_yaml
 
-# Ending of a key -> the unit in words.
+# Suffix of a key -> unit in words.
 UNITS = {
     "s": "seconds",
     "m": "metres",
@@ -41,36 +41,56 @@ NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
 
 
 class FileModel(BaseModel):
-    """What a file may say: unknown keys, other types and later changes are refused."""
+    """Base class of pydantic models of a file's content: immutable; unknown keys and wrong types are errors.
+
+    A subclass declares a field for each key.
+    """
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
 
 Model = TypeVar("Model", bound=BaseModel)
 
-UNSHOWN = object()  # a value that the message does not show
+UNSHOWN = object()  # marker: do not show the value in the message
 
 
 def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
-    """Raise the error for ``value`` at ``at`` (inside the field being checked): ``right`` says what would do."""
+    """Raise the error for an invalid value in a pydantic validator.
+
+    Args:
+        at: path of the value (keys and indices) inside the checked field; ``()``: the field itself.
+        value: the value, shown in the message; ``UNSHOWN``: do not show it.
+        right: what would be valid, for example ``must be above 0``.
+
+    """
     shown = "" if value is UNSHOWN else flow_text(value, 60)
     raise PydanticCustomError("refused", "{right}", {"right": right, "value": shown, "at": at})
 
 
 def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
-    """``refuse`` the value unless ``holds``."""
+    """Raise the error of ``refuse(at, value, right)`` unless ``holds`` is true."""
     if not holds:
         refuse(at, value, right)
 
 
 class Wording:
-    """What messages know of one kind of file: its keys by the fields of its model, and what a missing one needs."""
+    """Texts for error messages about one kind of file.
+
+    A subclass may override ``needed``, ``instead``, ``owner`` and ``right`` to say more about the keys of this file.
+
+    A *path* is the keys and indices that lead to a value, for example ``("mixture", 0, "weight")``.
+
+    Args:
+        model: the pydantic model of the file.
+        needed: text that says what a missing key needs.
+
+    """
 
     def __init__(self, model: type[BaseModel], needed: str = "") -> None:
         self.model, self._needed = model, needed
 
     def known(self, path: YamlPath) -> list[str]:
-        """The keys that may stand where ``path`` ends."""
+        """Return the names of the keys that are allowed at the end of ``path`` (keys and indices inside the file)."""
         models = [self.model]
         for key in path[:-1]:
             inside = [model.model_fields[key].annotation for model in models if key in model.model_fields]
@@ -78,29 +98,41 @@ class Wording:
         return list(dict.fromkeys(f.alias or name for model in models for name, f in model.model_fields.items()))
 
     def needed(self, path: YamlPath) -> str:
-        """What is needed at ``path``, where it is missing."""
+        """Return a text that says what is needed at ``path`` (keys and indices inside the file), if it is missing."""
         return self._needed
 
     def instead(self, key: str) -> str:
-        """What there is in place of a key that such files do not have; empty where nothing is known of it."""
+        """Return a text that says what replaces the unknown ``key``; empty if nothing is known about it."""
         return ""
 
     def owner(self, path: YamlPath) -> str:
-        """Whose value stands at ``path``, in words; empty where that needs no saying."""
+        """Return the vehicle or pair that the value at ``path`` belongs to, in words; empty if that is obvious.
+
+        ``path``: keys and indices inside the file.
+        """
         return ""
 
     def right(self, detail: ErrorDetails) -> str:
-        """What would be right, where only this kind of file knows; empty where the error says it itself."""
+        """Return what would be valid instead of the value in ``detail`` (a mistake, as pydantic reports it).
+
+        Empty if a general message says enough.
+        """
         return ""
 
 
 def explain(document: Document, error: ValidationError, wording: Wording) -> InvalidInput:
-    """The error where it does not fit its schema.
+    """Return the ``InvalidInput`` for a document that does not fit its schema.
 
-    The first is shown, unknown keys before all others, and "(and k more mistakes)" tells the rest. A missing
-    key that an unknown one was probably meant to be is not counted.
+    It shows the first mistake, unknown keys before all others, and counts the rest: "(and k more mistakes)". If an
+    unknown key is probably the misspelt name of a missing key, only the unknown key counts.
+
+    Args:
+        document: the parsed file, which knows the line of each value.
+        error: pydantic's error for its content.
+        wording: texts about this kind of file.
+
     """
-    # A default that needs another field is not made after an error elsewhere: no defect of its own.
+    # A default that depends on a field with an error is no further mistake.
     details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
     unknown = [d for d in details if d["type"] == "extra_forbidden"]
     meant = " ".join(suggestion(str(d["loc"][-1]), wording.known(path_of(d))) for d in unknown)
@@ -122,9 +154,16 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def read_model(source: str | Path | Document, model: type[Model], wording: Wording, advice: str) -> Model:
-    """What a file, or a document, says; raises ``InvalidInput`` with file, line, key, value and what would be right.
+    """Read a YAML file or document into ``model``; raise ``InvalidInput`` for the first mistake.
 
-    ``advice`` says what must be there where it holds no mapping of keys to values.
+    The message names file, line, key and value, and says what would be valid.
+
+    Args:
+        source: path of the file, or the parsed document.
+        model: pydantic model of the content.
+        wording: texts about this kind of file.
+        advice: what the file must contain, for the message if it is not a mapping.
+
     """
     document = source if isinstance(source, Document) else read_yaml(source)
     if not isinstance(document.content, dict):
@@ -136,7 +175,10 @@ def read_model(source: str | Path | Document, model: type[Model], wording: Wordi
 
 
 def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
-    """The plain content of a JSON file that a program wrote, and what it says; raises ``ValueError`` in one line."""
+    """Parse a JSON file that a program wrote; return its plain content, and the content as ``model``.
+
+    ``data``: the bytes of the file. Raises ``ValueError`` with a one-line reason for invalid content.
+    """
     content = parse_strict_json(data)  # no key twice, no NaN
     try:
         return content, model.model_validate_json(data)
@@ -145,25 +187,28 @@ def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
 
 
 class Mistake(NamedTuple):
-    """The first defect that pydantic found in what no person wrote: as text ``place: right``."""
+    """The first error that pydantic found in data from a program; its text is ``place: right``."""
 
-    place: str  # keys with dots between them; empty for the whole
-    given: Any
-    right: str
+    place: str  # keys joined by dots; empty for the whole
+    given: Any  # the invalid value
+    right: str  # what would be valid
 
     def __str__(self) -> str:
         return f"{self.place}: {self.right}" if self.place else self.right
 
 
 def first_mistake(error: ValidationError) -> Mistake:
-    """Where the first mistake is, and what would be right: for files that programs write, and for settings in code."""
+    """Return the first mistake that pydantic found, for files that programs write and for settings in code."""
     detail = error.errors(include_url=False)[0]
     right = {"missing": "is missing", "extra_forbidden": "unknown key"}.get(detail["type"])
     return Mistake(".".join(str(key) for key in path_of(detail)), detail["input"], right or _right(detail))
 
 
 def path_of(detail: ErrorDetails) -> YamlPath:
-    """The path inside the file: without pydantic's tags, with the path inside the field that a check gave."""
+    """Return the path (keys and indices inside the file) of a mistake that pydantic reports.
+
+    Pydantic's tags are left out; the path that ``refuse`` reports is appended.
+    """
     keys = tuple(key for key in detail["loc"] if not (isinstance(key, str) and key.startswith("#")))
     return (*keys, *detail.get("ctx", {}).get("at", ()))
 
@@ -185,7 +230,10 @@ def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
 
 
 def _show(detail: ErrorDetails) -> str:
-    """The value, unless the whole file is meant; a number keeps the point that makes it wrong."""
+    """Format the invalid value for the message; empty if the whole file is meant.
+
+    A float instead of a whole number keeps its decimal point.
+    """
     given = detail["input"]
     if isinstance(given, BaseModel) or not detail["loc"]:
         return ""
@@ -199,7 +247,7 @@ def _place(path: YamlPath, wording: Wording) -> str:
 
 
 def _unquote(detail: ErrorDetails) -> str:
-    """What would be right for a number in quotes; empty for anything else."""
+    """Return advice for a number that stands in quotes and so is a text; empty for any other mistake."""
     given = detail["input"]
     quoted = detail["type"] == "float_type" and isinstance(given, str) and parse_numeral(given) is not None
     return "must be a number, not text; write it without quotes" if quoted else ""
@@ -207,7 +255,7 @@ def _unquote(detail: ErrorDetails) -> str:
 
 def _right(detail: ErrorDetails) -> str:
     kind = detail["type"]
-    if detail["input"] != detail["input"]:  # NaN, which is not less than anything, either
+    if detail["input"] != detail["input"]:  # NaN
         return "must be a finite number"
     if kind == "float_type":
         return "must be a number"
@@ -228,9 +276,10 @@ def _right(detail: ErrorDetails) -> str:
 
 
 def suggestion(key: str, known: Iterable[str]) -> str:
-    """What an unknown ``key`` was probably meant to be; empty when nothing is close.
+    """Return "did you mean ...?" for an unknown ``key``; empty if no known key is close.
 
-    A key that differs from a known one only in its unit is recognised as such: ``gaps_km``, ``mass``.
+    ``known``: the valid keys. A key that differs from one of these only in its unit is recognised: ``gaps_km``,
+    ``mass``.
     """
     names = sorted(known)
     stems = {name.rsplit("_", 1)[0]: name for name in names if name.rsplit("_", 1)[-1] in UNITS}

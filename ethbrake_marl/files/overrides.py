@@ -1,4 +1,4 @@
-"""Settings of a command line, ``key.path=value``: parsed as YAML, and put in their place inside plain data."""
+"""Command-line settings ``key.path=value``: parsed as YAML and inserted into plain data."""
 
 from __future__ import annotations
 
@@ -13,31 +13,32 @@ from ethbrake_marl.files.yaml import flow_text, parse_yaml
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """One setting: where, and which value."""
+    """One setting from the command line, such as ``reward.harm=0.5``: its path and its value."""
 
-    text: str  # as it was given
-    path: tuple[str, ...]  # keys from the outermost on; of a list: which entry, from 0
-    value: Any  # typed by the rules of YAML
+    text: str  # the setting as written
+    path: tuple[str, ...]  # keys from the outermost on; for a list the index, from 0
+    value: Any  # value parsed as YAML
 
     @property
     def top(self) -> str:
-        """The outermost key."""
+        """The outermost key: ``reward`` for ``reward.harm=0.5``."""
         return self.path[0]
 
     @property
     def key(self) -> str:
-        """The path as it was written."""
+        """The path with dots, as written: ``reward.harm`` for ``reward.harm=0.5``."""
         return ".".join(self.path)
 
     def inside(self) -> Override:
-        """The same without its outermost key."""
+        """Return the setting without its outermost key: ``harm=0.5`` for ``reward.harm=0.5``."""
         return Override(self.text, self.path[1:], self.value)
 
     @staticmethod
     def parse(texts: Sequence[str]) -> list[Override]:
-        """Parse ``key.path=value``, each key once; a value is YAML on one line: ``0.2`` or ``{uniform: [1, 2]}``.
+        """Parse settings ``key.path=value``; a value is YAML on one line: ``0.2`` or ``{uniform: [1, 2]}``.
 
-        Raises ``InvalidInput`` for a text without ``=``, an empty key, a key given twice, and a value that is no YAML.
+        Raises ``InvalidInput`` for a text without ``=``, an empty key, a repeated key, and a value that is not valid
+        YAML.
         """
         found: list[Override] = []
         for text in texts:
@@ -52,9 +53,11 @@ class Override:
 
     @staticmethod
     def put(content: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
-        """Outermost key -> its new value, of ``content`` with the overrides in it; ``content`` stays as it is.
+        """Apply settings to plain data; return the changed top-level keys with their new values.
 
-        Raises ``InvalidInput`` for a path that leads into a value that holds nothing.
+        ``content`` itself is not changed. With ``content = {"reward": {"harm": 1}, "seed": 3}`` and the setting
+        ``reward.harm=2`` the result is ``{"reward": {"harm": 2}}``. Raises ``InvalidInput`` for a path into a value
+        that is neither a mapping nor a list.
         """
         changed: dict[str, Any] = {}
         for override in overrides:
@@ -65,7 +68,10 @@ class Override:
 
 
 def _placed(part: Any, path: tuple[str, ...], override: Override) -> Any:
-    """``part`` with the value at ``path`` inside it."""
+    """Return a copy of ``part`` (a mapping, list or other value) with the value of ``override`` at ``path`` inside it.
+
+    ``path``: the last keys of ``override.path``; ``()``: the value replaces ``part``. A missing mapping is created.
+    """
     if not path:
         return override.value
     key, rest = path[0], path[1:]

@@ -1,4 +1,4 @@
-"""Files that somebody else may have written: plain files only, no more of them than is expected, and strict JSON."""
+"""Safe reading of untrusted files: plain files only, of limited size, and strict JSON."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.files.store import LARGEST_OBJECT_BYTES
 
-_FLAGS = ("O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC", "O_BINARY")  # those that this system has
+_FLAGS = ("O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC", "O_BINARY")  # flags, if the system has them
 
 
 def read_plain(
@@ -25,9 +25,16 @@ def read_plain(
     refusal: type[EthBrakeError] = InvalidInput,
     follow_links: bool = True,
 ) -> bytes:
-    """The content of a plain file of at most ``limit_bytes``; raises ``refusal`` as ``open_plain``.
+    """Return the content of a plain file of at most ``limit_bytes``; raise ``refusal`` if it cannot be read.
 
-    Of a file that grows no more than that is read.
+    The limit also holds for a file that grows while it is read.
+
+    Args:
+        path: path of the file.
+        limit_bytes: largest accepted size.
+        refusal: class of the error to raise, with path and reason; see ``open_plain``.
+        follow_links: whether a symbolic link is accepted.
+
     """
     with open_plain(path, limit_bytes, refusal=refusal, follow_links=follow_links) as stream:
         data = _read(stream.fileno(), limit_bytes + 1)
@@ -44,12 +51,19 @@ def open_plain(
     refusal: type[EthBrakeError] = InvalidInput,
     follow_links: bool = True,
 ) -> Iterator[BufferedReader]:
-    """A plain file of at most ``limit_bytes``, open for reading.
+    """Open a plain file of at most ``limit_bytes`` for reading, as a context manager.
 
-    Its kind and size are looked at before anything of it is read: a pipe or device is not even opened, so nothing
-    waits for a writer and no device notices; what takes its place in between is opened without waiting and looked at
-    again. Raises ``refusal`` naming the path and the reason: nothing there, a folder, a device, a pipe, too large, not
-    to be read (inside the block too), or a symbolic link where none is to be followed.
+    Kind and size are checked before anything is opened, so a pipe or device is never opened. Nothing waits for a
+    writer, and no device is affected. If the file is replaced in between, the new one is opened without waiting and
+    checked again.
+
+    Args:
+        path: path of the file.
+        limit_bytes: largest accepted size.
+        refusal: class of the error to raise, with path and reason: the file does not exist, is a folder, device or
+            pipe, is too large, or cannot be read (also inside the block).
+        follow_links: whether a symbolic link is accepted.
+
     """
     file = Path(path)
     try:
@@ -71,7 +85,7 @@ def open_plain(
 
 
 def _read(descriptor: int, most_bytes: int) -> bytes:
-    """Up to so many bytes; raises ``OSError`` where there is nothing to read without waiting."""
+    """Read up to ``most_bytes`` from a file descriptor; raise ``OSError`` if reading would have to wait."""
     parts: list[bytes] = []
     while most_bytes > 0 and (part := os.read(descriptor, min(most_bytes, 1 << 20))):
         parts.append(part)
@@ -96,7 +110,7 @@ def _too_large(file: Path, limit_bytes: int, refusal: type[EthBrakeError]) -> Et
 
 
 def parse_strict_json(data: bytes) -> Any:
-    """Parse ``data``; raises ``ValueError`` with a one-line reason on anything ambiguous or not in the standard."""
+    """Parse UTF-8 JSON; raise ``ValueError`` with a one-line reason for repeated keys, NaN or invalid text."""
     try:
         return json.loads(
             data.decode("utf-8"), object_pairs_hook=_object, parse_constant=_not_a_number, parse_float=_finite
@@ -106,7 +120,7 @@ def parse_strict_json(data: bytes) -> Any:
 
 
 def read_object(file: Path) -> dict[str, Any]:
-    """The JSON object in a file of a run; raises ``InvalidInput`` naming the file and what is wrong with it."""
+    """Return the JSON object in a file of a training run; raise ``InvalidInput`` naming the file and what is wrong."""
     if not os.path.lexists(file):
         raise InvalidInput(f"{file}: is missing; nothing goes on without it")
     data = read_plain(file, LARGEST_OBJECT_BYTES)

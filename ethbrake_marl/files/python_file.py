@@ -1,7 +1,7 @@
-"""Python files of the user's own: run once when a person names one, and remembered with their SHA-256.
+"""Python files of the user: run once when the user names one, and recorded with their SHA-256.
 
-Nothing here is found by itself: a file is run because it was named (``--agents my_file.py:make_agent``). What a run's
-folder, a recipe or a scenario names is never run.
+A file runs only if the user names it (``--agents my_file.py:make_agent``). A file named in a run's folder, a recipe or
+a scenario never runs.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ethbrake_marl.files.plain import read_plain
 
 _LIMIT_BYTES = 1 << 20
 
-_RUN: dict[Path, tuple[str, ModuleType]] = {}  # files of this process, with their SHA-256
+_RUN: dict[Path, tuple[str, ModuleType]] = {}  # files that this process ran, with their SHA-256
 
 _BEING_RUN: set[Path] = set()
 
@@ -25,11 +25,11 @@ _READ: dict[str, set[str]] = {}
 
 
 def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
-    """What a Python file calls by this name. The file is run, once, and can do whatever you can do.
+    """Run a Python file, once per process, and return the object ``name`` that it defines. The file can do anything.
 
-    Of the file that it ``reads``, such as weights, the SHA-256 is remembered; nothing of what is no file. Raises
-    ``InvalidInput`` for a file that is missing, that raises (naming its line), that was changed since it was run, or
-    that has no such name.
+    ``reads`` is the path of a file that it uses, such as weights; its SHA-256 is recorded if the file exists. Raises
+    ``InvalidInput`` for a Python file that is missing, raises an error (with its line), was changed since it ran, or
+    does not define ``name``.
     """
     _, module = _run_file(Path(path), f"file {path!r}")
     if not hasattr(module, name):
@@ -40,15 +40,15 @@ def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
 
 
 def file_sha256(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal digits."""
+    """Return the SHA-256 of a file, in hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def files_run() -> dict[str, str]:
-    """Name -> SHA-256 of every file that this process ran, and of every file that was named for an agent.
+    """Return name -> SHA-256 of every Python file that this process ran, and of the files that these read.
 
-    Of all of that name, where there are several.
+    If several files have the same name, their hashes are joined by commas.
     """
     found = {name: set(several) for name, several in _READ.items()}
     for path, (sha256, _) in _RUN.items():
@@ -57,7 +57,10 @@ def files_run() -> dict[str, str]:
 
 
 def _run_file(path: Path, what: str) -> tuple[str, ModuleType]:
-    """SHA-256 and module of a file; run now unless it was run before."""
+    """Return SHA-256 and module of a Python file; run it unless it ran before.
+
+    ``what``: how error messages name the file.
+    """
     if not path.is_file():
         raise InvalidInput(f"{what}: {'is not a plain file' if path.exists() else 'there is no such file'}")
     content = read_plain(path, _LIMIT_BYTES)
@@ -70,7 +73,17 @@ def _run_file(path: Path, what: str) -> tuple[str, ModuleType]:
 
 
 def _run(content: bytes, path: Path, sha256: str, what: str) -> ModuleType:
-    """Run the content of a file as a module, which classes of it are pickled by."""
+    """Run the content of a Python file as a new module, and return the module.
+
+    The module is registered in ``sys.modules`` so that its classes can be pickled.
+
+    Args:
+        content: bytes of the file.
+        path: its resolved path.
+        sha256: hash of the content, used in the module's name.
+        what: how error messages name the file.
+
+    """
     module = ModuleType(f"ethbrake_file_{path.stem}_{sha256[:12]}")
     module.__file__ = str(path)
     if path in _BEING_RUN:

@@ -1,4 +1,4 @@
-"""A table of estimates and texts, written as a terminal, a document, a notebook, a CSV file or JSON needs it."""
+"""A table of estimates and texts, and its output for terminal, document, notebook, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -18,36 +18,43 @@ from ethbrake_marl.files.store import new_file
 if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 
-DASH = "–"  # for what does not exist
+DASH = "–"  # shown for a missing value
 _AFTER_SIGN = re.compile(r"(?<=[:+@,/])(?=.)")
-WIDE = 120  # characters of a terminal that show every column
+WIDE = 120  # width of a terminal (characters) from which on every column is shown
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A value and its interval; the interval is None where the data cannot give one (a single world)."""
+    """A value and its confidence interval; the interval is None if the data do not allow one (a single world)."""
 
-    value: float
-    interval: tuple[float, float] | None
+    value: float  # the estimate itself
+    interval: tuple[float, float] | None  # low and high end
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Its interval; the value itself where there is none."""
+        """Low and high end of the interval; the value twice if there is none."""
         return self.interval or (self.value, self.value)
 
     def in_words(self, *, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
-        """``24.19 [23.85, 24.53]``: value and interval, each times ``scale``."""
+        """Format value and interval as text: ``24.19 [23.85, 24.53]``.
+
+        Args:
+            digits: digits after the decimal point.
+            scale: factor that all numbers are multiplied by, for example 100 for per cent.
+            unit: text directly after the value.
+
+        """
         return Column("", digits=digits, scale=scale, unit=unit).show(self).in_words
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data for JSON: ``value``, and ``interval`` as ``[low, high]`` or null."""
+        """Return plain data for JSON: ``value``, and ``interval`` as ``[low, high]`` or null."""
         return {"value": self.value, "interval": None if self.interval is None else list(self.interval)}
 
     @staticmethod
     def side_by_side(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
-        """Estimates by name as plain data, side by side: ``{name: value, name_interval: [low, high]}``.
+        """Return estimates by name as flat plain data: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``.
 
-        What does not exist is null.
+        A missing estimate becomes None under both keys.
         """
         found: dict[str, Any] = {}
         for name, estimate in estimates.items():
@@ -57,14 +64,14 @@ class Estimate:
 
 
 class Shown(NamedTuple):
-    """A cell in words."""
+    """A cell of a table as text: its value, and the interval of an estimate."""
 
-    value: str
+    value: str  # the number, with its unit, or the text
     interval: str = ""  # ``23.85, 24.53``
 
     @property
     def in_words(self) -> str:
-        """In one line: ``24.19 [23.85, 24.53]``."""
+        """Value and interval in one line: ``24.19 [23.85, 24.53]``."""
         return f"{self.value} [{self.interval}]" if self.interval else self.value
 
 
@@ -73,29 +80,29 @@ Cell = Estimate | Shown | float | int | str | None
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column, and how its numbers are written: each times ``scale``, with ``digits``, then its ``unit``.
+    """A column, and the format of its numbers: multiplied by ``scale``, with ``digits``, then ``unit``.
 
-    A whole number is written as it is, a text too, whatever the column's digits are.
+    Whole numbers and texts are written unchanged.
     """
 
-    heading: str
-    key: str = ""  # its name in CSV and JSON; "": the heading
-    digits: int = 2
-    scale: float = 1.0
-    unit: str = ""
-    sign: Literal["z", "+"] = "z"  # as in a format: never -0.00, or always a sign
-    text: bool = False  # flush left, and folded where a terminal is narrow
-    short: str = ""  # the heading for a terminal; "": the heading
+    heading: str  # heading in documents
+    key: str = ""  # name in CSV and JSON; "": the heading
+    digits: int = 2  # digits after the decimal point
+    scale: float = 1.0  # numbers are multiplied by this
+    unit: str = ""  # text directly after the number
+    sign: Literal["z", "+"] = "z"  # format option: "z" never shows -0.00, "+" always shows a sign
+    text: bool = False  # left-aligned, and wrapped in a narrow terminal
+    short: str = ""  # heading in a terminal; "": the heading
     wide: bool = False  # shown only in a terminal of ``WIDE`` characters
-    interval: Literal["beside", "below", "hidden"] = "beside"  # of an estimate, in a terminal
+    interval: Literal["beside", "below", "hidden"] = "beside"  # where a terminal shows the interval of an estimate
 
     @property
     def name(self) -> str:
-        """Its name in CSV and JSON."""
+        """Name in CSV and JSON."""
         return self.key or self.heading
 
     def show(self, cell: Cell) -> Shown:
-        """A cell of this column in words."""
+        """Format a cell of this column as text: a number, estimate or text; None is shown as a dash."""
         if cell is None or isinstance(cell, Shown):
             return cell or Shown(DASH)
         if isinstance(cell, str | int):
@@ -109,15 +116,15 @@ class Column:
         return f"{self.scale * value:{self.sign}.{self.digits}f}"
 
 
-Row = Sequence[Any] | str  # of cells; Any spares callers a list's type
+Row = Sequence[Any] | str  # a row of cells, or the name of a section
 
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """A table: a title, columns, rows of cells, and a note below.
+    """A table: title, columns, rows of cells, and a note below.
 
-    A column may be given as its heading: it holds texts. A row that is a text begins a section of that name. A row may
-    end early; what is missing is empty.
+    A column given as a string is a column of texts with that heading. A row given as a string begins a section of that
+    name. A row may be shorter than the table; the missing cells are empty.
 
     >>> from ethbrake_marl.files.sheet import Column, Estimate, Sheet
     >>> sheet = Sheet("Harm", ["Agent", Column("Total", "total_harm")], [("coast", Estimate(1.5, (1.0, 2.0)))])
@@ -130,27 +137,27 @@ class Sheet:
 
     """
 
-    title: str
-    columns: Sequence[Column | str]
-    rows: Sequence[Row]
-    note: str = ""
-    gap: Literal[1, 2, 3] = 3  # blanks between two columns in a terminal
+    title: str  # "": no title
+    columns: Sequence[Column | str]  # a string: a column of texts with this heading
+    rows: Sequence[Row]  # a sequence of cells, or a string that begins a section
+    note: str = ""  # text below the table
+    gap: Literal[1, 2, 3] = 3  # spaces between two columns in a terminal
 
     def _columns(self) -> list[Column]:
         return [column if isinstance(column, Column) else Column(column, text=True) for column in self.columns]
 
     @property
     def headings(self) -> list[str]:
-        """Of its columns."""
+        """Headings of the columns."""
         return [column.heading for column in self._columns()]
 
     @property
     def names(self) -> list[str]:
-        """Of its columns, in CSV and JSON."""
+        """Names of the columns in CSV and JSON."""
         return [column.name for column in self._columns()]
 
     def shown(self) -> Iterator[str | tuple[Shown, ...]]:
-        """Its rows in words, each of as many cells as there are columns; sections are their names."""
+        """Yield each row as a tuple of formatted cells, one per column; a section is yielded as its name (a string)."""
         columns = self._columns()
         for row in self.rows:
             if isinstance(row, str):
@@ -160,20 +167,23 @@ class Sheet:
                 yield (*cells, *[Shown("")] * (len(columns) - len(cells)))
 
     def only(self, columns: Iterable[int]) -> Sheet:
-        """That of some columns, by number."""
+        """Return the table with only these columns, by index from 0."""
         kept = list(columns)
         rows = [row if isinstance(row, str) else [row[k] for k in kept if k < len(row)] for row in self.rows]
         return replace(self, columns=[self.columns[k] for k in kept], rows=rows)
 
     def filled(self) -> list[int]:
-        """Numbers of the columns in which some row has a value; all of them without rows."""
+        """Return the indices of the columns in which some row has a value; without rows, all indices."""
         rows = [row for row in self.rows if not isinstance(row, str)]
         return [
             k for k in range(len(self.columns)) if not rows or any(k < len(row) and row[k] is not None for row in rows)
         ]
 
     def rich(self, width: int = WIDE) -> RenderableType:
-        """For a terminal of this width, the note below; all lines of a cell but its first are dim."""
+        """Return the table as an object for ``rich``, for a terminal of ``width`` characters, with the note below.
+
+        Lines of a cell after the first are dim. Columns marked ``wide`` are left out of a narrow terminal.
+        """
         from rich import box
         from rich.console import Group
         from rich.table import Table
@@ -209,7 +219,10 @@ class Sheet:
         yield self.rich(options.max_width)
 
     def markdown(self) -> str:
-        """For a document, without title and note; rows of a section are named after it."""
+        """Return the table as Markdown, without title and note.
+
+        Markdown has no sections: the first cell of each row begins with the name of its section, ``Section: cell``.
+        """
         columns, section = self._columns(), ""
         lines = [[column.heading for column in columns], ["---" if column.text else "---:" for column in columns]]
         for row in self.shown():
@@ -221,10 +234,10 @@ class Sheet:
         return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
     def html(self) -> str:
-        """For a notebook or a page: the title above, the note below, intervals in brackets behind their values.
+        """Return the table as HTML, for a notebook or a page: title above, note below, intervals in brackets.
 
-        Everything is text but what says by ``__html__`` that it is none. The first cell of a row is its heading. The
-        text of a column after it may be broken into lines if the column is one of texts.
+        All content is escaped unless it has a method ``__html__``. The first cell of a row is its heading. Text columns
+        after it may wrap.
         """
         columns, label = self._columns(), self.title or f"Table: {self.headings[0]}"
         kinds = [' class="words"' if k and self.rows and column.text else "" for k, column in enumerate(columns)]
@@ -239,7 +252,7 @@ class Sheet:
             if isinstance(row, str):
                 lines.append(f'<tr class="block"><th colspan="{len(columns)}" scope="rowgroup">{_html(row)}</th></tr>')
                 continue
-            name = row[0].in_words  # a long one such as e_v2x_bm:pairwise is broken after a sign before inside a word
+            name = row[0].in_words  # allow line breaks after signs, as in e_v2x_bm:pairwise
             if not hasattr(row[0].value, "__html__"):
                 name = "<wbr>".join(map(_html, _AFTER_SIGN.split(name)))
             lines.append(f'<tr><th scope="row">{name}</th>')
@@ -251,7 +264,7 @@ class Sheet:
         return "\n".join([*lines, "</tbody>", "</table></div>", *note])
 
     def json(self) -> list[dict[str, Any]]:
-        """One object per row, sections apart: cells by the names of their columns, estimates with their intervals."""
+        """Return one object per row, without sections: cells by column name, estimates with their intervals."""
         columns, found = self._columns(), []
         for row in self.rows:
             cells = {} if isinstance(row, str) else dict(zip(columns, row, strict=False))
@@ -263,12 +276,15 @@ class Sheet:
         return found
 
     def csv(self) -> str:
-        """One line per row; the interval of column ``x`` is ``x_low`` and ``x_high``, what does not exist is empty."""
+        """Return CSV text, one line per row.
+
+        The interval of column ``x`` becomes ``x_low`` and ``x_high``; missing values are empty.
+        """
         return csv_text(self.json())
 
 
 def terminal_text(*shown: RenderableType) -> str:
-    """Tables and texts as ``print`` shows them, as wide as the terminal."""
+    """Return tables and texts as ``print`` would show them, as wide as the terminal."""
     from rich.console import Console
 
     console = Console(highlight=False)
@@ -278,9 +294,14 @@ def terminal_text(*shown: RenderableType) -> str:
 
 
 def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
-    """A CSV file of objects, with the ``columns`` given or all that some row has, in the order of their appearance.
+    """Return rows, each a mapping of column names to values, as CSV text with a header line.
 
-    The interval of ``x``, under ``x_interval``, becomes ``x_low`` and ``x_high``; None and what is missing is empty.
+    The interval of ``x``, in ``x_interval``, becomes ``x_low`` and ``x_high``. None and missing values are empty.
+
+    Args:
+        rows: the rows.
+        columns: names of the columns to write, in order, after intervals are split; None: all, in order of appearance.
+
     """
     flat: list[dict[str, Any]] = []
     for row in rows:
@@ -304,10 +325,16 @@ def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = 
 def parquet_file(
     path: Path, *, told: Callable[[], Mapping[str, str]] | None = None, **options: Any
 ) -> Iterator[Callable[..., None]]:
-    """Give what adds columns of arrays by name to a Parquet file, which appears when the block ends well.
+    """Context manager: write a Parquet file with the function ``add(columns)``, which it yields.
 
-    ``together`` keeps what is added at once in one row group. ``told`` is asked for metadata at the end; ``options``
-    are those of ``pyarrow.parquet.ParquetWriter``. Raises ``MissingExtra`` without pyarrow.
+    ``add`` appends arrays of equal length by column name; ``together=True`` keeps them in one row group. The file
+    appears only if the block ends without error. Raises ``MissingExtra`` without pyarrow.
+
+    Args:
+        path: the file.
+        told: called at the end of the block; returns metadata for the file. None: no metadata.
+        **options: options of ``pyarrow.parquet.ParquetWriter``.
+
     """
     with naming_extras():
         import pyarrow
@@ -333,6 +360,9 @@ def parquet_file(
 
 
 def _html(value: object) -> str:
-    """A value as text of a page: no control or direction character, whoever wrote it."""
+    """Escape a value for HTML; control and direction characters are shown as Python escapes.
+
+    An object with a method ``__html__`` supplies its own HTML.
+    """
     known: Callable[[], str] | None = getattr(value, "__html__", None)
     return escape(plain_text(str(value), keep="\u00a0")) if known is None else known()

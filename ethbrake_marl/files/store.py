@@ -1,4 +1,4 @@
-"""Files and folders that are either there completely or not at all, also after a crash; locks end with the process."""
+"""Atomic writing: files and folders appear completely or not at all, even after a crash. Locks end with the process."""
 
 from __future__ import annotations
 
@@ -16,18 +16,21 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput
 
 LARGEST_OBJECT_BYTES = 16 << 20
 
-_HIDDEN, _UNFINISHED = ".ethbrake-", ".partial"  # short whatever the target is called: file names have a longest length
+_HIDDEN, _UNFINISHED = ".ethbrake-", ".partial"  # not the target's name: file names have a maximum length
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write ``data`` to ``path``, replacing it in one step; a reader sees the old or the new content, whole."""
+    """Write ``data`` to ``path`` in one step, replacing an existing file; readers see the old or the new content."""
     with new_file(path) as partial:
         partial.write_bytes(data)
 
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Give a temporary file beside ``path`` that takes its place when the block ends well, and vanishes otherwise."""
+    """Context manager: yield the path of a temporary file that replaces ``path`` if the block succeeds.
+
+    Otherwise the temporary file is deleted.
+    """
     descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=_HIDDEN, suffix=_UNFINISHED)
     os.close(descriptor)
     partial = Path(name)
@@ -44,17 +47,17 @@ def new_file(path: Path) -> Iterator[Path]:
 
 
 def check_writable(folder: Path) -> None:
-    """Make a file in ``folder`` and remove it again; raises the ``OSError`` that a later write would meet."""
+    """Raise ``OSError`` unless ``folder`` is writable, tested by creating and deleting a file."""
     descriptor, name = tempfile.mkstemp(dir=folder, prefix=_HIDDEN, suffix=_UNFINISHED)
     os.close(descriptor)
     Path(name).unlink()
 
 
 def check_target(path: str | Path, *, force: bool = False) -> Path:
-    """Refuse a file that exists (``AlreadyExists``, unless ``force``) or cannot be written (``InvalidInput``).
+    """Check that the file ``path`` may be written; return it as a ``Path``. Call this before long work.
 
-    Even ``force`` replaces plain files only: no folder, device, pipe or symbolic link. Call it before long work whose
-    result goes there.
+    Raises ``AlreadyExists`` for an existing file unless ``force``; ``InvalidInput`` if it cannot be written. Even
+    ``force`` replaces plain files only, not a folder, device, pipe or symbolic link.
     """
     target = Path(path)
     try:
@@ -62,7 +65,7 @@ def check_target(path: str | Path, *, force: bool = False) -> Path:
             raise InvalidInput(f"{target}: is a symbolic link; give the file it points to")
         if target.is_dir():
             raise InvalidInput(f"{target}: is a folder; give the name of a file")
-        if os.access(target, os.F_OK) and not target.is_file():  # unlike exists, it does not take a NUL for no file
+        if os.access(target, os.F_OK) and not target.is_file():  # unlike exists(), it raises for a NUL in the name
             raise InvalidInput(f"{target}: is a device or a pipe, not a plain file; give another name")
         if not target.parent.is_dir():
             raise InvalidInput(f"{target}: there is no folder {target.parent}; make it first")
@@ -78,9 +81,10 @@ def check_target(path: str | Path, *, force: bool = False) -> Path:
 
 
 def check_folder(path: Path, files: Collection[str] = (), *, force: bool = False) -> None:
-    """Refuse a folder for results that is none or cannot be written to, or that holds one of these ``files``.
+    """Check that ``path`` can be a folder for results, without creating anything.
 
-    Raises ``InvalidInput``, and ``AlreadyExists`` unless ``force``. Makes nothing.
+    Raises ``InvalidInput`` if it is not a folder or cannot be written to; ``AlreadyExists`` if it already contains one
+    of the file names in ``files``, unless ``force``.
     """
     try:
         places = (path, *path.absolute().parents)
@@ -98,16 +102,19 @@ def check_folder(path: Path, files: Collection[str] = (), *, force: bool = False
 
 
 def write_output(path: str | Path, data: bytes, *, force: bool = False) -> None:
-    """Write ``data`` in one step; raises as ``check_target``."""
+    """Write ``data`` to ``path`` in one step; ``force`` replaces an existing file.
+
+    Raises ``AlreadyExists`` or ``InvalidInput`` like ``check_target``.
+    """
     write_file(check_target(path, force=force), data)
 
 
 @contextmanager
 def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """Give a temporary folder beside ``path`` that takes its name when the block ends well, and vanishes otherwise.
+    """Context manager: yield a temporary folder that becomes ``path`` if the block succeeds, else is deleted.
 
-    Raises ``AlreadyExists`` when there is something at ``path``, at the start or at the end; with ``replace`` a folder
-    there goes when the block has ended well, and only then.
+    Raises ``AlreadyExists`` if ``path`` exists, at the start or at the end. With ``replace`` an existing folder is
+    deleted, but only after the block has succeeded.
     """
     if not replace:
         _refuse_existing(path)
@@ -118,7 +125,7 @@ def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
     try:
         partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=_HIDDEN, suffix=_UNFINISHED))
     except OSError as error:
-        error.filename = str(path)  # what was asked for, not the passing name
+        error.filename = str(path)  # report the requested name, not the temporary one
         raise
     try:
         yield partial
@@ -135,14 +142,14 @@ def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
 
 
 def remove_folder(path: Path) -> None:
-    """Take a folder out of the way in one step, then delete it."""
+    """Delete the folder ``path``, after renaming it, so that no half-deleted folder has its name."""
     aside = Path(tempfile.mkdtemp(dir=path.parent, prefix=_HIDDEN, suffix=_UNFINISHED))
     path.rename(aside / path.name)
     shutil.rmtree(aside)
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Delete what writers that were killed left in ``folder``: nobody may be writing in it."""
+    """Delete temporary files that killed writers left in ``folder``; no other process may be writing there."""
     for left in folder.glob(f"{_HIDDEN}*{_UNFINISHED}"):
         if left.is_dir() and not left.is_symlink():
             shutil.rmtree(left)
@@ -152,9 +159,10 @@ def remove_unfinished(folder: Path) -> None:
 
 @contextmanager
 def hold_lock(lock: Path, other: str) -> Iterator[None]:
-    """Hold the file ``lock`` while the block runs.
+    """Context manager: hold the lock file ``lock`` while the block runs.
 
-    Raises ``InvalidInput`` where another process holds it, which ``other`` names, and where it is no file for that.
+    Raises ``InvalidInput`` if another process holds it, or if the file cannot be used as a lock. ``other``: reason in
+    the message in the first case.
     """
     held = FileLock(lock, blocking=False, mode=0o666)
     try:
@@ -175,7 +183,7 @@ def _refuse_existing(path: Path) -> None:
 
 
 def _folder_to_disk(path: Path) -> None:
-    """Make renames inside ``path`` survive a power cut (a folder cannot be opened for this outside POSIX)."""
+    """Flush the folder ``path``, so that renames in it survive a power failure (POSIX only)."""
     if os.name == "posix":
         descriptor = os.open(path, os.O_RDONLY)
         try:
@@ -185,7 +193,7 @@ def _folder_to_disk(path: Path) -> None:
 
 
 def _umask() -> int:
-    """The permissions that new files do not get; temporary ones are private until they are named."""
+    """Return the permission bits that new files do not get. Temporary files are private until they are renamed."""
     mask = os.umask(0)
     os.umask(mask)
     return mask

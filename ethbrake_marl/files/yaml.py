@@ -1,4 +1,4 @@
-"""Strict YAML: every value with its line, and one way to write a number."""
+"""Strict YAML: every value has its line number, and one rule says what is a number."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _NUMERAL = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 
 
 def parse_numeral(text: str) -> float | None:
-    """The number that ``text`` writes, infinite when it is too large; None when it writes none."""
+    """Return the number that ``text`` represents, infinite if it is too large; None if it is not a number."""
     return float(text) if _NUMERAL.fullmatch(text) else None
 
 
@@ -30,10 +30,10 @@ _RESERVED = {"null", "true", "false"}
 
 
 def flow_text(value: Any, longest: int | None = None) -> str:
-    """Write ``value`` in YAML's flow style; reading it back gives an equal value
-    (of printable text, lists, mappings with text keys, finite or infinite numbers, true, false, null).
+    """Write ``value`` in YAML's flow style, so that reading it back gives an equal value.
 
-    A text longer than ``longest`` characters is cut (for messages only).
+    Supports printable text, lists, mappings with text keys, finite or infinite numbers, true, false and null.
+    ``longest``: number of characters after which the text is cut off, for messages only; None: never.
     """
     text = _flow(value)
     return text if longest is None or len(text) <= longest else f"{text[: longest - 3]}..."
@@ -63,9 +63,9 @@ def _number(value: int | float) -> str:
     return {"nan": ".nan", "inf": ".inf", "-inf": "-.inf"}.get(text, text)
 
 
-SIZE_LIMIT = 64 * 1024  # bytes
+SIZE_LIMIT = 64 * 1024  # largest size of a file in bytes
 
-DEPTH_LIMIT = 16  # mappings and lists inside each other
+DEPTH_LIMIT = 16  # largest depth of nested mappings and lists
 
 YamlPath = tuple[str | int, ...]
 
@@ -86,27 +86,40 @@ _LARGEST_INTEGER = 2**63
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """What a file says, and on which line each of its values stands."""
+    """Content of a YAML file, and the line of each value.
 
-    file: str
+    A *path* is the keys and indices that lead to a value: ``("roles", "vehicle_2")``; ``()`` is the whole content.
+    """
+
+    file: str  # path or name of the file, for messages
     content: Any  # dict, list, str, int, float, bool or None, nested
-    lines: Mapping[YamlPath, int]  # from 1
+    lines: Mapping[YamlPath, int]  # path of a value -> its line, from 1
 
     def line_of(self, path: YamlPath) -> int | None:
-        """Line of the value at ``path``, or of the innermost value around it that the file has."""
+        """Return the line (from 1) of the value at ``path``; None if it is unknown.
+
+        ``path``: keys and indices that lead to the value. If there is no such value, the line of the innermost value
+        around it is returned.
+        """
         for length in range(len(path), -1, -1):
             if path[:length] in self.lines:
                 return self.lines[path[:length]]
         return None
 
     def where(self, path: YamlPath) -> str:
-        """The file, and the line of ``line_of`` where there is one: how a message about ``path`` begins."""
+        """Return file and line of the value at ``path`` (keys and indices), as the beginning of a message.
+
+        For example ``my.yaml, line 7``.
+        """
         line = self.line_of(path)
         return self.file if line is None else f"{self.file}, line {line}"
 
     @contextmanager
     def refusing_at(self, path: YamlPath) -> Iterator[None]:
-        """Begin the message of an ``InvalidInput`` from inside with where ``path`` stands."""
+        """Context manager: an ``InvalidInput`` raised in the block is raised again, beginning with file and line.
+
+        The line is that of the value at ``path``: keys and indices that lead to it.
+        """
         try:
             yield
         except InvalidInput as error:
@@ -122,7 +135,16 @@ def read_yaml(path: str | Path, limit: int = SIZE_LIMIT) -> Document:
 
 
 def parse_yaml(text: str | bytes, file: str = "<text>", limit: int = SIZE_LIMIT) -> Document:
-    """Parse one YAML document; ``file`` is how messages call it. Raises as ``read_yaml``."""
+    """Parse one YAML document.
+
+    Args:
+        text: the document, text or UTF-8 bytes.
+        file: name of the document in messages.
+        limit: largest accepted size in bytes.
+
+    Raises ``InvalidInput`` with file, line, column and reason for every defect.
+
+    """
     data = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
     if len(data) > limit:
         _fail(file, None, f"larger than {limit // 1024} KiB, the limit for these files")
@@ -160,14 +182,14 @@ def _fail(file: str, at: tuple[int, int] | None, reason: str) -> NoReturn:
 
 
 class _Reader:
-    """Reads the content of one document from its events."""
+    """Reader of one document's content from YAML events."""
 
     def __init__(self, file: str, text: str) -> None:
-        self.file, self.lines, self.at = file, dict[YamlPath, int](), (0, 0)  # line and column of the event in hand
+        self.file, self.lines, self.at = file, dict[YamlPath, int](), (0, 0)  # line and column of the current event
         self._events = yaml.parse(text, Loader=yaml.SafeLoader)
 
     def read(self) -> Any:
-        """The value of the whole document; None where there is nothing."""
+        """Return the value of the whole document; None if it is empty."""
         content, documents = None, 0
         for event in iter(self._next, None):
             if isinstance(event, yaml.DocumentStartEvent):
@@ -190,7 +212,7 @@ class _Reader:
         _fail(self.file, self.at, reason)
 
     def _value(self, event: Any, path: YamlPath) -> Any:
-        """What begins with this event, at this path."""
+        """Return the value that begins with the YAML event ``event`` and belongs at ``path``."""
         self._check_plain(event)
         self.lines.setdefault(path, self.at[0] + 1)
         if isinstance(event, yaml.ScalarEvent):
@@ -231,7 +253,10 @@ class _Reader:
         return key
 
     def _scalar(self, event: yaml.ScalarEvent) -> str | int | float | bool | None:
-        """Core schema of YAML 1.2; a quoted or block scalar is always text."""
+        """Convert the scalar of a YAML event by the core schema of YAML 1.2.
+
+        A quoted or block scalar is always text.
+        """
         text = str(event.value)
         if not event.implicit[0]:
             return text

@@ -1,1 +1,1 @@
-"""The definition of the game: harm, objectives, actions, observations, rewards."""
+"""The definition of the game: harm, objectives, actions, observations and rewards."""

@@ -1,9 +1,9 @@
-"""The contact features: what three forecasts of the vehicle's own command say of its next impacts.
+"""Contact features: the next impacts that a vehicle forecasts under three commands of its own.
 
-The vehicle looks at the part of the line around it whose news it has, as its other features tell it. It goes on, once
-its own latency has elapsed, with full braking, coasting or full driving. Every other vehicle of that part goes on
-with the command that is observed of it; one of which none is in force brakes fully as soon as its latency has
-elapsed, and so does one that brakes where brakes build up: its command is not seen in the force of the moment.
+The vehicle considers the part of the line that it knows, as in its other features. It forecasts full braking, coasting
+and full driving of its own, which start once its own latency has elapsed. Every other vehicle of that part keeps its
+observed command. A vehicle without a command in force is assumed to brake fully once its latency has elapsed. So is a
+vehicle whose brakes build up and that brakes, because the present force does not show its command.
 """
 
 from __future__ import annotations
@@ -22,23 +22,24 @@ from ethbrake_marl.physics.motion import BOUND
 from ethbrake_marl.physics.rows import FLAG, ROW, place_obstacle, place_rates
 from ethbrake_marl.physics.state import Bools, Floats, Ints
 
-FORECAST_S = 10.0  # how far the forecasts look; also the time to an impact that never comes
+FORECAST_S = 10.0  # length of a forecast (s); also the reported time if there is no impact
 
-_OF_PAIR, _HARMS = 4, 2  # numbers of each pair; of the line
+_OF_PAIR, _HARMS = 4, 2  # number of features per pair, and of the line
 
 _OF_COMMAND = len(CONTACT_SIDES) * _OF_PAIR + _HARMS
 
-_NEAR = len(CONTACT_COMMANDS) * _OF_COMMAND  # columns of contact; behind them are those of contact_far
+_NEAR = len(CONTACT_COMMANDS) * _OF_COMMAND  # number of columns of contact; those of contact_far follow
 
-_FAR = len(CONTACT_SIDES) + _HARMS  # numbers of contact_far for each command
+_FAR = len(CONTACT_SIDES) + _HARMS  # number of contact_far features per command
 
 
 class Contacts(NamedTuple):
-    """Which contact features are wanted, and how they are scaled."""
+    """Which contact features to compute, and their scaling."""
 
-    time_step_s: float  # between two decisions
-    commands: Ints  # those to forecast, as places in CONTACT_COMMANDS
-    features: Floats  # [3, 30], with far [3, 42]: 1 / scale, low, high of every contact feature
+    time_step_s: float  # time between two decisions (s)
+    commands: Ints  # commands to forecast, as indices into CONTACT_COMMANDS
+    # [3, 30], or [3, 42] with contact_far: rows 1 / scale, low and high; a column per contact feature
+    features: Floats
 
 
 @compiled
@@ -46,15 +47,27 @@ def observe_contacts(
     state: Floats, params: Floats, observers: Ints, time_step: float, commands: Ints, features: Floats,
     out: NDArray[np.float32], failed: Bools,
 ) -> None:  # fmt: skip
-    """Fill ``out``, and ``failed`` [n] where a check of the kernel failed."""
+    """Fill ``out`` [n, observers, features] with contact features, and set ``failed`` [n] where the kernel failed.
+
+    Args:
+        state: state rows of the worlds, [n, S], in the layout of ``physics.columns``.
+        params: their parameter rows.
+        observers: indices of the observing vehicles.
+        time_step: time between two decisions, s.
+        commands: commands to forecast, as indices into CONTACT_COMMANDS.
+        features: scaling, [3, 30], or [3, 42] with contact_far: rows 1 / scale, low and high, a column per feature.
+        out: result; columns of commands that are not forecast stay as they are.
+        failed: set to True where a check of the kernel failed, [n].
+
+    """
     of = columns(state)
     N, at = (
         of.vehicles,
         1 if state.shape[1] > of.obstacle else 0,
-    )  # vehicle i stands in column at + i, behind an obstacle
+    )  # vehicle i is column at + i; an obstacle is column 0
     line, table = np.zeros((ROW.OF_BUILD_UP, N + at)), np.zeros((ROW.OF_BUILD_UP, N + at))
     found, value = np.zeros((CONTACT.WIDTH, N + at)), np.zeros(_OF_COMMAND + _FAR)
-    no_pieces = np.zeros((N, 0))  # nobody is told how another one will brake
+    no_pieces = np.zeros((N, 0))  # no vehicle knows the future pieces of another one
     for k in range(out.shape[0]):
         for o in range(observers.shape[0]):
             i = observers[o]
@@ -85,9 +98,18 @@ def observe_contacts(
 
 @compiled
 def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, at: int) -> tuple[int, int]:
-    """Write world k, as vehicle i knows it, into a table; its first and last columns that are known.
+    """Write the part of a world that a vehicle knows into a table; return the first and last column that it knows.
 
-    Whoever is not known stands far away. Where an obstacle is known, it is the first column.
+    Unknown vehicles are placed far away. If an obstacle is known, it is the first column.
+
+    Args:
+        table: table to fill, in the layout of ``physics.rows``, [rows, N + at].
+        state: state rows of the worlds, [n, S], in the layout of ``physics.columns``.
+        params: their parameter rows.
+        k: row of the world.
+        i: index of the vehicle.
+        at: 1 if the rows have an obstacle, which is then column 0 of the table; otherwise 0.
+
     """
     of = columns(state)
     N, speed, command, gap, obstacle = of.vehicles, of.speed, of.command, of.gap, of.obstacle
@@ -110,7 +132,7 @@ def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, a
         if j == i or in_force == 0.0:
             table[ROW.ONSET, at + j] = max(params[k, own_part + j] - time, 0.0)
             table[ROW.COMMAND, at + j] = -params[k, braking + j] if known else 0.0
-        elif known and in_force < 0.0 and params[k, of.brake_rate + j] < math.inf:  # it may build up still
+        elif known and in_force < 0.0 and params[k, of.brake_rate + j] < math.inf:  # its force may still be building up
             table[ROW.COMMAND, at + j] = -params[k, braking + j]
         table[ROW.FORCE, at + j] = in_force if known else 0.0
         if j < N - 1:
@@ -125,9 +147,20 @@ def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, a
 
 @compiled
 def _tell(table: Floats, found: Floats, own: int, first: int, last: int, time_step: float, value: Floats) -> None:
-    """The numbers of one forecast before scaling; 0 for a pair whose other vehicle is not known, or not there.
+    """Compute the unscaled contact features of one forecast into ``value``.
 
-    An impact at the very end of a decision step belongs to that step, as in the engine.
+    A feature is 0 for a pair whose other vehicle is unknown or does not exist. An impact at the very end of a decision
+    step belongs to that step, as in the engine.
+
+    Args:
+        table: the world after the forecast, in the layout of ``physics.rows``.
+        found: next impact of each pair, as ``forecast_contacts`` wrote it.
+        own: column of the observing vehicle.
+        first: first column that the vehicle knows.
+        last: last column that it knows.
+        time_step: time between two decisions, s.
+        value: result.
+
     """
     for side in range(2):
         p, at = own - 1 + side, side * _OF_PAIR

@@ -19,7 +19,7 @@ from ethbrake_marl.physics.messages import Messages
 from ethbrake_marl.physics.state import Floats, Worlds, make_worlds
 from ethbrake_marl.registry import Registry
 
-MOST_NEIGHBOURS = 64  # on each side
+MOST_NEIGHBOURS = 64  # largest number of neighbours on each side
 
 Of = Literal["own", "neighbour"]
 
@@ -28,28 +28,28 @@ Of = Literal["own", "neighbour"]
 class Feature:
     """One number of an observation: ``clip(value / scale, low, high)``."""
 
-    name: str
-    unit: str
-    scale: float
-    low: float
-    high: float
-    meaning: str
+    name: str  # full name, such as ``own.speed``, or the name inside a group
+    unit: str  # unit of the value
+    scale: float  # the value is divided by this, in ``unit``
+    low: float  # least number that is observed
+    high: float  # largest number that is observed
+    meaning: str  # what it is, in words
 
 
-CONTACT_COMMANDS = ("brake", "coast", "drive")  # own commands that are forecast: full braking, none, full driving
+CONTACT_COMMANDS = ("brake", "coast", "drive")  # own commands of the forecasts: full braking, coasting, full driving
 
-CONTACT_SIDES = ("front", "rear")  # own pairs; in front of Vehicle 1 an obstacle
+CONTACT_SIDES = ("front", "rear")  # the vehicle's pairs; in front of Vehicle 1 an obstacle
 
 
 class Groups(NamedTuple):
-    """The built-in features by group; those of contacts are told of each of ``CONTACT_COMMANDS`` in turn."""
+    """The built-in features by group; contact features exist for each of ``CONTACT_COMMANDS``."""
 
-    own: tuple[Feature, ...]
-    role: tuple[Feature, ...]
-    obstacle: tuple[Feature, ...]
-    contact: tuple[Feature, ...]
-    contact_far: tuple[Feature, ...]
-    neighbour: tuple[Feature, ...]  # of each that is listed, ``front_1`` and so on
+    own: tuple[Feature, ...]  # the vehicle itself
+    role: tuple[Feature, ...]  # its place in the line
+    obstacle: tuple[Feature, ...]  # the obstacle ahead of the line
+    contact: tuple[Feature, ...]  # next impacts that it forecasts under own commands
+    contact_far: tuple[Feature, ...]  # late or hard impacts, beyond the bounds of ``contact``
+    neighbour: tuple[Feature, ...]  # features of each neighbour (``front_1``, ...)
 
 
 _contact: list[Feature] = []
@@ -57,7 +57,7 @@ _contact: list[Feature] = []
 _far: list[Feature] = []
 
 for _command, _held in zip(CONTACT_COMMANDS, ("braking fully", "coasting", "driving fully"), strict=True):
-    for _side, _where in zip(CONTACT_SIDES, ("in front", "behind"), strict=True):  # four numbers of each own pair
+    for _side, _where in zip(CONTACT_SIDES, ("in front", "behind"), strict=True):  # four features per pair
         _pair, _told = f"{_command}_{_side}", f"{_held}: time to the first impact {_where}"
         _contact += [
             Feature(f"{_pair}_time", "s", 2.0, 0.0, 2.0, _told),
@@ -66,11 +66,11 @@ for _command, _held in zip(CONTACT_COMMANDS, ("braking fully", "coasting", "driv
             Feature(f"{_pair}_steps", "1", 10.0, 0.0, 2.0, "whole decision steps before that one"),
         ]
         _far += [Feature(f"{_pair}_time", "s", 5.0, 0.0, 2.0, _told)]
-    _contact += [  # then the harm of the line
+    _contact += [  # features of the whole line
         Feature(f"{_command}_first_impact_harm", "m2/s2", 50.0, 0.0, 4.0, f"{_held}: first-impact harm of the line"),
         Feature(f"{_command}_total_harm", "m2/s2", 50.0, 0.0, 4.0, f"{_held}: total harm of the line"),
     ]
-    _far += [  # what is late or hard: beyond the bounds of those above
+    _far += [  # late or hard impacts, beyond the bounds of the features above
         Feature(f"{_command}_first_impact_speed", "m/s", 10.0, 0.0, 6.0, "square root of the first-impact harm"),
         Feature(f"{_command}_total_speed", "m/s", 10.0, 0.0, 6.0, "square root of the total harm"),
     ]
@@ -132,23 +132,32 @@ _SIDE = re.compile(r"(front|rear)_([1-9][0-9]?)")
 
 @dataclass(frozen=True, slots=True)
 class RegisteredFeature:
-    """A feature that somebody registered, or one of ours that belongs to no group."""
+    """A registered feature, or a built-in one that belongs to no group."""
 
-    feature: Feature
-    function: Callable[..., Floats]
-    of: Of
-    unknown: float  # in the feature's unit
-    tried: tuple[float, ...]  # what it gave in a few worlds: a changed function shows there
+    feature: Feature  # name, unit, scale, bounds and meaning
+    function: Callable[..., Floats]  # (worlds, vehicle) or (worlds, vehicle, neighbour) -> value, [n]
+    of: Of  # ``own``: of the vehicle itself; ``neighbour``: of a neighbour
+    unknown: float  # value for an unknown neighbour, in the feature's unit
+    tried: tuple[float, ...]  # values in a few test worlds, which reveal a changed function
 
     def scaled(self, value: Floats) -> Floats:
-        """``clip(value / scale, low, high)``."""
+        """Return the observed number ``clip(value / scale, low, high)`` for a ``value`` in the feature's unit."""
         feature = self.feature
         return np.clip(value * (1.0 / feature.scale), feature.low, feature.high)
 
     def checked(self, worlds: Worlds, vehicle: int, neighbour: int | None, counts: Any, steps: Floats | None) -> Floats:
-        """What it gives, scaled, [n]; ``unknown`` where it does not count.
+        """Compute the feature in n worlds and return it scaled, [n].
 
-        ``steps`` [n], if known, is told in the message. Raises ``InvalidInput`` that names feature, vehicle and world.
+        Raises ``InvalidInput`` naming feature, vehicle and world for a result of wrong shape or a value that is not
+        finite.
+
+        Args:
+            worlds: the n worlds.
+            vehicle: index of the observing vehicle, from 0.
+            neighbour: index of the neighbour; None for a feature of the vehicle itself.
+            counts: whether to use the value, a mask [n] or one truth value; other worlds get ``unknown``.
+            steps: number of steps so far, [n], for messages, if known.
+
         """
         name = self.feature.name
         given = (worlds, vehicle) if neighbour is None else (worlds, vehicle, neighbour)
@@ -170,25 +179,37 @@ class RegisteredFeature:
 
 
 def age(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
-    """Time since the sample that was last told of it, [n] s; 0 where the present is known."""
+    """Return the age of the newest state that ``vehicle`` has received from ``neighbour``, [n] s.
+
+    It is 0 if the present state is known. Both are indices from 0.
+    """
     told = Messages.of(worlds).age_s(worlds.time_s)[:, vehicle, neighbour]
     return np.where(np.isfinite(told), told, 0.0)
 
 
 def build_up_time(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> Floats:
-    """Time in which the brakes of the neighbour, or the own ones, build up from 0 to full, [n] s; 0: at once."""
+    """Return the time in which the brakes of the neighbour build up from 0 to full, [n] s; 0: at once.
+
+    Both vehicles are indices from 0; ``neighbour`` None: the brakes of ``vehicle`` itself.
+    """
     i, v = vehicle if neighbour is None else neighbour, worlds.vehicles
     return v.braking_capacity_mps2[:, i] / v.brake_rate_mps3[:, i]
 
 
 def release_time(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> Floats:
-    """Time in which they are released again, [n] s; 0: at once."""
+    """Return the time in which the fully applied brakes of the neighbour are released, [n] s; 0: at once.
+
+    Both vehicles are indices from 0; ``neighbour`` None: the brakes of ``vehicle`` itself.
+    """
     i, v = vehicle if neighbour is None else neighbour, worlds.vehicles
     return v.braking_capacity_mps2[:, i] / v.release_rate_mps3[:, i]
 
 
 def place(worlds: Worlds, vehicle: int) -> Floats:
-    """Vehicles ahead in the line, [n]: which one this is, for a policy that several share."""
+    """Return the number of vehicles ahead of ``vehicle`` (index from 0) in the line, [n].
+
+    It distinguishes the vehicles of a shared policy.
+    """
     return np.full(worlds.n, float(vehicle))
 
 
@@ -223,9 +244,10 @@ _BUILT_IN: dict[str, RegisteredFeature] = {
 
 
 def listed_features(listed: object) -> tuple[str, ...]:
-    """The full names of the features that a list of groups (``own``, ``front_1``) and single features stands for.
+    """Return the full names of the features in a list of groups and single features, in order.
 
-    Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for what is no list, is empty, or names one twice.
+    For example ``("own.speed", ..., "front_1.gap")`` for ``["own", "front_1.gap"]``. Raises ``UnknownName`` with a
+    suggestion; ``InvalidInput`` if it is not a list, is empty, or has a feature twice.
     """
     if isinstance(listed, str) or not isinstance(listed, Sequence) or not listed:
         raise InvalidInput("observation: must be a list of groups and features, for instance [own, front_1, rear_1]")
@@ -237,7 +259,10 @@ def listed_features(listed: object) -> tuple[str, ...]:
 
 
 class _ListSchema:
-    """The JSON schema of an observation: a list of what is known when it is asked for."""
+    """Annotation of a field that lists the features of an observation: its JSON schema names all features.
+
+    Features that are registered before the schema is made are included.
+    """
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
@@ -250,7 +275,7 @@ ListedFeatures = Annotated[tuple[str, ...], Field(strict=False), _ListSchema]
 
 
 def feature_named(name: str) -> Feature:
-    """One feature by its full name; raises ``UnknownName``."""
+    """Return the feature with the full name ``name``, such as ``front_1.gap``; raise ``UnknownName`` if none has it."""
     group, dot, own = name.partition(".")
     if name in FEATURES and FEATURES[name].of == "own":
         return FEATURES[name].feature
@@ -263,19 +288,25 @@ def feature_named(name: str) -> Feature:
 
 
 def side_of(name: str) -> tuple[str, int] | None:
-    """Of which neighbour a feature with this full name is: ``("front", 1)``; None: of none."""
+    """Return the neighbour in a full feature name, for example ``("front", 1)``; None if the name has none."""
     match = _SIDE.fullmatch(name.partition(".")[0])
     return (match[1], int(match[2])) if match and int(match[2]) <= MOST_NEIGHBOURS else None
 
 
 def registered_in(names: Iterable[str]) -> dict[str, RegisteredFeature]:
-    """The registered features among those of full names, by their own names."""
+    """Return name -> feature of the registered features among these full names.
+
+    The key is the feature's own name: ``age`` for ``front_1.age``.
+    """
     own = [name.partition(".")[2] or name for name in names]
     return {name: FEATURES[name] for name in own if name in FEATURES}
 
 
 def choices(sides: Iterable[str] = ("front_1", "rear_1")) -> list[str]:
-    """What an ``observation:`` may list: groups, then single features, of these neighbours."""
+    """Return what an ``observation:`` list may contain: names of groups, then of single features.
+
+    ``sides``: neighbours whose features are included, such as ``front_1``.
+    """
     groups = ["own", *sides, "role", "obstacle", "contact", "contact_far"]
     single = [f"{group}.{feature.name}" for group in groups for feature in _group(group)]
     entries = FEATURES.usable()
@@ -309,7 +340,7 @@ def _unknown(name: str) -> InvalidInput:
     sides = ["front_1", "rear_1"] + ([side] if _is_side(side) else [])
     known = choices(dict.fromkeys(sides))
     if not get_close_matches(name, known, n=1):
-        known = [each for each in known if "." not in each]  # a hundred single ones would hide the groups
+        known = [each for each in known if "." not in each]  # a hundred single features would hide the groups
     return unknown_name("feature", name, known, may_be_own=True)
 
 
@@ -327,25 +358,28 @@ def register_feature(
     of: Of = "own",
     unknown: float = 0.0,
 ) -> None:
-    """Make ``name`` a feature that an ``observation:`` may list; its docstring says what it means.
+    """Register ``name`` as a feature that an ``observation:`` may list; its meaning is the function's docstring.
 
-    An installed package does the same with an entry point of the group ``ethbrake_marl.features``: a ``Part`` of the
-    function and what stands behind it here.
+    An installed package registers a feature with an entry point of the group ``ethbrake_marl.features``: a ``Part``
+    with the arguments after ``name``.
 
     Args:
-        name: lower case letters, digits and ``_``, listed as it is; one of a neighbour as ``front_1.name``.
-        function: from worlds and the vehicle (0 = front) to its value [n], in ``unit``; of a neighbour: from worlds,
-            the vehicle and the neighbour. It must work for lines of any length and see the world through nothing else.
-        unit: of the value.
-        scale: what is observed is ``clip(value / scale, low, high)``; above 0.
+        name: lower case letters, digits and ``_``. A feature of the vehicle itself is listed under this name, a feature
+            of a neighbour as ``front_1.name``.
+        function: ``function(worlds, vehicle)`` returns the value [n] in ``unit``; vehicle 0 is in front. For a
+            neighbour: ``function(worlds, vehicle, neighbour)``. It must work for lines of any length, and depend on
+            nothing but its arguments.
+        unit: unit of the value.
+        scale: the observed number is ``clip(value / scale, low, high)``; above 0.
         low: see ``scale``.
         high: see ``scale``; above ``low``.
-        of: whose it is, ``own`` or ``neighbour``. Of a neighbour it is told only where the vehicle has its news.
-        unknown: what a feature of a neighbour is where the vehicle knows nothing of it, in ``unit``.
+        of: ``own`` or ``neighbour``. A neighbour's feature is observed only if the vehicle has its news.
+        unknown: value of a neighbour's feature if the vehicle knows nothing of the neighbour, in ``unit``.
 
-    What an own feature tells of other vehicles is up to its author: a channel hides nothing of it. Registering the same
-    again changes nothing. Raises ``AlreadyExists`` for a name that is taken, ``InvalidInput`` for what cannot be used,
-    a function among that which fails, or gives another shape or a number that is not finite, in a few worlds.
+    A channel hides nothing from a feature of kind ``own``: its author decides what it reveals of other vehicles.
+    Registering the same feature again changes nothing. Raises ``AlreadyExists`` if the name is taken; ``InvalidInput``
+    for invalid arguments, or if in a few test worlds the function fails, or returns a wrong shape or a number that is
+    not finite.
 
     """
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:

@@ -1,13 +1,12 @@
-"""The harm ledger: who was hurt how much, under both counting rules.
+"""The harm ledger: the harm of every vehicle, under both counting rules.
 
-Harm of an impact of pair (i, i + 1) with closing speed ``w`` is ``w^2`` (m2/s2), shared by mass (the paper's
+The harm of an impact of pair (i, i + 1) with closing speed ``w`` is ``w^2`` (m2/s2). It is shared by mass (the paper's
 eq. harm): ``H_i = m_{i+1} / (m_i + m_{i+1}) w^2`` and ``H_{i+1} = w^2 - H_i``, so the shares add up exactly.
 
-An impact of Vehicle 1 with an obstacle ahead (``obstacle_gap_m``), which nothing moves, does harm ``v_1^2``, all to
-Vehicle 1.
+An impact of Vehicle 1 with an immovable obstacle ahead (``obstacle_gap_m``) has harm ``v_1^2``, all borne by Vehicle 1.
 
-*First-impact harm* counts each pair's first impact only (the paper's protocol); *total harm* counts every impact.
-The first can be gamed (a light early touch makes the later, harder impact free), so both are always kept.
+*First-impact harm* counts each pair's first impact only (the paper's rule); *total harm* counts every impact. The first
+can be gamed, because a light early touch makes the later, harder impact free. So both are always kept.
 """
 
 from __future__ import annotations
@@ -30,23 +29,23 @@ HARM_COUNTS: tuple[HarmCount, ...] = get_args(HarmCount)
 
 
 def check_harm_count(harm_count: str) -> None:
-    """Refuse a name that is not a counting rule with ``InvalidInput``."""
+    """Raise ``InvalidInput`` unless ``harm_count`` is ``"first"`` or ``"total"``."""
     if harm_count not in HARM_COUNTS:
         raise InvalidInput(f"harm_count {harm_count!r}: must be {' or '.join(repr(known) for known in HARM_COUNTS)}")
 
 
 @dataclass(frozen=True, slots=True)
 class Ledger:
-    """Harm of ``n`` worlds so far, by pair."""
+    """Harm and number of impacts of ``n`` worlds since the start of the episode, by pair."""
 
-    first_impact_harm: Floats  # [n, P] m2/s2
-    total_harm: Floats  # [n, P] m2/s2
-    count: Ints  # [n, P] impacts
-    obstacle_first_harm: Floats  # [n] of Vehicle 1's impacts with the obstacle ahead, all its own (m2/s2)
-    obstacle_total_harm: Floats  # [n] likewise
-    obstacle_count: Ints  # [n] impacts
-    mass_t: Floats  # [n, N]
-    restitution: Floats  # [n]
+    first_impact_harm: Floats  # [n, P] harm of each pair's first impact (m2/s2)
+    total_harm: Floats  # [n, P] harm of all impacts of each pair (m2/s2)
+    count: Ints  # [n, P] number of impacts
+    obstacle_first_harm: Floats  # [n] first-impact harm of Vehicle 1 with the obstacle ahead (m2/s2)
+    obstacle_total_harm: Floats  # [n] total harm of Vehicle 1 with the obstacle (m2/s2)
+    obstacle_count: Ints  # [n] number of impacts with the obstacle
+    mass_t: Floats  # [n, N] mass of each vehicle (t)
+    restitution: Floats  # [n] coefficient of restitution
 
     def __repr__(self) -> str:
         return (
@@ -54,7 +53,7 @@ class Ledger:
         )
 
     def add(self, impacts: Impacts) -> Ledger:
-        """The ledger after a further segment."""
+        """Return the ledger with the ``impacts`` of the next segment of the same episodes added."""
         return Ledger(
             self.first_impact_harm + impacts.first_impact_harm,
             self.total_harm + impacts.total_harm,
@@ -67,9 +66,10 @@ class Ledger:
         )
 
     def since(self, before: Ledger) -> Ledger:
-        """What came to the same worlds after ``before``, as the harm of one step, to the last rounding.
+        """Return the harm that was added after ``before``, an earlier ledger of the same episodes.
 
-        Raises ``InvalidInput`` where there were more worlds, vehicles or impacts before, as in a row that was renewed.
+        The difference is exact to the last rounding. Raises ``InvalidInput`` if ``before`` has another shape or more
+        impacts, for example because a row holds a new episode.
         """
         names = [column.name for column in fields(self) if column.name not in ("mass_t", "restitution")]
         if before.count.shape != self.count.shape or (before.count > self.count).any():
@@ -77,30 +77,42 @@ class Ledger:
         return replace(self, **{name: getattr(self, name) - getattr(before, name) for name in names})
 
     def take(self, rows: Ints | Bools | Sequence[int]) -> Ledger:
-        """That of some of the worlds."""
+        """Return the ledger of the worlds selected by ``rows`` (indices or a mask [n])."""
         return Ledger(*(getattr(self, column.name)[rows] for column in fields(self)))
 
     def pair_harm(self, harm_count: HarmCount) -> Floats:
-        """Harm of each pair under a counting rule, [n, P]. Raises ``InvalidInput`` for an unknown one."""
+        """Return the harm of each pair, [n, P] m2/s2: of its ``"first"`` impact, or of all impacts (``"total"``).
+
+        Raises ``InvalidInput`` for another ``harm_count``.
+        """
         check_harm_count(harm_count)
         return self.first_impact_harm if harm_count == "first" else self.total_harm
 
     def obstacle_harm(self, harm_count: HarmCount) -> Floats:
-        """Harm of Vehicle 1's impacts with the obstacle ahead, [n]. Raises ``InvalidInput`` for an unknown rule."""
+        """Return the harm of Vehicle 1 with the obstacle ahead, [n] m2/s2: of the ``"first"`` impact, or ``"total"``.
+
+        Raises ``InvalidInput`` for another ``harm_count``.
+        """
         check_harm_count(harm_count)
         return self.obstacle_first_harm if harm_count == "first" else self.obstacle_total_harm
 
     def vehicle_harm(self, harm_count: HarmCount) -> Floats:
-        """Harm of each vehicle, from both its pairs, [n, N]; see ``split``. That of an obstacle is all Vehicle 1's."""
+        """Return the harm that each vehicle bears, [n, N] m2/s2: its shares (``split``) of the harm of both its pairs.
+
+        Vehicle 1 also bears the harm with the obstacle. ``harm_count``: ``"first"`` impact of each pair, or
+        ``"total"``.
+        """
         harm = split(self.pair_harm(harm_count), self.mass_t)
         harm[:, 0] += self.obstacle_harm(harm_count)
         return harm
 
     def speed_changes(self, harm_count: HarmCount) -> tuple[Floats, Floats]:
-        """Change of speed of each vehicle, hit in front and at the rear, each [n, N] (m/s).
+        """Return two changes of speed of each vehicle, [n, N] m/s each: by impacts in front, and at the rear.
 
-        That of the one impact between two vehicles which does the counted harm of their pair: exact for first impacts
-        of one pair at a time; of several impacts of a pair, counted by ``total``, more than the hardest one had.
+        They are computed from the harm of the pair, as if it came from one single impact of these two vehicles alone.
+        This is exact for a first impact in which no third vehicle takes part. If ``"total"`` counts several impacts of
+        a pair, the result exceeds the change in the hardest one. ``harm_count``: ``"first"`` impact of each pair, or
+        ``"total"``.
         """
         with_obstacle = np.concatenate([self.obstacle_harm(harm_count)[:, np.newaxis], self.pair_harm(harm_count)], 1)
         rebound = (1.0 + self.restitution[:, np.newaxis]) * np.sqrt(with_obstacle)
@@ -111,7 +123,11 @@ class Ledger:
         return front, rear
 
     def world_harm(self, harm_count: HarmCount) -> Floats:
-        """Harm of all vehicles of a world together, [n]: the obstacle's, then the pairs' front to rear."""
+        """Return the harm of all vehicles of a world together, [n] m2/s2.
+
+        It is summed in a fixed order: obstacle, then pairs front to rear. ``harm_count``: ``"first"`` impact of each
+        pair, or ``"total"``.
+        """
         return line_sum(self.pair_harm(harm_count), self.obstacle_harm(harm_count))
 
     @property
@@ -128,7 +144,10 @@ class Ledger:
 
 @compiled
 def line_sum(pair_values: Floats, obstacle_values: Floats) -> Floats:
-    """Sum of a world's obstacle and its pairs, [n], in this order, front to rear: the same bits in any batch."""
+    """Return the sum over obstacle and pairs of each world, [n], in a fixed order: the same bits in any batch.
+
+    ``pair_values`` is [n, P], ``obstacle_values`` [n]; the obstacle comes first, then the pairs front to rear.
+    """
     n, pairs = pair_values.shape
     total = np.zeros(n)
     for k in range(n):
@@ -139,7 +158,7 @@ def line_sum(pair_values: Floats, obstacle_values: Floats) -> Floats:
 
 
 def empty_ledger(worlds: Worlds) -> Ledger:
-    """The ledger at the alert: no harm yet."""
+    """Return the ledger of ``worlds`` at the alert (time 0), without harm."""
     shape = worlds.gaps_m.shape
     pairs = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64)
     of_worlds = worlds.vehicles.mass_t, worlds.vehicles.restitution
@@ -148,7 +167,10 @@ def empty_ledger(worlds: Worlds) -> Ledger:
 
 @compiled
 def split(pair_harm: Floats, mass_t: Floats) -> Floats:
-    """Share each pair's harm [n, P] between its two vehicles by mass (the lighter one bears more), [n, N]."""
+    """Share the harm of each pair between its two vehicles by mass; return the harm of each vehicle, [n, N] m2/s2.
+
+    The lighter vehicle bears more. ``pair_harm`` is [n, P] in m2/s2, ``mass_t`` [n, N] in t.
+    """
     n, vehicles = mass_t.shape
     harm = np.zeros((n, vehicles))
     for k in range(n):
@@ -161,9 +183,10 @@ def split(pair_harm: Floats, mass_t: Floats) -> Floats:
 
 @compiled
 def front_share(harm: float, front_mass: float, rear_mass: float) -> float:
-    """What the front vehicle of a pair bears: ``m_rear / (m_front + m_rear) harm``.
+    """Return the front vehicle's share of a pair's ``harm``: ``m_rear / (m_front + m_rear) harm``.
 
     The larger share is computed and the smaller one is the rest, an exact subtraction: the two add up to the last bit.
+    Masses must have the same unit; the result has the unit of ``harm``.
     """
     if front_mass <= rear_mass:
         return rear_mass / (front_mass + rear_mass) * harm
@@ -172,7 +195,7 @@ def front_share(harm: float, front_mass: float, rear_mass: float) -> float:
 
 @compiled
 def _powers(shares: Floats, exponent: float) -> Floats:
-    """``x^exponent`` of each of ``shares`` [k] from 0 on, at most 1; the same bits on every processor."""
+    """Return ``x^exponent`` of each x >= 0 in ``shares`` [k], limited to 1, [k]; the same bits on every processor."""
     found = np.zeros(len(shares))
     for i in range(len(shares)):
         if shares[i] > 0.0:
@@ -181,13 +204,13 @@ def _powers(shares: Floats, exponent: float) -> Floats:
 
 
 class InjuryCurve(NamedTuple):
-    """Probability of an injury in a rear-end collision from the change of speed dv (m/s) of the vehicle."""
+    """Probability of an injury in a rear-end collision, as a function of the vehicle's change of speed dv (m/s)."""
 
-    injury: str  # at least this one, of the abbreviated injury scale
-    formula: str
-    source: str
-    front: Callable[[Floats], Floats]  # of the striking vehicle, which is hit in front
-    rear: Callable[[Floats], Floats]  # of the struck one
+    injury: str  # least severity, on the abbreviated injury scale
+    formula: str  # the probability as a formula in dv
+    source: str  # where the curve comes from
+    front: Callable[[Floats], Floats]  # probability in the striking vehicle, which is hit in front
+    rear: Callable[[Floats], Floats]  # probability in the struck vehicle, which is hit at the rear
 
 
 _GEISSLINGER = "Geisslinger, Poszler and Lienkamp 2023, doi:10.1038/s42256-022-00607-z, parameters of its code"
@@ -209,11 +232,17 @@ INJURY_CURVES = {
 
 
 def injury_probability(speed_change_mps: Floats, side: Literal["front", "rear"], curve: str = "lr4s") -> Floats:
-    """Probability of an injury of one vehicle's occupant from its change of speed in a rear-end impact, [k].
+    """Return the probability that a vehicle's occupant is injured in a rear-end impact, [k].
 
-    ``side`` is the one that is hit: the front of the striking vehicle, the rear of the struck one. ``curve`` is one of
-    ``INJURY_CURVES``, whose entries tell formula and source. Logistic curves give about 1 % at 0: of a vehicle that was
-    not hit there is no probability.
+    Logistic curves give about 1 % for no change of speed; do not use them for a vehicle that was not hit.
+
+    Args:
+        speed_change_mps: change of the vehicle's speed in the impact, [k] m/s; its sign is ignored.
+        side: side that is hit: ``"front"`` of the striking vehicle, ``"rear"`` of the struck one.
+        curve: key of ``INJURY_CURVES``, which give formula and source.
+
+    Raises ``UnknownName`` for another side or curve.
+
     """
     if curve not in INJURY_CURVES:
         raise unknown_name("injury curve", curve, INJURY_CURVES)

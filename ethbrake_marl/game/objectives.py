@@ -1,16 +1,16 @@
-"""Objectives, whose harm counts: what each vehicle's objective makes of the harm of the line, from the one ledger.
+"""Objectives: whose harm counts. Each turns the harm of the line, from the one ledger, into an amount per vehicle.
 
-Every objective but the last is an amount of harm (m2/s2) to be made small; ``H_i`` is what vehicle i bears, ``H``
-what all do:
+Every objective but the last is an amount of harm (m2/s2) to be minimised; ``H_i`` is the harm that vehicle i bears,
+``H`` the harm of all vehicles:
 
 ==================  ================================================================================================
 total               ``H``: everybody's harm alike; the same number for all vehicles
 own                 ``H_i``
 social:phi          ``cos(phi) H_i + sin(phi) (H - H_i)``, social value orientation: phi from 0 (own harm only)
                     over 45 (prosocial) to 90 degrees (the others' only)
-maximin             ``max_j H_j``: the harm of whoever bears most
+maximin             ``max_j H_j``: the harm of the vehicle that bears most
 mass-weighted       ``N sum_j m_j H_j / sum_j m_j``: harm in a heavy vehicle counts for more
-weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``: one weight (1e-6 to 1e6) for each vehicle, as for its occupants
+weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``: one weight (1e-6 to 1e6) per vehicle, for example its occupants
 injury:curve        injuries in 1,000 lines, by the pair that injures a vehicle more (``Ledger.speed_changes``)
 ==================  ================================================================================================
 """
@@ -32,50 +32,50 @@ from ethbrake_marl.game.harm import INJURY_CURVES, HarmCount, Ledger, injury_pro
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.registry import Registry
 
-STANDARD = ("total", "own", "social:45", "maximin", "mass-weighted")  # those that need no knowledge of the scenario
+STANDARD = ("total", "own", "social:45", "maximin", "mass-weighted")  # objectives that fit every scenario
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
 
-Declared = str | tuple[str, ...]  # one objective for all vehicles, or one for each
+Declared = str | tuple[str, ...]  # one objective for all vehicles, or one per vehicle
 
 
 class Objective(NamedTuple):
-    """A parsed objective."""
+    """An objective that ``parse_objective`` has read from a text such as ``social:45``."""
 
-    kind: str
-    angle_deg: float = 0.0
-    weights: tuple[float, ...] = ()
-    curve: str = ""
+    kind: str  # name before the colon, such as ``social``
+    angle_deg: float = 0.0  # angle of ``social`` (degrees)
+    weights: tuple[float, ...] = ()  # weights of ``weighted``, one per vehicle
+    curve: str = ""  # curve of ``injury``, a key of ``INJURY_CURVES``
 
 
 class HarmSoFar(NamedTuple):
-    """What objectives are computed from, for n worlds of N vehicles; it cannot be written to."""
+    """Read-only input of an objective: harm, masses and changes of speed in n worlds of N vehicles."""
 
-    borne: Floats  # [n, N] what each vehicle bears, m2/s2
-    whole: Floats  # [n] what all do
-    mass_t: Floats  # [n, N]
-    front_change_mps: Floats  # [n, N] change of speed of each vehicle, hit in front
-    rear_change_mps: Floats  # [n, N] likewise, hit at the rear
+    borne: Floats  # [n, N] harm that each vehicle bears, m2/s2
+    whole: Floats  # [n] harm of all vehicles, m2/s2
+    mass_t: Floats  # [n, N] mass of each vehicle, t
+    front_change_mps: Floats  # [n, N] change of speed of each vehicle by impacts in front, m/s; 0: not hit there
+    rear_change_mps: Floats  # [n, N] change of speed of each vehicle by impacts at the rear, m/s; 0: not hit there
 
 
 ObjectiveFunction = Callable[[HarmSoFar, int], Floats]
 
 
 class Kind(NamedTuple):
-    """One line of the table of objectives."""
+    """One kind of objective, built in or registered: a line of the table at the top of this file."""
 
-    form: str  # how it is written; without ":" it takes no argument
-    about: str
-    amount: Callable[[Objective, HarmSoFar, int], Floats]  # of a vehicle, [n]: less is better
-    function: ObjectiveFunction | None = None  # what somebody registered
+    form: str  # how it is written; no argument if there is no ":"
+    about: str  # what it means, in words
+    amount: Callable[[Objective, HarmSoFar, int], Floats]  # (objective, harm, vehicle) -> amount [n]: less is better
+    function: ObjectiveFunction | None = None  # the function of a registered objective
 
 
 @lru_cache(maxsize=256)
 def parse_objective(text: str) -> Objective:
-    """Read ``total``, ``own``, ``social:45``, ``maximin``, ``mass-weighted``, ``weighted:1,4,1`` or ``injury:lr4s``.
+    """Parse the text of an objective: ``total``, ``own``, ``social:45``, ``weighted:1,4,1``, ``injury:lr4s``, ...
 
-    Raises ``InvalidInput`` for an unknown name, an angle outside [0, 90] degrees, a weight outside [1e-6, 1e6], or a
-    curve that is none.
+    Raises ``InvalidInput`` for an unknown name, an angle outside [0, 90] degrees, a weight outside [1e-6, 1e6], or an
+    unknown curve.
     """
     kind, colon, argument = text.partition(":")
     if ":" not in OBJECTIVES[kind].form:
@@ -100,7 +100,10 @@ def parse_objective(text: str) -> Objective:
 
 
 def check_declared(declared: object) -> None:
-    """Refuse, with ``InvalidInput``, what is not an objective or a list of some, however many vehicles there are."""
+    """Raise ``InvalidInput`` unless ``declared`` is an objective as a scenario writes it, such as ``own``, or a list.
+
+    The number of objectives in a list is not checked here.
+    """
     each = [declared] if isinstance(declared, str) else declared
     if not isinstance(each, list | tuple) or not all(isinstance(text, str) for text in each):
         raise InvalidInput("objective: must be a name, for instance own or social:45, or a list with one per vehicle")
@@ -109,7 +112,10 @@ def check_declared(declared: object) -> None:
 
 
 def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
-    """The objective of each of ``vehicles`` vehicles; ``InvalidInput`` if there are too many or too few."""
+    """Return the parsed objective of each of ``vehicles`` vehicles; raise ``InvalidInput`` if their number is wrong.
+
+    ``declared``: the text of one objective for all vehicles, or one text per vehicle.
+    """
     check_declared(declared)
     each = (declared,) * vehicles if isinstance(declared, str) else tuple(declared)
     if len(each) != vehicles:
@@ -125,22 +131,34 @@ def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
 
 
 def objective_harm(ledger: Ledger, harm_count: HarmCount, objectives: Sequence[Objective]) -> Floats:
-    """What the objective of each vehicle makes of the harm so far, [n, N] (m2/s2, or injuries): less is better."""
+    """Return what each vehicle should minimise, for the harm so far, [n, N] (m2/s2, or injuries in 1,000 lines).
+
+    Args:
+        ledger: harm of n worlds since the start of the episode.
+        harm_count: impacts that count: ``"first"`` of each pair, or ``"total"``.
+        objectives: objective of each vehicle, N of them.
+
+    """
     harms = ledger.vehicle_harm(harm_count), ledger.world_harm(harm_count)
     told = *harms, ledger.mass_t, *ledger.speed_changes(harm_count)
-    harm = HarmSoFar(*(np.broadcast_to(each, each.shape) for each in told))  # read-only
+    harm = HarmSoFar(*(np.broadcast_to(each, each.shape) for each in told))  # read-only views
     return np.stack([OBJECTIVES[o.kind].amount(o, harm, i) for i, o in enumerate(objectives)], axis=1)
 
 
 def standard_objectives() -> tuple[str, ...]:
-    """The built-in objectives that need no knowledge of the scenario, then those of others that were loaded."""
+    """Return the built-in objectives that fit every scenario, then the registered ones that are loaded."""
     return (*STANDARD, *(name for name, kind in OBJECTIVES.loaded.items() if kind.function is not None))
 
 
 def declared_objectives(texts: Sequence[str], vehicles: int) -> list[str]:
-    """Objectives by name, ``standard`` standing for all that need no knowledge of the scenario.
+    """Return the names of objectives, with ``standard`` replaced by all of ``standard_objectives``.
 
-    Raises ``InvalidInput`` for one that is unknown, given twice, or made for another number of vehicles.
+    Raises ``InvalidInput`` if an objective is unknown, listed twice, or made for another number of vehicles.
+
+    Args:
+        texts: names of objectives, or ``standard``.
+        vehicles: number of vehicles in the line.
+
     """
     names = [name for text in texts for name in (standard_objectives() if text == "standard" else (text,))]
     for k, name in enumerate(names):
@@ -151,18 +169,18 @@ def declared_objectives(texts: Sequence[str], vehicles: int) -> list[str]:
 
 
 def register_objective(name: str, function: ObjectiveFunction) -> None:
-    """Make ``objective: name`` known to every scenario and reward, and to ``--objective``.
+    """Register an objective, so that scenarios, rewards and ``--objective`` can use ``name``.
 
-    An installed package does the same with an entry point of the group ``ethbrake_marl.objectives`` that names the
-    function.
+    An installed package registers an objective with an entry point of the group ``ethbrake_marl.objectives`` that names
+    the function.
 
     Args:
         name: 1 to 64 of ``a-z``, digits, ``-`` and ``_``.
-        function: from ``HarmSoFar`` and the vehicle (0 = front) to the amount of harm that this vehicle is to make
-            small, [n] (m2/s2); its docstring says what it is.
+        function: ``function(harm, vehicle)`` returns the amount of harm that this vehicle should minimise, [n] (m2/s2).
+            ``harm`` is a ``HarmSoFar``, vehicle 0 is in front. Its docstring describes the objective.
 
-    Registering the same again changes nothing. Raises ``AlreadyExists`` for another one under a name that is taken,
-    ``InvalidInput`` for a name that is none and for a function without a docstring.
+    Registering the same function again changes nothing. Raises ``AlreadyExists`` if the name belongs to another
+    objective, ``InvalidInput`` for an invalid name or a function without a docstring.
 
     """
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
@@ -193,9 +211,18 @@ def register_objective(name: str, function: ObjectiveFunction) -> None:
 
 
 def scored(ledger: Ledger, harm_count: HarmCount, declared: Sequence[Declared] | None = None) -> dict[str, Floats]:
-    """The same ledger under several objectives: objective -> what it is for each vehicle, [n, N] (m2/s2).
+    """Evaluate one ledger under several objectives; return the amount for each vehicle: ``{"own": [n, N], ...}``.
 
-    So one policy, whatever it was trained for, is told under all of them. ``InvalidInput`` for a name without its list.
+    So a policy can be judged under objectives that it was not trained for. Amounts are in m2/s2, or injuries in 1,000
+    lines; less is better.
+
+    Args:
+        ledger: harm of n worlds since the start of the episode.
+        harm_count: impacts that count: ``"first"`` of each pair, or ``"total"``.
+        declared: list of objectives, each for all vehicles or one per vehicle; None: ``standard_objectives``.
+
+    Raises ``InvalidInput`` for a single name instead of a list.
+
     """
     if isinstance(declared, str):
         raise InvalidInput(f"scored: {declared!r}: must be a list of objectives, for instance [{declared!r}]")
@@ -216,9 +243,9 @@ def _social(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
 
 @lru_cache
 def _social_weights(angle_deg: float) -> tuple[float, float]:
-    """Weights of the own harm and of the others': cosine and sine; exactly 0 and 1 at 90 degrees too.
+    """Return the weights of own harm and others' harm: cosine and sine of the angle, exactly 0 and 1 at 90 degrees.
 
-    By their series in exact fractions, rounded once: the C library's have other last bits on other processors.
+    Computed by their series in exact fractions and rounded once, because the C library's last bits differ by processor.
     """
     if angle_deg == 90.0:
         return 0.0, 1.0
@@ -230,9 +257,10 @@ def _social_weights(angle_deg: float) -> tuple[float, float]:
 
 
 def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
-    """Injuries in 1,000 lines, [n], summed front to rear: the same for all vehicles.
+    """Return the injuries in 1,000 lines, [n], summed front to rear; the same number for all vehicles.
 
-    The larger risk of a vehicle counts, not that of the larger change of speed: no impact may take away from it.
+    If a vehicle has two impacts, the larger risk counts, not the larger change of speed, so that no further impact can
+    lower the number.
     """
     del vehicle
     front, rear = harm.front_change_mps, harm.rear_change_mps
@@ -245,7 +273,10 @@ def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
 
 
 def _weighted(borne: Floats, weights: Floats) -> Floats:
-    """``N sum_j w_j H_j / sum_j w_j``, summed front to rear: the same bits in any batch."""
+    """Return ``N sum_j w_j H_j / sum_j w_j``, [n], summed front to rear: the same bits in any batch.
+
+    ``borne``: harm H_j of each vehicle, [n, N] m2/s2; ``weights``: w_j, [n, N].
+    """
     n, vehicles = borne.shape
     harm, whole = np.zeros(n), np.zeros(n)
     for j in range(vehicles):

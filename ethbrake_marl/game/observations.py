@@ -34,9 +34,9 @@ from ethbrake_marl.physics.state import Floats, Ints, Worlds
 
 @dataclass(frozen=True, slots=True)
 class ObservationSpec:
-    """How many neighbours an observation holds on each side, and whether place, obstacle and contacts follow.
+    """What a vehicle observes: a number of neighbours on each side, and whether place, obstacle and contacts are added.
 
-    With ``chosen`` it holds these features alone, in this order; ``choose_observation`` makes such a one.
+    With ``chosen`` the observation has exactly these features, in this order; use ``choose_observation`` to make it.
 
     >>> import ethbrake_marl as eb
     >>> spec = eb.ObservationSpec(front=2, rear=0)
@@ -47,16 +47,16 @@ class ObservationSpec:
 
     """
 
-    front: int = 1  # neighbours ahead, 0 to 64
-    rear: int = 1  # neighbours behind
-    role: bool = False  # ROLE_FEATURES
-    obstacle: bool = False  # OBSTACLE_FEATURES
-    chosen: tuple[str, ...] = ()  # full names; the other fields say how far these look
-    contact: bool = False  # CONTACT_FEATURES; those of contact_far must be chosen
-    time_step_s: float | None = None  # between two decisions; contact features need it, others do not look at it
+    front: int = 1  # number of observed neighbours ahead, 0 to 64
+    rear: int = 1  # number of observed neighbours behind, 0 to 64
+    role: bool = False  # whether to add the vehicle's place in the line (GROUPS.role)
+    obstacle: bool = False  # whether to add the obstacle ahead (GROUPS.obstacle)
+    chosen: tuple[str, ...] = ()  # full names of all features, in order; the other fields are then what these need
+    contact: bool = False  # whether to add forecast impacts (GROUPS.contact); contact_far only through ``chosen``
+    time_step_s: float | None = None  # time between two decisions (s); only contact features need it
 
     def __post_init__(self) -> None:
-        """Refuse what is not a number of neighbours, and features that the rest does not fit."""
+        """Raise ``InvalidInput`` for an invalid number of neighbours, or fields that contradict ``chosen``."""
         for side, count in (("front", self.front), ("rear", self.rear)):
             whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
             if not whole or not 0 <= count <= MOST_NEIGHBOURS:
@@ -71,18 +71,21 @@ class ObservationSpec:
 
     @property
     def sides(self) -> tuple[tuple[str, int], ...]:
-        """Neighbours as (prefix, offset in the line), front ones first, nearest first."""
+        """Observed neighbours as (prefix, offset), nearest first: ``("front_1", -1)`` is the next vehicle ahead.
+
+        Neighbours in front come first; the offset is the difference of the places in the line.
+        """
         fronts = tuple((f"front_{k}", -k) for k in range(1, self.front + 1))
         return fronts + tuple((f"rear_{k}", k) for k in range(1, self.rear + 1))
 
     @property
     def features(self) -> tuple[Feature, ...]:
-        """Every number of an observation in order; names are unique (``own.speed``, ``front_1.gap``)."""
+        """Every feature of an observation in order; names are unique (``own.speed``, ``front_1.gap``)."""
         return tuple(feature_named(name) for name in self.chosen) or self.whole
 
     @property
     def whole(self) -> tuple[Feature, ...]:
-        """The same with all built-in features of every group that it looks at."""
+        """All built-in features of every group of which the observation has at least one feature, in order."""
         groups = [("own", GROUPS.own), *((prefix, GROUPS.neighbour) for prefix, _ in self.sides)]
         groups += [("role", GROUPS.role)] if self.role else []
         groups += [("obstacle", GROUPS.obstacle)] if self.obstacle else []
@@ -92,7 +95,7 @@ class ObservationSpec:
 
     @property
     def far(self) -> bool:
-        """Whether any of GROUPS.contact_far is chosen."""
+        """Whether the observation has features of GROUPS.contact_far (late or hard forecast impacts)."""
         return any(name.startswith("contact_far.") for name in self.chosen)
 
     @property
@@ -102,27 +105,27 @@ class ObservationSpec:
 
     @property
     def plan(self) -> Plan:
-        """Offsets of the neighbours and scaling of every feature, in order; what is picked, and what is added.
+        """The ``Plan`` that computes this observation from worlds.
 
-        Made once for each specification, not to be changed. Raises ``InvalidInput`` for contact features without a
+        It is cached per specification and must not be changed. Raises ``InvalidInput`` for contact features without a
         time step.
         """
         return _plan(self, tuple(registered_in(self.chosen).items()) if self.chosen else ())
 
     def at_steps_of(self, time_step_s: float) -> ObservationSpec:
-        """The same for decisions every ``time_step_s`` (s), where it needs to know and does not say so itself."""
+        """Return the specification with ``time_step_s`` (s) filled in, if it needs one and has none."""
         return replace(self, time_step_s=time_step_s) if self.contact and self.time_step_s is None else self
 
 
-Observation = ObservationSpec | Sequence[str] | Mapping[str, Any]  # or a list of groups and features, or the fields
+Observation = ObservationSpec | Sequence[str] | Mapping[str, Any]  # list: groups and features; mapping: fields
 
 
 def choose_observation(listed: Observation, time_step_s: float | None = None) -> ObservationSpec:
-    """The observation of a list of groups and single features: ``[own, front_1, rear_1.gap, my_feature]``.
+    """Return the observation for a list of groups and single features: ``[own, front_1, rear_1.gap, my_feature]``.
 
-    A mapping names the fields of an ``ObservationSpec``, which is what JSON makes of one. ``time_step_s`` (s) is the
-    time between two decisions; an environment knows its own, so only who observes without one gives it, for contact
-    features. Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for what is no such list.
+    A mapping gives the fields of an ``ObservationSpec``, as in JSON; an ``ObservationSpec`` is returned unchanged.
+    ``time_step_s`` (s) is the time between two decisions; only contact features outside an environment need it. Raises
+    ``UnknownName`` with a suggestion, ``InvalidInput`` for an invalid list.
     """
     if isinstance(listed, ObservationSpec):
         spec = listed
@@ -145,7 +148,10 @@ def choose_observation(listed: Observation, time_step_s: float | None = None) ->
 
 
 def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool, bool]:
-    """How far features look: neighbours in front and behind, the own place, the obstacle, contacts."""
+    """Return what features with these full names need: neighbours in front and behind, own place, obstacle, contacts.
+
+    These are the fields ``front``, ``rear``, ``role``, ``obstacle`` and ``contact`` of ``ObservationSpec``.
+    """
     sides = [side for name in names if (side := side_of(name)) is not None]
     front, rear = (max((k for at, k in sides if at == wanted), default=0) for wanted in ("front", "rear"))
     groups = {name.partition(".")[0] for name in names}
@@ -160,7 +166,10 @@ _ROLE, _OBSTACLE = len(GROUPS.role), len(GROUPS.obstacle)
 
 
 def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations:
-    """Observation of ``vehicle`` (0 = front) in every world, [n, F] float32 in its own memory."""
+    """Return the observation of ``vehicle`` (0 = front) in every world, [n, F] float32 in new memory.
+
+    ``spec`` says which F features are observed. Raises ``InvalidInput`` for an index without a vehicle.
+    """
     if not 0 <= vehicle < worlds.N:
         raise InvalidInput(f"observe: vehicle index {vehicle}; must be in 0..{worlds.N - 1}")
     packed = Packed.of(worlds)
@@ -168,37 +177,44 @@ def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations
 
 
 class Scaling(NamedTuple):
-    """The groups of a specification as the kernel wants them."""
+    """Arguments of the kernel that computes all groups of features except the contact features."""
 
-    offsets: Ints  # of the neighbours in the line
-    role: bool
-    obstacle: bool
-    features: Floats  # [3, F] 1 / scale, low, high
+    offsets: Ints  # place of each observed neighbour relative to the observer: -1 is the next vehicle ahead
+    role: bool  # whether the place in the line is observed
+    obstacle: bool  # whether the obstacle ahead is observed
+    features: Floats  # [3, F] rows 1 / scale, low and high; a column per feature
 
 
 class Extra(NamedTuple):
-    """A registered feature in an observation."""
+    """A registered feature in an observation, computed by its own function."""
 
-    column: int
-    entry: RegisteredFeature
-    offset: int  # of the neighbour in the line; 0: its own
-    known: int  # column of the neighbour's ``known`` in the whole groups
+    column: int  # its column in the observation
+    entry: RegisteredFeature  # the feature and its function
+    offset: int  # place of the neighbour relative to the vehicle, -1 is the next one ahead; 0: the vehicle itself
+    known: int  # column of the neighbour's feature ``known`` among the built-in features
 
 
 class Plan(NamedTuple):
-    """How an observation is made: by kernels, which fill whole groups, and by functions of registered features."""
+    """How to compute an observation from worlds: kernels fill whole groups, functions compute registered features."""
 
-    scaling: Scaling
-    contacts: Contacts | None  # their group is the last one; None: it holds none
-    picked: Ints | None  # [F] columns of the whole groups; None: all of them
-    extras: tuple[Extra, ...]
+    scaling: Scaling  # how to compute all built-in features but the contact features
+    contacts: Contacts | None  # contact features, after all other groups; None: no such features
+    picked: Ints | None  # [F] columns to take from the features of whole groups; None: all
+    extras: tuple[Extra, ...]  # registered features
 
     def observe(self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None = None) -> Observations:
-        """Observations of several vehicles in worlds given as rows of ``physics.batch``, [n, len(vehicles), F].
+        """Return the observations of several vehicles, [n, len(vehicles), F] float32.
 
-        ``steps`` [n] is how many steps each world has made, for error texts. Over a channel of periodic messages a
-        vehicle sees the worlds as it takes them to be (``physics.messages``). Contact features of commands that are
-        not wanted are 0. Raises ``PhysicsError`` naming the worlds in which a forecast of contacts failed.
+        With periodic messages a vehicle observes the worlds as it estimates them (``physics.estimates``). Contact
+        features of commands that are not needed are 0. Raises ``PhysicsError`` with the worlds in which a forecast of
+        contacts failed.
+
+        Args:
+            state: state rows of the worlds, [n, S], in the layout of ``physics.columns``.
+            params: their parameter rows.
+            vehicles: indices of the observing vehicles, from 0.
+            steps: number of steps so far, [n], for messages.
+
         """
         if not Packed(state, params).has_messages:
             return self._observe_present(state, params, vehicles, steps)
@@ -209,7 +225,7 @@ class Plan(NamedTuple):
         return np.concatenate(seen, axis=1)
 
     def _observe_present(self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None) -> Observations:
-        """The same where everything known is known as it is."""
+        """Version of ``observe`` without estimation: a known vehicle is observed in its present state."""
         shape = len(state), len(vehicles)
         whole = np.empty((*shape, self.scaling.features.shape[1]), np.float32)
         _observe_rows(state, params, vehicles, *self.scaling, whole)
@@ -230,9 +246,9 @@ class Plan(NamedTuple):
         for extra, (o, vehicle) in product(self.extras, enumerate(vehicles.tolist())):
             neighbour = vehicle + extra.offset if extra.offset else None
             counts = np.ones(worlds.n, np.bool_) if neighbour is None else whole[:, o, extra.known] == 1.0
-            if counts.any():  # one of a neighbour tells where the kernel says that it is known
+            if counts.any():  # a neighbour's feature counts where the neighbour is known
                 values = extra.entry.checked(worlds, vehicle, neighbour, counts, steps)
-            else:  # nobody is there, or nobody is heard
+            else:  # no such neighbour, or no news of it
                 values = extra.entry.scaled(np.full(worlds.n, extra.entry.unknown))
             out[:, o, extra.column] = values
         return out
@@ -268,7 +284,7 @@ def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature]
 
 
 def _scales(features: Sequence[Feature]) -> Floats:
-    """1 / scale, low, high of every feature, [3, F]."""
+    """Return the scaling of features, [3, F]: rows 1 / scale, low and high, a column per feature."""
     return np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]])
 
 
@@ -277,15 +293,26 @@ def _observe_rows(
     state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, with_obstacle: bool, features: Floats,
     out: Observations,
 ) -> None:  # fmt: skip
-    """Fill ``out`` with the clipped features of each observer, in the order of the lists of features above.
+    """Fill ``out`` [n, observers, F] with the clipped features of each observer, in the order of ``GROUPS``.
 
-    One long loop on purpose: handing these arrays on to functions made it four times as slow.
+    This is one long loop on purpose: passing these arrays to functions made it four times slower.
+
+    Args:
+        state: state rows of the worlds, [n, S], in the layout of ``physics.columns``.
+        params: their parameter rows.
+        observers: indices of the observing vehicles.
+        offsets: place of each observed neighbour relative to the observer; -1 is the next vehicle ahead.
+        role: whether the vehicle's place in the line is observed.
+        with_obstacle: whether the obstacle ahead is observed.
+        features: scaling, [3, F]: rows 1 / scale, low and high, a column per feature.
+        out: result.
+
     """
     of = columns(state)
     N, speed, command, gap_column, hit, obstacle = of.vehicles, of.speed, of.command, of.gap, of.hit, of.obstacle
     braking, driving, latency, mass, news = of.braking, of.driving, of.latency, of.mass, of.news
     by_link, some_obstacle = params.shape[1] > of.own_latency, state.shape[1] > obstacle
-    own_part = of.own_latency if by_link else latency  # of vehicle j's latency: own_part + j
+    own_part = of.own_latency if by_link else latency  # column own_part + j has vehicle j's own latency
     value = np.zeros(out.shape[2])
     for k in range(out.shape[0]):
         time = state[k, of.time]
@@ -350,10 +377,16 @@ def _observe_rows(
 
 @compiled
 def _fitting_deceleration(speed: float, latency_left: float, room: float) -> float:
-    """Constant deceleration that uses up exactly ``room`` after the own latency: ``v^2 / (2 (room - v tau))``.
+    """Return the constant deceleration (m/s2) that stops a vehicle within ``room``: ``v^2 / (2 (room - v tau))``.
 
-    Room below 1 mm counts as 1 mm. Without room it therefore reads as the upper clipping bound (20 m/s2) from 0.2 m/s
-    on, and lower for a slower vehicle; at rest it is 0.
+    Room below 1 mm counts as 1 mm. So without room the feature is at its upper bound (20 m/s2) from 0.2 m/s on, and
+    lower for a slower vehicle; at rest it is 0.
+
+    Args:
+        speed: present speed v, m/s.
+        latency_left: time tau until its brakes act, s.
+        room: distance in which it must stop, m.
+
     """
     speed = max(speed, 0.0)
     left = max(room - speed * latency_left, 1e-3)

@@ -1,1 +1,1 @@
-"""The exact, event-driven motion of ``n`` worlds, compiled with numba."""
+"""Exact, event-driven motion of ``n`` worlds (independent lines of vehicles), compiled with numba."""

@@ -1,4 +1,4 @@
-"""Move many worlds through one segment, exactly: ``advance``."""
+"""``advance``: move many worlds exactly through a segment, a time interval in which all commands are constant."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds, checked_num
 
 @compiled
 def finite_among(values: Floats) -> int:
-    """How many of n numbers are below infinity; a loop by index that counts is compiled to one of vectors."""
+    """Return how many entries of ``values`` [n] are below infinity.
+
+    A counting loop over an index is compiled to vector instructions.
+    """
     count = 0
     for k in range(values.size):
         count += 1 if values[k] < math.inf else 0
@@ -36,12 +39,21 @@ def advance_worlds(
     command: Floats, until: Floats, braking: Floats, driving: Floats, latency: Floats, mass: Floats, limit: Floats,
     restitution: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats, failed: Ints, at: int, rows: Floats,
 ) -> tuple[int, bool]:  # fmt: skip
-    """Advance every world to its ``until``, in place (the first seven arrays), and fill its harm (the next six).
+    """Advance every world to its time ``until``, in place; return the number of impacts and whether the input is valid.
 
-    ``at`` is 1 where some world has an obstacle ``ahead``, else 0: vehicle i stands in column at + i of the table.
-    ``rows`` [capacity, LISTED.WIDTH] receives the impacts that fit. Gives their whole number, and False where a world's
-    end or command is refused. A world in which a check fails is marked with its status in ``failed`` [n] (else DONE)
-    and stays where it was; the others go on.
+    A failed world keeps its state; the others go on. The second result is False if some ``until`` or command is
+    invalid. Arguments that are not listed are fields of ``Worlds`` and ``Vehicles`` under short names, for example
+    ``gaps`` for ``gaps_m``.
+
+    - ``in_force``: accelerations in force at the start, [n, N] m/s2. The first seven arrays, the state, are updated.
+    - ``ahead``: gap to the obstacle ahead, [n] m.
+    - ``first_harm``: harm of first impacts, [n, P] m2/s2. The six arrays from this one to ``ahead_count`` are filled.
+    - ``command``: commands, [n, N] m/s2.
+    - ``until``: time at which each world's segment ends, [n] s.
+    - ``failed``: [n] receives the status of each world: ``FLAG.DONE``, or the code of the check that failed.
+    - ``at``: 1 if some world has an obstacle, otherwise 0; vehicle i is column ``at + i`` of the table
+      (``physics.rows``).
+    - ``rows``: list of impacts, [capacity, LISTED.WIDTH], filled until it is full; further impacts are only counted.
     """
     n, vehicles = speeds.shape
     building = pieces.shape[2] > 0 or finite_among(brake_rate.ravel()) + finite_among(release_rate.ravel()) > 0
@@ -103,17 +115,19 @@ def advance(
     record: bool = False,
     threads: int = 1,
 ) -> tuple[Worlds, Impacts]:
-    """Advance ``worlds`` exactly, each under its constant command, and report the impacts on the way.
+    """Advance ``worlds`` exactly, each under constant commands, and return the new worlds and their impacts.
 
-    Raises ``InvalidInput`` for an unusable command, end or ``threads``, ``PhysicsError`` naming the worlds that failed.
+    Raises ``InvalidInput`` for an invalid command, end time or ``threads``; ``PhysicsError`` with the failed worlds.
 
     Args:
-        worlds: n worlds of N vehicles.
-        command_mps2: signed acceleration wanted, [n, N] m/s2, within capacities; nothing before the latency elapsed.
-        duration_s: length of the segment, one number or [n], s; or give ``until_s``.
-        until_s: its absolute end, not before the worlds' time.
-        record: also report every impact, as ``Impacts.rows``.
-        threads: pay from about 10,000 worlds on; neither they nor the batch change a result.
+        worlds: n worlds of N vehicles; they are not changed.
+        command_mps2: commanded acceleration, [n, N] m/s2, negative brakes, within the vehicles' capacities; it has no
+            effect before a vehicle's latency has elapsed.
+        duration_s: length of the segment, one number or [n], s. Pass this or ``until_s``.
+        until_s: absolute time at which the segment ends, one number or [n], s; not before the worlds' time.
+        record: also return every single impact, in ``Impacts.rows``.
+        threads: number of threads; more than one is faster from about 10,000 worlds on. Results depend neither on the
+            number of threads nor on the batch.
 
     """
     command = shaped("command_mps2", command_mps2, worlds.speeds_mps.shape)
@@ -150,16 +164,24 @@ def advance(
 
 
 class _Part(NamedTuple):
-    """How the kernel fared on a part of the worlds."""
+    """Result of the kernel ``advance_worlds`` for a contiguous part of the worlds."""
 
-    first: int  # world of the whole batch with which the part begins
-    rows: Floats  # the impacts that fit; worlds are counted from ``first``
-    recorded: int  # all impacts
-    good: bool  # no end and no command was refused
+    first: int  # row in the whole batch of the part's first world
+    rows: Floats  # [capacity, LISTED.WIDTH] impacts, until it is full; worlds are numbered within the part
+    recorded: int  # number of all impacts
+    good: bool  # every end time and command was valid
 
 
 def _advance_part(arrays: tuple[NDArray[Any], ...], at: int, capacity: int, part: slice) -> _Part:
-    """Advance the worlds of ``part`` in place."""
+    """Advance the worlds of the slice ``part`` in place; return their impacts and whether the input is valid.
+
+    Args:
+        arrays: array arguments of ``advance_worlds`` for all worlds, in its order.
+        at: 1 if some world has an obstacle ahead, otherwise 0.
+        capacity: number of impacts to record.
+        part: slice of the worlds.
+
+    """
     rows, kernel = np.empty((capacity, LISTED.WIDTH)), cast("Any", advance_worlds)
     whole = part.stop - part.start == len(arrays[0])
     mine = arrays if whole else [array[part] for array in arrays]
@@ -177,7 +199,15 @@ def shaped(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
 
 
 def refuse_bad(worlds: Worlds, command: Floats, until: Floats, in_time: Bools) -> None:
-    """Refuse the first world whose end is not ``in_time`` [n], or with a command beyond a vehicle's capacity."""
+    """Raise ``InvalidInput`` for the first world with an invalid end time or a command beyond a vehicle's capacity.
+
+    Args:
+        worlds: n worlds.
+        command: [n, N] m/s2.
+        until: end times, [n] s, for the message.
+        in_time: whether each end time is valid, [n].
+
+    """
     low, high = -worlds.vehicles.braking_capacity_mps2, worlds.vehicles.driving_capacity_mps2
     in_range = (command >= low) & (command <= high)
     if in_time.all() and in_range.all():
@@ -190,7 +220,10 @@ def refuse_bad(worlds: Worlds, command: Floats, until: Floats, in_time: Bools) -
 
 
 def _impact_rows(parts: list[_Part], ahead: int) -> ImpactRows:
-    """The impacts of all parts; ``ahead`` columns of their tables stand before that of Vehicle 1."""
+    """Join the recorded impacts of all parts of a batch.
+
+    ``ahead`` is 1 if column 0 of the kernel's tables is an obstacle, otherwise 0.
+    """
     rows = np.concatenate([part.rows[: part.recorded] for part in parts])
     first = np.repeat([part.first for part in parts], [part.recorded for part in parts])
     return ImpactRows(

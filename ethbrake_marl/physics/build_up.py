@@ -1,10 +1,16 @@
-"""Brakes that build up: the force moves towards the command at a constant rate, so the motion is a cubic in time.
+"""Motion with brake build-up: the force moves towards the command at a constant rate, so motion is cubic in time.
 
-What a vehicle's brakes or engine call for (FORCE) falls at BRAKE_RATE and rises at RELEASE_RATE until it is the
-command; before the latency has elapsed the command is 0. It goes on while a vehicle stands, is held, or is struck.
-Between events each vehicle, and each body of joined vehicles, has a constant jerk. Two more events bound a piece: the
-force reaches the command or passes 0; and joined vehicles part, or a body that is held is so no more. A world in
-which all rates are infinite never comes here.
+The kernels advance one world in a ``table`` with the layout of ``physics.rows``: a row per quantity, a column per
+vehicle or pair.
+
+The *force* of a vehicle (row FORCE) is the acceleration that its brakes or engine call for at the moment. It falls at
+the rate BRAKE_RATE and rises at the rate RELEASE_RATE until it equals the command; before the latency has elapsed the
+command counts as 0. The force keeps moving while a vehicle stands, is held, or is struck.
+
+Between events each vehicle, and each body of touching vehicles that move together, has a constant jerk. Build-up adds
+two kinds of events to those of ``physics.constant_motion``: a force reaches its command or passes 0; and touching
+vehicles separate, or a body that was held starts to move. Worlds in which all rates are infinite do not use this
+module.
 """
 
 from __future__ import annotations
@@ -17,16 +23,21 @@ from ethbrake_marl.physics.pieces import begin_piece, force_now, pieces_to_come
 from ethbrake_marl.physics.rows import ROW
 from ethbrake_marl.physics.state import Floats
 
-_SAME_MPS2 = 5e-13  # touching vehicles whose accelerations differ by less are one body: less than parting needs
+_SAME_MPS2 = 5e-13  # touching vehicles with accelerations closer than this move as one body
 
-_PARTS_LATE_S = 1e-9  # joined vehicles part this much late, so that rounding cannot undo it: it costs 1e-26 m
+_PARTS_LATE_S = 1e-9  # delay of a separation, so that rounding cannot undo it; error 1e-26 m
 
-_PARTS_LATE_MPS2 = 1e-12  # and by no smaller a difference of accelerations
+_PARTS_LATE_MPS2 = 1e-12  # smallest difference of accelerations at a separation
 
 
 @compiled(bare=True)
 def built_up(table: Floats) -> bool:
-    """Whether every force is the command in effect, so that until the next onset the motion is that of ``move``."""
+    """Return whether no force will change before the next latency elapses: each already equals its command.
+
+    The force of a vehicle is the acceleration by its brakes or engine. A vehicle that brakes in *pieces* (by a fixed
+    sequence of commands) must also have begun the last one. If the result is True, ``constant_motion.move`` is exact.
+    ``table``: one world in the layout of ``physics.rows``.
+    """
     there = True
     for i in range(table.shape[1]):
         there = there and table[ROW.FORCE, i] == table[ROW.COMMAND, i] * table[ROW.ACTIVE, i]
@@ -35,7 +46,10 @@ def built_up(table: Floats) -> bool:
 
 @compiled
 def first_return(value: float, rate: float, jerk: float) -> float:
-    """First time > 0 at which ``value + rate t + jerk t^2 / 2`` is 0; infinite: never. A start at 0 does not count."""
+    """Return the first time t > 0 at which ``value + rate t + jerk t^2 / 2`` is 0, in s; infinite if there is none.
+
+    For a speed, ``value`` is in m/s, ``rate`` in m/s2 and ``jerk`` in m/s3. A value that is 0 at t = 0 does not count.
+    """
     if value == 0.0:
         return -2.0 * rate / jerk if rate * jerk < 0.0 else math.inf
     if jerk == 0.0:
@@ -54,16 +68,36 @@ def first_return(value: float, rate: float, jerk: float) -> float:
 
 @compiled
 def gap_after(gap: float, closing: float, pressing: float, jerk: float, time: float) -> float:
-    """Gap after ``time`` of constant closing jerk: ``g - (w + (b + j t / 3) t / 2) t``. [m]"""
+    """Return the gap (m) after the time t at constant closing jerk: ``g - (w + (b + j t / 3) t / 2) t``.
+
+    Closing quantities are rear minus front.
+
+    Args:
+        gap: present gap g, m.
+        closing: present closing speed w, m/s.
+        pressing: present closing acceleration b, m/s2.
+        jerk: rate j of the closing acceleration, m/s3.
+        time: t, s.
+
+    """
     return gap - (closing + 0.5 * (pressing + jerk * time / 3.0) * time) * time
 
 
 @compiled
 def contact_within(gap: float, closing: float, pressing: float, jerk: float, end: float) -> tuple[float, float]:
-    """``contact`` of a pair whose closing acceleration changes at the rate ``jerk`` (m/s3), until ``end`` (s).
+    """Return the time of a pair's first contact before ``end`` (s) and the closing speed there; ``(inf, 0)`` if none.
 
-    The closing speed ``w + b t + j t^2 / 2`` has at most two roots, between which the gap is monotone. The first
-    stretch at whose end the gap is not positive holds the contact. Newton's method finds it, kept inside by bisection.
+    Like ``contact``, for a closing acceleration that changes with time. The closing speed ``w + b t + j t^2 / 2`` has
+    at most two roots, and between them the gap is monotone. The contact lies in the first monotone stretch that ends
+    with a gap of at most 0. Newton's method finds it; bisection keeps the iterates inside the stretch.
+
+    Args:
+        gap: present gap of the pair, m.
+        closing: present closing speed w (rear minus front), m/s.
+        pressing: present closing acceleration b, m/s2.
+        jerk: rate j of the closing acceleration, m/s3.
+        end: length of the time interval to search, s.
+
     """
     if jerk == 0.0:
         return contact(gap, closing, pressing)
@@ -105,7 +139,12 @@ def contact_within(gap: float, closing: float, pressing: float, jerk: float, end
 
 @compiled(bare=True)
 def plan_force(table: Floats, i: int, wanted: float) -> None:
-    """Where the force of vehicle ``i`` goes from now on, and when it is there: the command, or 0 on the way to it."""
+    """Write into the table how the force of vehicle ``i`` changes next: rate, next goal and the time until then.
+
+    The force is the acceleration by brakes or engine. The goal is the command ``wanted`` (m/s2), or 0 if the force
+    changes sign on the way to it. Writes the rows FORCE, FORCE_RATE, FORCE_TIME and FORCE_VALUE; the time is infinite
+    if the force already equals the command.
+    """
     force = table[ROW.FORCE, i]
     force = force_now(force, wanted, table[ROW.BRAKE_RATE, i], table[ROW.RELEASE_RATE, i])
     table[ROW.FORCE, i] = force
@@ -122,7 +161,18 @@ def plan_force(table: Floats, i: int, wanted: float) -> None:
 
 @compiled
 def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple[float, float, float, float]:
-    """``force_range``, and the rates at which both ends move."""
+    """Return a vehicle's own acceleration if it is about to move forward and if backward, and how fast both change.
+
+    The result is ``(forward, backward, rate of forward, rate of backward)``, in m/s2 and m/s3. The two accelerations
+    differ where the force depends on the direction, for example for brakes at standstill, see ``motion.force_range``.
+
+    Args:
+        force: present acceleration by brakes or engine, m/s2.
+        rate: rate at which the force changes, m/s3.
+        speed: present speed, m/s.
+        limit: speed up to which the vehicle drives, m/s.
+
+    """
     if force < 0.0 or (force == 0.0 and rate < 0.0):
         if speed > 0.0:
             return force, force, rate, rate
@@ -139,7 +189,11 @@ def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple
 
 @compiled
 def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) -> tuple[float, float]:
-    """Acceleration and jerk of a free body whose forces range over a moving ``[low, high]``."""
+    """Return acceleration (m/s2) and jerk (m/s3) of a body (a vehicle, or several that move as one).
+
+    Its own forces allow every acceleration in the range ``[low, high]`` (m/s2), whose ends move at the rates
+    ``low_jerk`` and ``high_jerk`` (m/s3). The body takes the value nearest to 0, as in ``motion.settle``.
+    """
     if low > 0.0 or (low == 0.0 and low_jerk > 0.0):
         return low, low_jerk
     if high < 0.0 or (high == 0.0 and high_jerk < 0.0):
@@ -149,10 +203,12 @@ def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) ->
 
 @compiled(apart=True, bare=True)
 def pool_moving(table: Floats, first: int, last: int) -> float:
-    """Accelerations and jerks of touching vehicles ``first..last`` of equal speed; the time until one of them parts.
+    """Set accelerations and jerks of touching vehicles; return the time until two of them separate (s).
 
-    The regression of ``pool``, but vehicles of equal acceleration are joined, and part by their jerks. Accelerations
-    that differ by rounding alone are equal.
+    The vehicles are the columns ``first..last`` of ``table`` and have the same speed. A vehicle whose acceleration is
+    at least as large as that of the vehicle in front, up to rounding, joins it: both move as one body with a common
+    acceleration and jerk. They separate later if their jerks differ. The time is infinite if no joined vehicles
+    separate. Writes the rows ACCELERATION, JERK and JOINED.
     """
     count = 0
     for i in range(first, last + 1):
@@ -189,7 +245,11 @@ def pool_moving(table: Floats, first: int, last: int) -> float:
 
 @compiled(bare=True)
 def settle_block(table: Floats, block: int, out: int) -> None:
-    """Acceleration and jerk of a block, into column ``out``."""
+    """Write the common acceleration and jerk of a pooled block into column ``out`` of the table.
+
+    A block is a run of touching vehicles that move as one body; ``block`` is its column in the rows BLOCK_*, which hold
+    its mass and the sums of mass times force.
+    """
     mass = table[ROW.BLOCK_MASS, block]
     table[ROW.ACCELERATION, out], table[ROW.JERK, out] = settle_moving(
         table[ROW.BLOCK_LOW, block] / mass, table[ROW.BLOCK_HIGH, block] / mass,
@@ -199,16 +259,24 @@ def settle_block(table: Floats, block: int, out: int) -> None:
 
 @compiled(bare=True)
 def parting_s(table: Floats, head: int, tail: int, value: float, jerk: float) -> float:
-    """Time until the block of vehicles ``head..tail`` is one no more.
+    """Return the time until the joined vehicles ``head..tail`` stop moving as one body (s); infinite: never.
 
-    A block that moves parts where the front ones of it alone would be faster than it; one that is held moves where its
-    front ones drive away or its rear ones would be pushed back.
+    A moving body splits where its front vehicles alone would be faster than the whole. A body that is held starts to
+    move where its front vehicles drive away or its rear vehicles would be pushed back.
+
+    Args:
+        table: one world in the layout of ``physics.rows``.
+        head: column of the body's front vehicle.
+        tail: column of its rear vehicle.
+        value: acceleration of the body, m/s2.
+        jerk: jerk of the body, m/s3.
+
     """
     soonest = math.inf
     held = value == 0.0 and jerk == 0.0
     forward = value > 0.0 or (value == 0.0 and jerk > 0.0)
     mass, force, rate = 0.0, 0.0, 0.0
-    for i in range(head, tail + (1 if held else 0)):  # the front ones, up to i
+    for i in range(head, tail + (1 if held else 0)):  # the front vehicles, up to i
         if table[ROW.MASS, i] == math.inf:
             mass = math.inf
             continue
@@ -218,7 +286,7 @@ def parting_s(table: Floats, head: int, tail: int, value: float, jerk: float) ->
         rate += table[ROW.MASS, i] * table[side + ROW.LOW_JERK - ROW.FORCE_LOW, i]
         soonest = min(soonest, crossing_s(force / mass - value, rate / mass - jerk))
     mass, force, rate = 0.0, 0.0, 0.0
-    for i in range(tail if held else head - 1, head - 1, -1):  # the rear ones, from i on
+    for i in range(tail if held else head - 1, head - 1, -1):  # the rear vehicles, from i on
         if table[ROW.MASS, i] == math.inf:
             break
         mass += table[ROW.MASS, i]
@@ -230,7 +298,11 @@ def parting_s(table: Floats, head: int, tail: int, value: float, jerk: float) ->
 
 @compiled
 def crossing_s(below: float, rate: float) -> float:
-    """When a difference of accelerations that is not positive is surely positive; infinite: never. [m/s2, m/s3]"""
+    """Return the time after which a difference of two accelerations is surely positive (s); infinite: never.
+
+    The difference is now ``below`` <= 0 (m/s2) and grows at ``rate`` (m/s3). A small delay is added, so that rounding
+    cannot leave the difference at 0.
+    """
     if rate <= 0.0:
         return math.inf
     return max(-below / rate, 0.0) + _PARTS_LATE_S + _PARTS_LATE_MPS2 / rate
@@ -238,7 +310,12 @@ def crossing_s(below: float, rate: float) -> float:
 
 @compiled(apart=True, bare=True)
 def accelerate_moving(table: Floats) -> float:
-    """``accelerate`` where brakes build up: accelerations and jerks; the time until touching vehicles part."""
+    """Set the acceleration and jerk of every vehicle; return the time until touching vehicles separate (s).
+
+    Version of ``constant_motion.accelerate`` for brake build-up; ``table`` is one world in the layout of
+    ``physics.rows``. Also sets how each vehicle's force changes next and marks the pairs that move as one body (row
+    JOINED). The time is infinite if no touching vehicles separate.
+    """
     vehicles = table.shape[1]
     for i in range(vehicles):
         plan_force(table, i, table[ROW.COMMAND, i] * table[ROW.ACTIVE, i])
@@ -268,7 +345,20 @@ def accelerate_moving(table: Floats) -> float:
 
 @compiled(apart=True, bare=True)
 def next_moving_event(table: Floats, now: float, end: float, parting: float) -> float:
-    """``next_event`` where brakes build up."""
+    """Return the time from ``now`` to the next event, at most ``end - now`` (s).
+
+    An event is a contact, a separation, a vehicle that comes to rest or reaches its speed limit, a command that takes
+    effect, or a force that reaches its command. Also writes into the table when each vehicle next comes to rest or
+    reaches its speed limit, and when each pair comes into contact. Version of ``constant_motion.next_event`` for brake
+    build-up.
+
+    Args:
+        table: one world in the layout of ``physics.rows``, after ``accelerate_moving``.
+        now: present time, counted from the start of the segment, s.
+        end: end of the segment, s.
+        parting: time until touching vehicles separate, s: the result of ``accelerate_moving``.
+
+    """
     vehicles = table.shape[1]
     soonest = min(end - now, parting)
     for i in range(vehicles):
@@ -284,7 +374,7 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
             table[ROW.JERK, i],
             table[ROW.LIMIT, i],
         )
-        most = (abs(rate) + abs(jerk) * soonest) * soonest  # by so much the speed can change
+        most = (abs(rate) + abs(jerk) * soonest) * soonest  # largest possible change of speed
         time, value = math.inf, 0.0
         if most >= abs(speed):
             time = first_return(speed, rate, jerk)
@@ -302,7 +392,7 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
             pressing = table[ROW.ACCELERATION, p + 1] - table[ROW.ACCELERATION, p]
             jerk = table[ROW.JERK, p + 1] - table[ROW.JERK, p]
             most = max(closing, 0.0) + (max(pressing, 0.0) + max(jerk, 0.0) * soonest) * soonest
-            if most * soonest >= gap:  # else it cannot close in this piece
+            if most * soonest >= gap:  # otherwise the gap cannot close before the next event
                 time, speed = contact_within(gap, closing, pressing, jerk, soonest)
         table[ROW.CONTACT_TIME, p] = time
         table[ROW.CONTACT_SPEED, p] = speed
@@ -312,7 +402,10 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
 
 @compiled(apart=True, bare=True)
 def move_on_cubics(table: Floats, duration: float) -> bool:
-    """``move`` where brakes build up: gaps, speeds and forces."""
+    """Move gaps, speeds and forces to the next event, ``duration`` (s) later; return False if a contact was missed.
+
+    Version of ``constant_motion.move`` for brake build-up; ``table`` is one world in the layout of ``physics.rows``.
+    """
     vehicles, sound = table.shape[1], True
     for p in range(vehicles - 1):
         if table[ROW.CONTACT_TIME, p] <= duration:
@@ -354,7 +447,12 @@ def move_on_cubics(table: Floats, duration: float) -> bool:
 
 @compiled(apart=True, bare=True)
 def move_apart_on_cubics(table: Floats, duration: float) -> bool:
-    """``move_apart`` where brakes build up: each vehicle from event to event on its own, and how near two can come."""
+    """Move every vehicle alone by ``duration`` (s) and return True if no two can meet; otherwise return False.
+
+    In the second case speeds and gaps do not change. Version of ``segment.move_apart`` for brake build-up; ``table`` is
+    one world in the layout of ``physics.rows``. A bound decides whether two vehicles can meet: their gap must exceed
+    ``duration`` times the largest possible closing speed.
+    """
     vehicles = table.shape[1]
     slowest_in_front = math.inf
     for i in range(vehicles):
@@ -394,10 +492,20 @@ def move_apart_on_cubics(table: Floats, duration: float) -> bool:
 
 @compiled(bare=True)
 def move_alone(table: Floats, i: int, wanted: float, duration: float) -> tuple[float, float]:
-    """Move vehicle ``i`` under one command, from SPEED_VALUE on, and add its WAY; its lowest and its highest speed."""
+    """Move vehicle ``i`` alone under a constant command; return its lowest and its highest speed on the way (m/s).
+
+    The motion starts at the speed in row SPEED_VALUE, which is updated, as is FORCE; the distance is added to row WAY.
+
+    Args:
+        table: one world in the layout of ``physics.rows``.
+        i: column of the vehicle.
+        wanted: command, m/s2.
+        duration: length of the motion, s.
+
+    """
     speed = table[ROW.SPEED_VALUE, i]
     force = force_now(table[ROW.FORCE, i], wanted, table[ROW.BRAKE_RATE, i], table[ROW.RELEASE_RATE, i])
-    rate, building = 0.0, 0.0  # at which the force moves towards the command, and for how long
+    rate, building = 0.0, 0.0  # rate (m/s3) and duration (s) of the force's move to the command
     if wanted != force:
         rate = -table[ROW.BRAKE_RATE, i] if wanted < force else table[ROW.RELEASE_RATE, i]
         building = duration if abs(rate * duration) < abs(wanted - force) else (wanted - force) / rate
@@ -419,7 +527,10 @@ def move_alone(table: Floats, i: int, wanted: float, duration: float) -> tuple[f
 
 @compiled(apart=True, bare=True)
 def move_alone_by_events(table: Floats, i: int, wanted: float, duration: float) -> tuple[float, float]:
-    """``move_alone`` where the vehicle may come to rest, or to its speed limit."""
+    """Version of ``move_alone`` for a vehicle that may come to rest or reach its speed limit: it moves event by event.
+
+    Arguments, result and updated rows are the same as in ``move_alone``.
+    """
     speed, limit, now = table[ROW.SPEED_VALUE, i], table[ROW.LIMIT, i], 0.0
     slowest, fastest = speed, speed
     while now < duration:

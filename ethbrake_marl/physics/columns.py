@@ -1,6 +1,6 @@
-"""Worlds packed into rows, one row per world: the layout in which the engine keeps them.
+"""Worlds packed into two arrays, state and parameters, one row per world: the layout that the engine uses.
 
-Two arrays (state and parameters) are far cheaper to hand to a kernel, to copy and to replace row by row than a dozen.
+Two arrays are much cheaper to pass to a kernel, to copy and to replace row by row than a dozen arrays.
 """
 
 from __future__ import annotations
@@ -17,34 +17,36 @@ from ethbrake_marl.physics.state import Floats, Ints, Vehicles, Worlds
 
 
 class Columns(NamedTuple):
-    """First column of each group of the rows of N vehicles and P = N - 1 pairs; it ends where the next one begins.
+    """First column of each group of quantities in the rows of ``Packed``, for N vehicles and P = N - 1 pairs.
 
-    News by link is there where some news comes so, else latencies are all own, and everything is known from them on.
-    The columns of periodic messages (``physics.messages``) follow it, and change as messages come in.
+    A group ends where the next one begins. *News by link* is the time from which each vehicle may act on information
+    about each other one. Its columns exist only if some world needs them; without them a vehicle knows everything from
+    the end of its own latency on. The columns of periodic messages (``physics.messages``) follow; they change as
+    messages arrive.
     """
 
-    vehicles: int  # N, no column
+    vehicles: int  # the number N itself, not a column
     # of the state
-    time: int
-    speed: int  # N (m/s)
-    command: int  # N, in force (m/s2)
-    previous: int  # N, in force before the last segment (m/s2)
-    gap: int  # P (m)
-    hit: int  # P
-    harm: int  # since the episode began: first-impact harm P, total harm P, impacts P
-    obstacle: int  # the width without an obstacle; else its gap (infinite: none), hit flag, both harms, impacts
+    time: int  # 1 column: since Vehicle 1 began to brake (s)
+    speed: int  # N columns (m/s)
+    command: int  # N columns, acceleration in force (m/s2)
+    previous: int  # N columns, acceleration in force before the last segment (m/s2)
+    gap: int  # P columns, bumper to bumper (m)
+    hit: int  # P columns, 1 once the pair has had an impact
+    harm: int  # 3 P columns since the start of the episode: first-impact harm, total harm, number of impacts
+    obstacle: int  # 5 columns: gap (m; infinite: none), hit flag, both harms, impacts; if absent, the row's width
     # of the parameters
-    restitution: int
-    braking: int  # N
-    driving: int  # N
-    latency: int  # N
-    mass: int  # N
-    limit: int  # N
-    brake_rate: int  # N
-    release_rate: int  # N
-    own_latency: int  # the width without news by link; else N
-    news: int  # N * N: from when on vehicle i acts on news of vehicle j
-    messages: int  # the width without periodic messages
+    restitution: int  # 1 column, coefficient of restitution
+    braking: int  # N columns, braking capacity (m/s2)
+    driving: int  # N columns, driving capacity (m/s2)
+    latency: int  # N columns, time before which commands have no effect (s)
+    mass: int  # N columns (t)
+    limit: int  # N columns, speed up to which a vehicle drives (m/s)
+    brake_rate: int  # N columns, rate at which the acceleration in force falls (m/s3)
+    release_rate: int  # N columns, rate at which it rises (m/s3)
+    own_latency: int  # N columns, part of the latency without the channel (s); if absent, the row's width
+    news: int  # N * N columns, time from which vehicle i acts on news of vehicle j (s)
+    messages: int  # M columns, ``physics.messages``; if absent, the row's width
 
 
 OBSTACLE_WIDTH = 5
@@ -66,19 +68,25 @@ _compiled_columns = compiled(_columns_of)
 
 @compiled
 def columns(state: Floats) -> Columns:
-    """The columns of these rows of state, [n, S], and of their parameters."""
+    """Return the first column of each group of quantities, for rows of ``state`` [n, S] and of their parameters."""
     return _compiled_columns((state.shape[1] + 4) // 8)
 
 
 class Packed(NamedTuple):
-    """Worlds by rows."""
+    """n worlds packed into two arrays, one row per world."""
 
-    state: Floats  # [n, S]
-    params: Floats  # [n, 1 + 7 N], [n, 1 + 8 N + N * N] or, with M columns of messages, [n, 1 + 8 N + N * N + M]
+    state: Floats  # [n, S] what changes during an episode; columns ``time`` to ``obstacle`` of ``Columns``
+    # parameters of the vehicles and state of the messages; columns ``restitution`` to ``messages`` of ``Columns``:
+    # [n, 1 + 7 N]; with news by link [n, 1 + 8 N + N * N]; with M columns of messages [n, 1 + 8 N + N * N + M]
+    params: Floats
 
     @classmethod
     def of(cls, worlds: Worlds) -> Packed:
-        """Worlds with no harm so far; with columns of the obstacle, and of news by link, if any world has such."""
+        """Pack ``worlds`` at the start of their episode, with harm 0.
+
+        Columns of the obstacle, and of news by link (the time from which each vehicle may act on information about each
+        other one), exist only if some world needs them.
+        """
         v, (n, N) = worlds.vehicles, worlds.speeds_mps.shape
         none = np.zeros((n, 3 * (N - 1)))
         state = [
@@ -97,34 +105,39 @@ class Packed(NamedTuple):
 
     @property
     def column(self) -> Columns:
-        """Where each group begins."""
+        """First column of each group of quantities in these rows."""
         return _known_columns((self.state.shape[1] + 4) // 8)
 
     @property
     def has_obstacle(self) -> bool:
-        """Whether the rows have columns of an obstacle."""
+        """Whether the rows have columns for an obstacle."""
         return bool(self.state.shape[1] > self.column.obstacle)
 
     @property
     def has_news(self) -> bool:
-        """Whether the rows have columns of news by link."""
+        """Whether the rows have columns for news by link: when each vehicle may act on information about others."""
         return bool(self.params.shape[1] > self.column.own_latency)
 
     @property
     def has_messages(self) -> bool:
-        """Whether the rows have columns of periodic messages."""
+        """Whether the rows have columns for periodic messages."""
         return bool(self.params.shape[1] > self.column.messages)
 
     @property
     def builds_up(self) -> bool:
-        """Whether brakes of some world build up."""
+        """Whether the brakes of some vehicle build up, that is, at a finite rate."""
         column = self.column
         return bool(np.isfinite(self.params[:, column.brake_rate : column.own_latency]).any())
 
     def widened(self, obstacle: bool, news: bool) -> Packed:
-        """The rows with columns of an obstacle, and of news by link, where that is wanted.
+        """Return the rows with columns for an obstacle, and for news by link, if requested and not there yet.
 
-        Where there were none, they say that there is no obstacle, and that all news comes at the own latency.
+        The new columns say that there is no obstacle, and that each vehicle knows everything from its own latency on.
+
+        Args:
+            obstacle: add the columns of an obstacle.
+            news: add the columns of news by link.
+
         """
         (state, params), column = self, self.column
         if obstacle and not self.has_obstacle:
@@ -136,7 +149,10 @@ class Packed(NamedTuple):
         return Packed(state, params)
 
     def worlds(self, vehicles: Vehicles | None = None) -> Worlds:
-        """The worlds, in their own memory but for ``vehicles``, if they are given as they were unpacked."""
+        """Unpack the worlds into new arrays.
+
+        ``vehicles``: parameters to use in the result; None: unpack them too.
+        """
         (state, params), column, far = self, self.column, not self.has_obstacle
         return Worlds(
             self._vehicles() if vehicles is None else vehicles,
@@ -169,14 +185,18 @@ class Packed(NamedTuple):
 
     @property
     def known_from_s(self) -> Floats:
-        """``Vehicles.known_from_s`` [n, N, N] of these rows, in its own memory."""
+        """Time from which vehicle i acts on news of vehicle j, [n, N, N] s, as a new array."""
         column = self.column
         if not self.has_news:
             return Vehicles.known_at_once(self.params[:, column.latency : column.mass].copy())
         return self.params[:, column.news : column.messages].copy().reshape(-1, column.vehicles, column.vehicles)
 
     def ledger(self) -> tuple[Floats, Floats, Ints, Floats, Floats, Ints]:
-        """Since the episode began: both harms and impacts of each pair, [n, P] each; of the obstacle, [n] each."""
+        """Return six arrays: harm and impacts since the start of the episode, for the pairs and for the obstacle.
+
+        First-impact harm (m2/s2), total harm (m2/s2) and number of impacts of each pair, [n, P] each; then the same
+        three for the obstacle, [n] each.
+        """
         state, column, pairs = self.state, self.column, self.column.vehicles - 1
         first, total, count = (state[:, at : at + pairs].copy() for at in range(column.harm, column.obstacle, pairs))
         of_obstacle = Impacts.no_obstacle(len(state))

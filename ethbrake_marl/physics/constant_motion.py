@@ -1,4 +1,7 @@
-"""Motion under constant accelerations: forces, the next event, the move to it. Compiled."""
+"""Motion of one world under constant accelerations: set the accelerations, find the next event, move to it. Compiled.
+
+The kernels work on a ``table`` in the layout of ``physics.rows``: a row per quantity, a column per vehicle or pair.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,10 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(bare=True)
 def accelerate(table: Floats) -> None:
-    """Accelerations in force, touching vehicles coupled; marks the pairs that move as one body."""
+    """Set the acceleration of every vehicle, coupling touching ones, and mark the pairs that move as one body.
+
+    Reads speeds, commands and gaps of ``table``; writes the rows ACCELERATION and JOINED.
+    """
     vehicles = table.shape[1]
     for i in range(vehicles):
         wanted = table[ROW.COMMAND, i] * table[ROW.ACTIVE, i]
@@ -39,7 +45,18 @@ def accelerate(table: Floats) -> None:
 
 @compiled(bare=True)
 def next_event(table: Floats, now: float, end: float) -> float:
-    """Time from ``now`` to the next event, at most ``end - now``; fills the candidates of each vehicle and pair."""
+    """Return the time from ``now`` to the next event, at most ``end - now`` (s).
+
+    An event is a contact, a vehicle that comes to rest or reaches its speed limit, or a command that takes effect. Also
+    writes into the table when each vehicle next comes to rest or reaches its speed limit, and when each pair comes into
+    contact.
+
+    Args:
+        table: one world in the layout of ``physics.rows``, after ``accelerate``.
+        now: present time, counted from the start of the segment, s.
+        end: end of the segment, s.
+
+    """
     vehicles = table.shape[1]
     soonest = end - now
     for i in range(vehicles):
@@ -64,7 +81,11 @@ def next_event(table: Floats, now: float, end: float) -> float:
 
 @compiled(bare=True)
 def move(table: Floats, duration: float) -> bool:
-    """Move to the next event, putting event values exactly; False when a gap became impossible."""
+    """Move the world of ``table`` to its next event, ``duration`` (s) later; return False if a contact was missed.
+
+    Quantities that reach an event are set to its exact value: a gap to 0, a speed to 0 or the speed limit. A missed
+    contact shows as a negative gap.
+    """
     sound = True
     for p in range(table.shape[1] - 1):
         if table[ROW.CONTACT_TIME, p] <= duration:
@@ -83,7 +104,11 @@ def move(table: Floats, duration: float) -> bool:
 
 @compiled(bare=True)
 def move_speeds(table: Floats, duration: float) -> None:
-    """Speeds after ``duration``: one value for each joined body, and a pair in contact differs by its closing speed."""
+    """Set the speeds of ``table`` to those after ``duration`` (s), before or at the next event.
+
+    Vehicles that move as one body get one common speed; the speeds of a pair that comes into contact differ exactly by
+    its closing speed.
+    """
     vehicles = table.shape[1]
     first = 0
     while first < vehicles:

@@ -1,8 +1,8 @@
-"""Exponential, logarithm and normal quantile from sums, products, quotients and square roots alone.
+"""Exponential, logarithm and normal quantile, computed only with + - * / and sqrt, to equal bits on every machine.
 
-The C library and numpy choose their own exp, log and pow by processor, with other last bits on each. These take the
-same IEEE operations in the same order everywhere, so the worlds of a list are the same bits on any machine. Each
-error bound is the largest error that a comparison with 40 digits found, rounded up
+The C library and numpy choose implementations of exp, log and pow by processor, which differ in the last bits. The
+functions here do the same IEEE operations in the same order everywhere, so a list of worlds has the same bits on any
+machine. Each error bound is the largest error in a comparison with 40 digits, rounded up
 (tests/physics/test_compiling.py).
 """
 
@@ -17,7 +17,7 @@ from ethbrake_marl.physics.state import Floats
 
 PER_LN2 = 1.4426950408889634
 
-_LN2_HIGH = 0.693147180369123816490  # its last 32 bits are 0: times a whole number below 2^32 it is exact
+_LN2_HIGH = 0.693147180369123816490  # its last 32 bits are 0, so its product with a whole number below 2^32 is exact
 
 _LN2_LOW = 1.90821492927058770002e-10
 
@@ -25,13 +25,13 @@ _SQRT2 = 1.4142135623730951
 
 _PER_SQRT_2PI = 0.3989422804014327
 
-_LARGEST_EXPONENT = 709.782712893384  # of e; from here on the result is beyond the doubles
+_LARGEST_EXPONENT = 709.782712893384  # e to this power, or more, overflows a double
 
-_LEAST_EXPONENT = -708.0  # below, 0: what is smaller than 3e-308 plays no part here
+_LEAST_EXPONENT = -708.0  # below this exp returns 0 instead of a number under 3e-308
 
 _EXP = tuple(1.0 / math.factorial(k) for k in range(13, -1, -1))  # Taylor's series, highest power first
 
-_LOG = tuple(2.0 / k for k in range(25, 1, -2))  # of 2 artanh(s) / s - 2 in s^2, highest power first
+_LOG = tuple(2.0 / k for k in range(25, 1, -2))  # series of 2 artanh(s) / s - 2 in s^2, highest power first
 
 # x = q (sqrt(2 pi) + q^2 P(q^2)) for q = p - 1/2 up to 1/4; else x = C - t N(t) / Q(t) - r for r = sqrt(-2 ln p): one
 # set for t = r - 1.65 up to r = 4, one for t = r - 4 up to 10.3. Fitted to quantiles of 60 digits at Chebyshev nodes.
@@ -69,14 +69,14 @@ _NEAR, _NEAR_C = 1.65, 0.9953300906244928
 
 _FAR, _FAR_C = 4.0, 0.5988073438553344
 
-_LEAST_PROBABILITY = 1e-22  # a normal of a scenario draws no smaller one: 2^-53 of the mass that it must hold at least
+_LEAST_PROBABILITY = 1e-22  # scenarios draw no smaller probability: 2^-53 times the least mass of a normal
 
-_FRACTIONS = 150  # of the continued fraction: from 2 on the rest is below 1e-17
+_FRACTIONS = 150  # terms of the continued fraction: for x >= 2 its remainder is below 1e-17
 
 
 @compiled
 def _polynomial(coefficients: tuple[float, ...], x: float) -> float:
-    """Horner's rule, highest power first."""
+    """Evaluate the polynomial with these coefficients (highest power first) at ``x``, by Horner's rule."""
     total = 0.0
     for coefficient in coefficients:
         total = total * x + coefficient
@@ -85,7 +85,7 @@ def _polynomial(coefficients: tuple[float, ...], x: float) -> float:
 
 @compiled
 def power_of_two(k: int) -> float:
-    """``2^k``, exactly, for k from -1022 to 1023."""
+    """Return ``2^k`` exactly, for k from -1022 to 1023."""
     base, power = (2.0, k) if k >= 0 else (0.5, -k)
     found = 1.0
     while power > 0:
@@ -98,13 +98,16 @@ def power_of_two(k: int) -> float:
 
 @compiled
 def exp_rest(x: float, k: int) -> float:
-    """``e^x / 2^k`` for the k that leaves ``|x - k ln(2)| <= ln(2) / 2``: Taylor's series to the 13th power (5e-18)."""
+    """Return ``e^x / 2^k``; pass the whole number k nearest to ``x / ln 2``.
+
+    Taylor's series to the 13th power of ``x - k ln 2``, which lies within ``ln(2) / 2`` of 0; relative error 5e-18.
+    """
     return _polynomial(_EXP, (x - k * _LN2_HIGH) - k * _LN2_LOW)
 
 
 @compiled
 def exp(x: float) -> float:
-    """``e^x`` within 1.5 ulp; infinite above 709.78, 0 below -708.
+    """Return ``e^x`` within 1.5 ulp; infinite above 709.78, 0 below -708.
 
     ``e^x = 2^k e^(x - k ln 2)`` with k whole.
     """
@@ -118,9 +121,11 @@ def exp(x: float) -> float:
 
 @compiled
 def _log_parts(x: float) -> tuple[float, float]:
-    """``ln x`` for finite x > 0 as an exact multiple of a constant and a small rest.
+    """Return two numbers whose sum is ``ln x``, for a finite x > 0, more accurate than one number could be.
 
-    ``x = 2^k m`` with m around 1, and ``ln m = 2 artanh(s)`` with ``s = (m - 1) / (m + 1)``, its first terms apart.
+    With ``x = 2^k m`` and m between ``sqrt(1/2)`` and ``sqrt(2)``, the first number is k times the leading bits of
+    ``ln 2``, without rounding. The second is the rest of ``k ln 2``, plus ``ln m = 2 artanh((m - 1) / (m + 1))`` by its
+    series.
     """
     k, m = 0, x
     while m >= _SQRT2:
@@ -138,16 +143,17 @@ def _log_parts(x: float) -> tuple[float, float]:
 
 @compiled
 def log(x: float) -> float:
-    """``ln x`` of a finite x > 0 within 1 ulp."""
+    """Return ``ln x`` of a finite x > 0 within 1 ulp."""
     whole, rest = _log_parts(x)
     return whole + rest
 
 
 @compiled
 def normal_quantile(p: float) -> float:
-    """The x below which a standard normal number is with probability p, within 1.5 ulp; p is kept within 1e-22 of 0.
+    """Return the quantile x of a standard normal: its probability of being below x is p. Within 1.5 ulp.
 
-    In the tails ``r = sqrt(-2 ln p)`` is carried in two parts, of which the first has 24 bits, so its square is exact.
+    p is clipped to [1e-22, 1 - 1e-22]. In the tails ``r = sqrt(-2 ln p)`` is the sum of two numbers. The first has 24
+    bits, so its square is exact.
     """
     q = p - 0.5
     if abs(q) <= 0.25:
@@ -170,9 +176,9 @@ def normal_quantile(p: float) -> float:
 
 @compiled
 def normal_probability(x: float) -> float:
-    """Probability that a standard normal number is below x, within 1e-13 of itself (x > -30).
+    """Return the probability that a standard normal number is below x; relative error 1e-13 for x > -30.
 
-    Up to 2 the series ``1/2 - phi(x) (x + x^3 / 3 + x^5 / 15 + ...)``, beyond it the continued fraction
+    For ``|x| <= 2`` by the series ``1/2 - phi(x) (x + x^3 / 3 + x^5 / 15 + ...)``, beyond by the continued fraction
     ``phi(x) / (x + 1 / (x + 2 / (x + ...)))``.
     """
     a = abs(x)
@@ -194,7 +200,7 @@ def normal_probability(x: float) -> float:
 
 @compiled
 def exp_each(values: Floats) -> Floats:
-    """``exp`` of each of ``values`` [n]."""
+    """Return ``e^x`` of each entry x of ``values`` [n], as ``exp`` computes it, [n]."""
     found = np.empty(len(values))
     for i in range(len(values)):
         found[i] = exp(values[i])
@@ -203,7 +209,7 @@ def exp_each(values: Floats) -> Floats:
 
 @compiled
 def normal_quantile_each(values: Floats) -> Floats:
-    """``normal_quantile`` of each of ``values`` [n]."""
+    """Return the standard normal quantile of each probability in ``values`` [n], by ``normal_quantile``, [n]."""
     found = np.empty(len(values))
     for i in range(len(values)):
         found[i] = normal_quantile(values[i])
@@ -211,5 +217,5 @@ def normal_quantile_each(values: Floats) -> Floats:
 
 
 def logistic(values: Floats) -> Floats:
-    """``1 / (1 + e^-x)`` of each of ``values``, in their shape."""
+    """Return ``1 / (1 + e^-x)`` of each x in ``values``, in the same shape."""
     return 1.0 / (1.0 + exp_each(-values.ravel()).reshape(values.shape))

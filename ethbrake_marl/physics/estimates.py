@@ -1,4 +1,4 @@
-"""Estimates of a vehicle over a channel of periodic messages: where the others are, and how old its news is."""
+"""A vehicle's estimate of the others' states, from the newest periodic messages, which may be old."""
 
 from __future__ import annotations
 
@@ -13,11 +13,19 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled
 def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> None:
-    """Fill ``out`` [n, S] with the worlds as one vehicle takes them to be now, from what it was told.
+    """Fill ``out`` with the worlds as vehicle ``observer`` estimates them from the messages it has received.
 
-    Of whom it knows: the newest place and speed, moved on with the command of then, as if alone. A pair whose two
-    vehicles it sees now has its true gap; the own pairs' hit flags are its own. Who is not known stands in the place of
-    the next one towards the observer, at rest: nothing of it is left.
+    For a vehicle that the observer knows: the newest received place and speed, extrapolated alone under the command
+    received with them. A pair in which the observer sees both vehicles at present has its true gap. Hit flags are known
+    for the observer's own pairs only. A vehicle that the observer does not know is put at rest, at the place of the
+    next vehicle towards the observer, so that it gives no information.
+
+    Args:
+        state: true state rows of the worlds, [n, S], in the layout of ``physics.columns``.
+        params: their parameter rows, with the columns of messages.
+        observer: index of the observing vehicle, from 0.
+        out: result, [n, S], in the layout of ``state``. Worlds without periodic messages get their true state.
+
     """
     column = columns(state)
     N, gap, speed, command, obstacle = column.vehicles, column.gap, column.speed, column.command, column.obstacle
@@ -56,7 +64,17 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
 
 @compiled
 def moved_on(speed: float, command: float, limit: float, duration: float) -> tuple[float, float]:
-    """Speed and way of a vehicle alone after ``duration`` under a command in force; one moving backward brakes too."""
+    """Return speed (m/s) and distance (m) of a vehicle alone after ``duration`` (s) under a command in force.
+
+    A vehicle that moves backward brakes, whatever the sign of its command.
+
+    Args:
+        speed: present speed, m/s; may be negative.
+        command: acceleration in force, m/s2; negative brakes.
+        limit: speed up to which the vehicle drives, m/s.
+        duration: length of the motion, s.
+
+    """
     if speed >= 0.0:
         after, way, _ = solo_motion(speed, command, 0.0, limit, duration)
         return after, way
@@ -67,9 +85,15 @@ def moved_on(speed: float, command: float, limit: float, duration: float) -> tup
 
 @compiled
 def move_on(speed: Floats, command: Floats, onset: Floats, limit: Floats, duration: Floats) -> tuple[Floats, Floats]:
-    """Speeds and ways, each [n, N], of vehicles alone after ``duration``, the command acting from ``onset`` (s) on.
+    """Return speeds (m/s) and distances (m) of vehicles alone after ``duration`` (s), [n, N] each.
 
-    All are [n, N], speeds not below 0.
+    Args:
+        speed: present speeds, [n, N] m/s, at least 0.
+        command: commands, [n, N] m/s2; negative brakes.
+        onset: time from now until the command takes effect, [n, N] s.
+        limit: speed up to which each vehicle drives, [n, N] m/s.
+        duration: length of the motion, [n, N] s.
+
     """
     after, way = np.empty(speed.shape), np.empty(speed.shape)
     for k in range(speed.shape[0]):

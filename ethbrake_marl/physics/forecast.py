@@ -1,6 +1,6 @@
-"""The forecast of constant commands: the physics of ``advance``, for many candidate commands of one vehicle.
+"""Forecast of harm under constant commands, for many candidate commands of one vehicle.
 
-Nothing of the motion is kept, only the harm, so a candidate costs little more than its events.
+Uses the physics of ``advance``. Only harm is kept, not the motion, so a candidate costs little more than its events.
 """
 
 from __future__ import annotations
@@ -19,13 +19,21 @@ from ethbrake_marl.physics.state import Bools, Floats, Worlds
 def forecast(
     worlds: Worlds, command_mps2: Floats, vehicle: int, candidates_mps2: Floats, until_s: float
 ) -> tuple[Floats, Floats]:
-    """First-impact and total harm from now to ``until_s`` if ``vehicle`` held each candidate command, [n, K] each.
+    """Return first-impact and total harm until ``until_s`` if ``vehicle`` held each candidate command.
 
-    Harm is that of all pairs and of the obstacle ahead, if there is one.
-    ``command_mps2`` [n, N] are the other vehicles' commands (the vehicle's own column is ignored);
-    ``candidates_mps2`` [n, K]. Worlds at or beyond ``until_s`` have no harm left. Pairs hit before do not count
-    again in first-impact harm. Raises ``InvalidInput`` for shapes that do not fit or a candidate beyond capacity,
-    ``PhysicsError`` naming the worlds in which a check of the kernel failed.
+    Both results are [n, K] in m2/s2. Harm is summed over all pairs and the obstacle ahead, if there is one. A world at
+    or after ``until_s`` has harm 0. A pair that was hit before adds no first-impact harm.
+
+    Args:
+        worlds: n worlds of N vehicles.
+        command_mps2: commands of all vehicles, [n, N] m/s2; the column of ``vehicle`` is ignored.
+        vehicle: index of the vehicle, from 0.
+        candidates_mps2: K candidate commands for it in each world, [n, K] m/s2.
+        until_s: absolute end of the forecast, s.
+
+    Raises ``InvalidInput`` for arrays of wrong shape or a candidate beyond capacity; ``PhysicsError`` with the worlds
+    in which a check of the kernel failed.
+
     """
     n, N = worlds.speeds_mps.shape
     if command_mps2.shape != (n, N) or candidates_mps2.ndim != 2 or candidates_mps2.shape[0] != n:
@@ -63,12 +71,21 @@ def forecast_worlds(
     in_force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats, first: Floats, total: Floats,
     failed: Bools,
 ) -> None:  # fmt: skip
-    """Fill ``first`` and ``total`` [n, K], and ``failed`` [n] where a check failed.
+    """Simulate every world with each candidate command; fill ``first`` and ``total`` [n, K] with the harm (m2/s2).
 
-    ``ahead`` [n] is where an obstacle is, ``FAR_AWAY_M`` for none; empty where no world has one.
+    ``first`` and ``total`` must be 0 on entry. Arguments that are not listed are fields of ``Worlds`` and ``Vehicles``
+    under short names, for example ``gaps`` for ``gaps_m``.
+
+    - ``ahead``: gap to an obstacle, [n] m, ``FAR_AWAY_M`` in a world without one; empty if no world has one.
+    - ``command``: commands of all vehicles, [n, N] m/s2; the column of ``vehicle`` is ignored.
+    - ``vehicle``: index of the vehicle that tries the candidates, from 0.
+    - ``candidates``: K candidate commands for it in each world, [n, K] m/s2.
+    - ``until_s``: absolute end of the forecast, s.
+    - ``in_force``: accelerations in force at the start, [n, N] m/s2.
+    - ``failed``: set to True where a check of the kernel failed, [n].
     """
     n, vehicles = speeds.shape
-    at = min(ahead.shape[0], 1)  # vehicle i stands in column at + i, behind an obstacle
+    at = min(ahead.shape[0], 1)  # vehicle i is column at + i; an obstacle is column 0
     table = np.zeros((rows_for(pieces.shape[2]), at + vehicles))
     no_rows = np.empty((0, LISTED.WIDTH))
     for k in range(n):

@@ -1,17 +1,17 @@
-"""Impacts and resting contact of touching vehicles: one order-free law for both.
+"""Impacts and resting contact of touching vehicles, resolved together by one law that does not depend on an order.
 
-Pairs resolved one after another give results that depend on their order. Here a whole cluster of touching
-vehicles is resolved at once by a mass-weighted isotonic regression ``P`` (pool adjacent violators):
+Resolving pairs one after another gives results that depend on the order. Here a *cluster*, a run of touching vehicles,
+is resolved at once by a mass-weighted isotonic regression ``P`` (pool adjacent violators):
 
 * impact: ``v+ = (1 + e) P(v-) - e v-``; for two vehicles this is the paper's eq. (13);
-* resting contact: accelerations are ``P`` of the vehicles' own ones, a block's common acceleration being
-  ``sum(m u) / sum(m)``; forces that hold (brakes at rest) enter as a range, so a block at rest moves only when
-  pushed harder than its braked members hold.
+* resting contact: the accelerations are ``P`` of the vehicles' own accelerations; a pooled block accelerates with
+  ``sum(m u) / sum(m)``. Forces that hold (brakes at rest) enter as a range, so a block at rest moves only if the push
+  exceeds what its braked members can hold.
 
-Vehicles are ordered front to rear; feasible means that no vehicle is faster than the one before it.
+Vehicles are ordered front to rear; a result is feasible if no vehicle is faster than the one in front of it.
 
-The kernels work on one table of floats for one world, ``table[row, vehicle or pair]``; the rows are named here. (One
-array is cheap to hand from function to function; twenty small ones cost more than the physics.)
+The kernels work on one table of floats per world, ``table[row, vehicle or pair]``, with the rows of ``physics.rows``.
+One array is cheap to pass from function to function; passing twenty small ones costs more than the physics.
 """
 
 from __future__ import annotations
@@ -26,11 +26,20 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(bare=True)
 def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) -> int:
-    """Mass-weighted isotonic regression of vehicles ``first..last`` (inclusive) into row ``out``; the number of blocks.
+    """Give touching vehicles values with which none is faster than the vehicle in front; return the number of blocks.
 
-    Rows ``low`` and ``high`` bound each vehicle's own value (equal for an ordinary one). All members of a pooled
-    block get the same bits. Rows BLOCK_* describe the blocks. A vehicle of infinite mass (``obstacle``) stands, and
-    so does its block.
+    A vehicle that would be faster than the one in front is pooled with it into a *block*, whose vehicles all get the
+    same value: the mean weighted by mass (isotonic regression). The values are written to row ``out``, and rows BLOCK_*
+    describe the blocks. A vehicle of infinite mass (the obstacle) stands still, and so does its block.
+
+    Args:
+        table: one world in the layout of ``physics.rows``.
+        low: row with the lower bound of each vehicle's value (a speed or an acceleration).
+        high: row with the upper bound; the same row as ``low`` for an exactly known value.
+        first: column of the front vehicle of the touching run.
+        last: column of its rear vehicle.
+        out: row that receives the results.
+
     """
     count = 0
     for i in range(first, last + 1):
@@ -63,13 +72,20 @@ def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) ->
 def resolve_cluster(table: Floats, restitution: float, first: int, last: int) -> None:
     """Replace the speeds of touching vehicles ``first..last`` by their speeds after the impact.
 
-    One restitution holds per world, so clusters never mix two; the cluster is plastic when its largest closing speed
-    is below ``PLASTIC_SPEED_MPS``. A block's common speed is refined by the mean of what is left over, so the momentum
-    error stays within 4 eps of ``sum(m |v|)`` whatever the masses; a vehicle that nobody strikes keeps its bits.
+    Nothing bounces (restitution 0) if the largest closing speed is below ``PLASTIC_SPEED_MPS``. The vehicles fall into
+    blocks with one common speed before the bounce (``pool``). This speed is corrected by the mean of the remaining
+    error, so the momentum error stays within 4 eps of ``sum(m |v|)`` for any masses. A vehicle that is not struck keeps
+    its bits.
 
-    The exact blocks are ordered, their refined speeds only up to rounding. A plastic cluster is therefore put in order
-    at the end (front to rear, nobody faster than the one before): then no pair approaches any more, and the instant has
-    no further round. Without it two blocks can hand the last bit to and fro for ever.
+    Corrected speeds are ordered only up to rounding. So if nothing bounces, each speed is finally limited to that of
+    the vehicle in front. Without this step two blocks could exchange a rounding error forever.
+
+    Args:
+        table: one world in the layout of ``physics.rows``.
+        restitution: coefficient of restitution of every impact.
+        first: column of the front vehicle.
+        last: column of the rear vehicle.
+
     """
     largest = 0.0
     for p in range(first, last):
@@ -94,9 +110,10 @@ def resolve_cluster(table: Floats, restitution: float, first: int, last: int) ->
 
 @compiled(bare=True)
 def resolve_impacts(table: Floats, restitution: float) -> bool:
-    """One round of impacts of one world: every cluster that holds an approaching pair, once. False if there is none.
+    """Resolve, once, every run of touching vehicles in which some pair approaches; return False if no pair approaches.
 
-    Rows CLOSING, BEFORE and STRUCK tell what happened. CONTACT_SPEED is used up.
+    ``table``: one world in the layout of ``physics.rows``; ``restitution``: coefficient of restitution in [0, 1].
+    Updates SPEED, writes the rows CLOSING, BEFORE and STRUCK of this round of impacts, and clears CONTACT_SPEED.
     """
     pairs = table.shape[1] - 1
     approaching = False
@@ -130,7 +147,16 @@ def resolve_impacts(table: Floats, restitution: float) -> bool:
 
 @compiled(bare=True)
 def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recorded: int) -> int:
-    """Add the last round of impacts to the harm, and to the list of impacts."""
+    """Add the last round of impacts to the harm rows and to the list ``rows``; return the new number of impacts.
+
+    Args:
+        table: one world in the layout of ``physics.rows``, after ``resolve_impacts``.
+        time_s: time of the impacts, s.
+        world: number to write into the list for this world.
+        rows: list of impacts, [capacity, LISTED.WIDTH]; impacts beyond its capacity are only counted.
+        recorded: number of impacts counted so far.
+
+    """
     for p in range(table.shape[1] - 1):
         if table[ROW.STRUCK, p] == 0.0:
             continue

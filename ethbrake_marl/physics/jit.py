@@ -1,12 +1,13 @@
-"""The one way in which this package compiles a kernel: strict floating point, kept safely for later processes.
+"""``compiled``, the decorator of all compiled kernels: strict floating point, and a cache that is safe to share.
 
-numba's own cache goes by a function's own file: editing a *callee* in another file would silently keep the stale
-machine code; and its index, which is read, changed and written back, is not safe where processes share a folder.
+Numba's own cache has two problems. Its key is the function's own file, so an edit to a *callee* in another file would
+keep the old machine code in use. And its index file is read, changed and written back, which is not safe if processes
+share a folder.
 
-Here each kernel and signature has one file, named by all that makes it: a hash of the sources, of the versions, of the
-signature and of the processor, and nothing of where the package lies. An edit compiles anew what can call it, and a
-second environment or a moved checkout finds what the first one compiled. There is no index. A file is written under
-another name and renamed when it is whole, so any number of processes may share a folder.
+Here each kernel and signature has one file. Its name is a hash of everything that determines the code: sources,
+versions, signature and processor, but not the location of the package. An edit recompiles exactly the kernels that can
+reach it, and a second environment or a moved checkout reuses the kernels of the first. There is no index. A file is
+written under a temporary name and renamed when complete, so any number of processes may share a folder.
 """
 
 from __future__ import annotations
@@ -48,13 +49,13 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 _OPTIONS = {"nopython": True, "boundscheck": None, "fastmath": False, "nogil": True, "error_model": "numpy"}
 
-_KNOWN = numba.__version__.startswith("0.68.")  # of others these inner parts were not tried: numba goes its own way
+_KNOWN = numba.__version__.startswith("0.68.")  # other versions are untested with numba's internals: use plain numba
 
-_SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DEBUGINFO_DEFAULT")  # numba's, of the code made
+_SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DEBUGINFO_DEFAULT")  # change the code
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
-_MARK = b"\n@compiled"  # of a decorator, at the start of its line
+_MARK = b"\n@compiled"  # the decorator at the start of a line
 
 _IMPORT = re.compile(rb"^ *from (ethbrake_marl[.\w]*) import (\([^)]*\)|.*)$", re.MULTILINE)
 
@@ -62,7 +63,7 @@ _CONSTANT = re.compile(r"\b[A-Z][A-Z0-9_]*\b")
 
 _DIGEST_BYTES = 32
 
-_LONGEST_WAIT_S = 600.0  # for another process that compiles the same kernel: it may have been stopped
+_LONGEST_WAIT_S = 600.0  # for another process that compiles the same kernel
 
 _UNKEPT = "each process compiles for itself; set the clock, or their dates (find FOLDER -exec touch {} +)"
 
@@ -72,7 +73,7 @@ _loaded: list[str] = []
 
 
 class _Linkable(JITCodeLibrary):  # type: ignore[misc]
-    """The code of a kernel for those that call it, which make it a part of theirs: no machine code is made of it."""
+    """Code of a kernel that is only inlined into its callers: no machine code is generated for it."""
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()
@@ -80,10 +81,11 @@ class _Linkable(JITCodeLibrary):  # type: ignore[misc]
 
 
 class Kernel(CPUDispatcher):  # type: ignore[misc]
-    """A compiled function as numba's ``njit`` makes it, but for where its code is kept, and for what is not compiled.
+    """A compiled function like the result of numba's ``njit``, with its own cache and less to compile.
 
-    numba makes machine code, and two wrappers, of whatever one compiled function calls of others, though the caller
-    holds all of that code already; and it compiles once for each whole number that stands as an argument in a source.
+    Numba generates machine code and two wrappers for each compiled function that another one calls, although the caller
+    already contains its code. And it compiles once per integer literal that is passed as an argument. This class does
+    neither.
     """
 
     def __init__(self, *given: Any, **options: Any) -> None:
@@ -92,7 +94,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         self._linked: dict[tuple[Any, ...], Any] = {}  # types of the arguments -> signature, library, environments
 
     def compile(self, sig: Any) -> Any:
-        """The machine code for one signature: at hand, loaded, or compiled and kept."""
+        """Load or compile the machine code for one numba signature ``sig``, and return its entry point."""
         with global_compiler_lock:
             arguments, returned = normalize_signature(sig)
             if tuple(arguments) not in self.overloads:
@@ -106,7 +108,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         if not _KNOWN:
             return made.library.has_dynamic_globals, made._reduce()
         library = made.library
-        for environment in made._find_referenced_environments():  # of what it has linked: its own is set
+        for environment in made._find_referenced_environments():  # of the linked callees; its own is set already
             library.codegen.set_env(environment.env_name, environment)
         parts = list(made._replace(type_annotation="")._reduce())
         stub = "".join(f'define void @"{name}"() {{ ret void }}\n' for name in _symbols(library))
@@ -120,7 +122,10 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         self.add_overload(made)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """What another kernel that calls this one needs to know of it."""
+        """Return what numba needs to type a call of this kernel from another kernel (numba's own protocol).
+
+        ``args`` and ``kws`` are the numba types of the call's arguments.
+        """
         if not _KNOWN:
             return super().get_call_template(args, kws)
         pysig, folded = self._compiler.fold_argument_types(args, kws)
@@ -131,7 +136,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         return make_concrete_template(self.__name__, self.__name__, signatures), pysig, arguments, {}
 
     def get_overload(self, sig: Any) -> Any:
-        """By what the code for a signature is known to numba."""
+        """Return the key under which numba stores the code for the signature ``sig`` (numba's own protocol)."""
         return self._linked[tuple(normalize_signature(sig)[0])][1] if _KNOWN else super().get_overload(sig)
 
     def _compile_linked(self, arguments: tuple[Any, ...]) -> Any:
@@ -161,7 +166,15 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         self._linked[signature.args] = signature, library, environments
 
     def _obtain(self, way: str, kinds: tuple[Any, ...], make: Callable[[], Any], load: Callable[..., None]) -> None:
-        """Load what is kept under this name, or make and keep it, while no other process does."""
+        """Load a kernel from the cache, or make and cache it while no other process makes the same one.
+
+        Args:
+            way: ``"entry"`` for a kernel called from Python, ``"linked"`` for one called from other kernels.
+            kinds: numba types of the arguments, and for an entry also of the result.
+            make: compiles the kernel; returns whether it must not be cached, and its parts, which can be pickled.
+            load: takes these parts and makes the kernel usable in this process.
+
+        """
         name = self._name(way, kinds)
         kept = load_kernel(name)
         if kept is None:
@@ -175,7 +188,10 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         load(*pickle.loads(kept))
 
     def _name(self, way: str, kinds: tuple[Any, ...]) -> str:
-        """Name of a signature's file in the store; empty where not all that makes the code is known."""
+        """Return the cache file name for argument types ``kinds``; empty if the code's sources are not fully known.
+
+        ``way`` is ``"entry"`` for a kernel called from Python, ``"linked"`` for one called from other kernels.
+        """
         code, source = self.py_func.__code__, Path(self.py_func.__code__.co_filename)
         digest, own = digest_of_sources(source), digest_of_sources(Path(__file__))
         if not digest or not own or self.py_func.__closure__:
@@ -193,26 +209,27 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
 
 
 def _without_c_wrapper(flags: Any) -> Any:
-    """Python calls these functions, other kernels do, and nothing written in C."""
+    """Set numba's compiler ``flags`` to make no C wrapper: kernels are called from Python and other kernels only."""
     flags.no_cfunc_wrapper = _KNOWN
     return flags
 
 
 def _symbols(library: Any) -> list[str]:
-    """Names of what a library defines for callers from outside."""
+    """Return the names under which other kernels call the functions of ``library``, numba's code of one kernel."""
     return [function.name for function in library._final_module.functions if function.name.startswith("_ZN7cpython")]
 
 
 def _described(kind: Any) -> str:
-    """A type with the names of the fields that it and its parts have: of a named tuple numba's own name has none."""
+    """Return a text for a numba type ``kind``, with the field names of named tuples, which its own name omits."""
     parts = [_described(part) for part in getattr(kind, "types", ())]
     return f"{kind} {getattr(kind, 'fields', '')} {parts}"
 
 
 def load_kernel(name: str) -> bytes | None:
-    """What was kept under a name; nothing where it is missing, damaged, or not this user's or root's.
+    """Return the content of the cache file ``name`` (as ``keep_kernel`` wrote it); None if it cannot be used.
 
-    Who else could write there could have us run anything.
+    It cannot be used if it is missing or damaged, or if its owner is not this user or root: the owner matters because a
+    cached kernel is executed.
     """
     try:
         with (cache_folder() / name).open("rb") as file:
@@ -228,7 +245,7 @@ def load_kernel(name: str) -> bytes | None:
 
 
 def keep_kernel(name: str, content: bytes) -> None:
-    """Keep what ``load_kernel`` gives back; a disk that is full costs a warning, and the next process compiles anew."""
+    """Write ``content`` to the cache file ``name`` for ``load_kernel``; warn if that fails (for example, full disk)."""
     folder = cache_folder()
     try:
         handle, part = tempfile.mkstemp(dir=folder, prefix=".")
@@ -249,11 +266,11 @@ def _digest_of(name: str, content: bytes) -> bytes:
 
 @contextmanager
 def _alone(name: str) -> Iterator[None]:
-    """No other process that asks for the same name is inside meanwhile, unless the folder's disk knows no locks."""
+    """Context manager: hold a lock on the cache file ``name`` against other processes, if the file system can lock."""
     if not name:
         yield
         return
-    from filelock import FileLock, Timeout  # needed by who compiles only
+    from filelock import FileLock, Timeout  # imported here because only compiling needs it
 
     lock = FileLock(cache_folder() / f".{name}.lock", timeout=_LONGEST_WAIT_S)
     with suppress(Timeout, OSError, NotImplementedError):
@@ -268,10 +285,11 @@ def _alone(name: str) -> Iterator[None]:
 
 @cache
 def digest_of_sources(source: Path) -> str:
-    """Hash of all files that the kernels of one file may be made of; empty where that is not known.
+    """Return a hash of all files that the kernels in the file ``source`` may be compiled from; empty if not known.
 
-    That is so for code in no file (a shell), and for a file that was edited after this process began: its code may
-    have been read before. A date in the future cannot be told from that, and costs a warning.
+    It is not known for code outside a file (a shell), and for a file that was edited after this process started,
+    because the process may have imported the older version. A file dated in the future counts as edited, with a
+    warning.
     """
     digest = hashlib.sha256()
     for file in kernel_sources(source) if source.is_file() else ():
@@ -285,15 +303,15 @@ def digest_of_sources(source: Path) -> str:
 
 
 def _place_of(file: Path) -> str:
-    """Where a file lies inside this package, wherever that lies; of another file its whole path."""
+    """Return the path of ``file`` relative to this package's folder, or its full path if it lies elsewhere."""
     return file.relative_to(_PACKAGE).as_posix() if file.is_relative_to(_PACKAGE) else str(file)
 
 
 def kernel_sources(source: Path) -> list[Path]:
-    """The file, and all of this package that its kernels may be made of, sorted by name.
+    """Return the file ``source`` and all files of this package that its kernels may be compiled from, sorted by name.
 
-    These are the files with kernels that it imports, theirs, and so on; and files from which any of them imports a
-    constant (a name in capitals).
+    These are the files with kernels that it imports, directly or through other such files, and the files from which any
+    of them imports a constant (a name in capitals).
     """
     found, follow = {source}, [source]
     while follow:
@@ -306,7 +324,7 @@ def kernel_sources(source: Path) -> list[Path]:
 
 @cache
 def _imports(source: Path) -> list[tuple[Path, bool]]:
-    """The files with kernels or constants that a file imports, and whether they have kernels."""
+    """Return (file, whether it has kernels) for the files with kernels or constants that ``source`` imports."""
     found = []
     for module, names in _IMPORT.findall(source.read_bytes()):
         for imported, taken in _homes(module.decode(), set(re.findall(r"\w+", names.decode()))):
@@ -317,7 +335,11 @@ def _imports(source: Path) -> list[tuple[Path, bool]]:
 
 
 def _homes(module: str, names: set[str]) -> list[tuple[Path, set[str]]]:
-    """(file, names taken from it) for names of a module or, through its front door, of a folder."""
+    """Return (file, names defined there) for each file that the imported ``names`` come from.
+
+    ``module`` is the dotted name in the import: a module, or a folder whose ``__init__`` imports the names from
+    elsewhere.
+    """
     place = _PACKAGE.joinpath(*module.split(".")[1:])
     if place.with_suffix(".py").is_file():
         return [(place.with_suffix(".py"), names)]
@@ -337,21 +359,24 @@ def compiled(*, apart: bool = False, within: bool = False, bare: bool = False) -
 
 
 def compiled(function: Any = None, *, apart: bool = False, within: bool = False, bare: bool = False) -> Any:
-    """Compile a function with numba: no fast-math, no bounds checks, releases the GIL, cached on disk.
+    """Compile a function with numba: no fast-math, no bounds checks, no GIL, cached on disk.
 
-    What a kernel calls becomes part of it (``forceinline``): a call would count references to its arrays, atomically,
-    which cost more than half of the physics. ``apart``: calls of it stay calls, for what is large, shared, and seldom
-    called. Made part of every caller, such functions would be compiled once for each: minutes instead of seconds.
+    By default a kernel is inlined into its callers (``forceinline``). A real call would count references to its arrays,
+    atomically, which costs more than half of the physics.
 
-    ``within``: it is written into its callers before they are compiled, for a level of its own. ``forceinline`` still
-    counts references at each level through which an array is handed on; this does not.
+    Args:
+        function: the function, if the decorator is used without arguments.
+        apart: keep calls of this kernel as calls. For large, shared, rarely called kernels: inlined, they would be
+            compiled once per caller, which takes minutes instead of seconds.
+        within: inline this kernel into its callers before they are compiled. ``forceinline`` still counts references at
+            each level that passes an array on; ``within`` does not.
+        bare: compile without any reference counting. For kernels that neither create nor return arrays; the caller
+            holds them. A callee with ``forceinline`` still counts references unless it is bare too.
 
-    ``bare``: without any counting of references, for what makes no array and gives none back. Whoever calls it holds
-    the arrays. What is ``forceinline`` inside still counts them, unless it is bare, too.
     """
     if function is None:
         return partial(compiled, apart=apart, within=within, bare=bare)
-    config: Any = numba_config  # its settings are made at run time
+    config: Any = numba_config  # its attributes are set at run time
     if config.DISABLE_JIT:
         return function
     how: dict[str, Any] = {"inline": "always"} if within else {"forceinline": not apart}
@@ -364,10 +389,17 @@ Result = TypeVar("Result")
 
 
 def by_parts(work: Callable[[slice], Result], n: int, threads: int) -> list[Result]:
-    """Results of ``work`` on up to ``threads`` neighbouring parts of ``n`` rows, in order of the rows.
+    """Return the results of ``work`` on contiguous slices that divide the rows 0 to n - 1, in the order of the rows.
 
-    The first part is done by the caller's own thread, so 1 thread means no others. If parts fail, the error of the
-    first of them is raised after all have ended. Raises ``InvalidInput`` unless ``threads`` is a whole number >= 1.
+    There is one slice per thread, so up to ``threads`` results. The calling thread does the first slice, so
+    ``threads=1`` starts no thread. If slices fail, all others still end, and then the error of the first failed slice
+    is raised. Raises ``InvalidInput`` unless ``threads`` is a whole number >= 1.
+
+    Args:
+        work: function of a slice of the rows, called once per slice.
+        n: number of rows.
+        threads: largest number of threads.
+
     """
     check_whole_number("threads", threads, 1)
     parts = min(int(threads), n)

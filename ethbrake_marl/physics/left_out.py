@@ -1,4 +1,4 @@
-"""Worlds that cannot be advanced: left out, named, and never at the expense of the others."""
+"""Worlds that cannot be advanced are left out and reported; the results of the others do not change."""
 
 from __future__ import annotations
 
@@ -13,13 +13,20 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 Result = TypeVar("Result")
 
-LeftOutRows = tuple[tuple[int, str], ...]  # row of the batch that was given, why its world counts nowhere
+LeftOutRows = tuple[tuple[int, str], ...]  # row of each world that was left out, and why
 
 
 def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[Result, Ints, LeftOutRows]:
-    """What ``measure`` finds in those of ``n`` worlds in which it does not fail, their rows, and which were left out.
+    """Measure n worlds without those that fail; return the result, the rows that were measured, and the failed rows.
 
-    As ``leaving_out_failed``, but raises ``PhysicsError`` where no world is left.
+    Like ``leaving_out_failed``, but raises ``PhysicsError`` if every world fails. The failed rows come as (row,
+    reason), in ascending order.
+
+    Args:
+        measure: function of rows (indices of worlds, from 0 to n - 1); raises ``PhysicsError`` naming the worlds that
+            fail, numbered within these rows.
+        n: number of worlds.
+
     """
     found, rows, failed = leaving_out_failed(measure, np.arange(n))
     if found is None:
@@ -28,11 +35,16 @@ def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[
 
 
 def leaving_out_failed(work: Callable[[Ints], Result], rows: Ints) -> tuple[Result | None, Ints, dict[int, str]]:
-    """Result of ``work`` on those of ``rows`` in which it does not fail, these rows, and what went wrong in the others.
+    """Run ``work`` without the rows that fail; return its result, the rows it used, and the failures as row -> reason.
 
-    ``work`` takes rows of a batch and raises ``PhysicsError`` by the place in what it was given. As the result of a
-    world does not depend on its batch, it is simply done again without those that failed; each time there are fewer.
-    The result is None where no row is left.
+    A world's result does not depend on its batch, so ``work`` is simply repeated without the failed rows until none
+    fails. The result is None if no row is left.
+
+    Args:
+        work: function of rows of a batch; raises ``PhysicsError`` naming the worlds that fail, numbered within these
+            rows.
+        rows: indices of the worlds to begin with, [k].
+
     """
     failed: dict[int, str] = {}
     while len(rows):
@@ -47,30 +59,33 @@ def leaving_out_failed(work: Callable[[Ints], Result], rows: Ints) -> tuple[Resu
 
 @dataclass(frozen=True, slots=True)
 class ImpactRows:
-    """Every impact of a segment, by world and then by time; arrays [k]."""
+    """Every impact of a segment (an interval of constant commands), ordered by world and then by time; arrays [k]."""
 
-    world: Ints
-    pair: Ints  # -1: Vehicle 1 and the obstacle ahead
-    time_s: Floats  # since Vehicle 1 began to brake
-    closing_speed_mps: Floats  # immediately before, > 0
-    first: Bools  # the pair had no impact before
-    front_speed_change_mps: Floats  # of the pair's front vehicle in this cluster of impacts, >= 0
-    rear_speed_change_mps: Floats  # of its rear vehicle, usually negative
+    world: Ints  # row of the world in the batch
+    pair: Ints  # index of the pair; -1: Vehicle 1 and the obstacle ahead
+    time_s: Floats  # time since Vehicle 1 began to brake
+    closing_speed_mps: Floats  # just before the impact, > 0
+    first: Bools  # whether this is the pair's first impact
+    front_speed_change_mps: Floats  # change of the front vehicle's speed in this round of impacts, >= 0
+    rear_speed_change_mps: Floats  # change of the rear vehicle's speed, usually negative
 
 
 @dataclass(frozen=True, slots=True)
 class Impacts:
-    """What happened in a segment. Harm of a pair's impact is its squared closing speed (m2/s2)."""
+    """Harm and number of impacts in a segment (a time interval of constant commands).
 
-    first_impact_harm: Floats  # [n, P] only impacts of pairs that had none before
-    total_harm: Floats  # [n, P] every impact
-    count: Ints  # [n, P]
-    obstacle_first_harm: Floats  # [n] the same of Vehicle 1's impacts with the obstacle ahead
-    obstacle_total_harm: Floats  # [n]
-    obstacle_count: Ints  # [n]
-    rows: ImpactRows | None = None  # only when recorded
+    The harm of an impact is its squared closing speed, in m2/s2. Pair p is (vehicle p, vehicle p + 1).
+    """
+
+    first_impact_harm: Floats  # [n, P] harm of each pair's first impact of the episode, if it is in this segment
+    total_harm: Floats  # [n, P] harm of every impact
+    count: Ints  # [n, P] number of impacts
+    obstacle_first_harm: Floats  # [n] first-impact harm of Vehicle 1 with the obstacle ahead
+    obstacle_total_harm: Floats  # [n] total harm of Vehicle 1 with the obstacle
+    obstacle_count: Ints  # [n] number of impacts of Vehicle 1 with the obstacle
+    rows: ImpactRows | None = None  # every single impact; None if not recorded
 
     @staticmethod
     def no_obstacle(n: int) -> tuple[Floats, Floats, Ints]:
-        """Harm, by both counts, and impacts of ``n`` worlds without an obstacle."""
+        """Return zeros for the three obstacle fields of n worlds: first-impact harm, total harm and count, [n] each."""
         return np.zeros(n), np.zeros(n), np.zeros(n, np.int64)

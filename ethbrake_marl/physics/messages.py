@@ -1,20 +1,21 @@
-"""Periodic messages: what has been told to whom, how old it is, and where it lets a vehicle think the others are.
+"""Periodic messages: what each vehicle has received from each other one, and how old it is.
 
-A vehicle samples its state at every decision moment, back to the alert. A message carries its sender's newest sample.
-On each link one is sent every period, and the channel of the link is good or bad (Gilbert-Elliott): after the first
-message that arrived it turns bad with probability p and good again with r, per message; one that is sent while it is
-bad is lost. Chance is a pure function of the world's key, the link and the number of the message, whatever the batch
-and the step. A neighbour in sight is measured: what is known of it is the present.
+A vehicle samples its state at every decision, starting at the alert. A message carries the sender's newest sample. On
+each link a message is sent every period. The link's channel is good or bad (Gilbert-Elliott): after the first message
+that arrives it turns bad with probability p per message, and good again with probability r. A message sent while the
+channel is bad is lost. The random numbers are a pure function of the world's key, the link and the message's number, so
+they do not depend on the batch or the step. A neighbour in sight is measured, so its present state is known.
 
-Columns, for N vehicles, behind the news in the parameters (``physics.batch.Columns``); they are the memory of the
-channel and change as it speaks. The period is 0 in a world without periodic messages: there the present is known.
+For N vehicles the messages use these columns of the parameters, after the news (``physics.columns.Columns``). They are
+the memory of the channel and change while it is in use. A world without periodic messages has period 0: there the
+present state is known.
 
-head    period (s), delay from sending to use (s), p, r, key (a whole number below 2^53), samples taken, place of the
-        obstacle ahead (m; infinite: there is none)
-place   N, where each vehicle is now (m; 0 is the front of Vehicle 1 at the alert, lengths not counted)
-links   N * N times LINK columns, receiver by receiver
-ring    the newest samples: RING_HEAD + 3 N columns each: time, whether Vehicle 1 has hit the obstacle, and the places,
-        speeds and commands in force of all vehicles
+head    period (s), delay from sending to use (s), p, r, key (a whole number below 2^53), number of samples taken, place
+        of the obstacle ahead (m; infinite: none)
+place   N, present place of each vehicle (m; 0 is the front of Vehicle 1 at the alert, vehicle lengths not counted)
+links   N * N times the columns of ``_Link``, ordered by receiver, then sender
+ring    the newest samples in a ring buffer, RING_HEAD + 3 N columns each: time, whether Vehicle 1 has hit the obstacle,
+        and places, speeds and commands in force of all vehicles
 """
 
 from __future__ import annotations
@@ -35,89 +36,104 @@ from ethbrake_marl.physics.state import Bools, Floats, Worlds
 
 
 class _Channel(NamedTuple):
-    """The head: one entry for all links of a world."""
+    """Column numbers of the head of the messages: quantities that all links of a world share."""
 
-    PERIOD: int = 0
-    DELAY: int = 1
-    LOSS_BEGINS: int = 2
-    LOSS_ENDS: int = 3
-    KEY: int = 4
-    TAKEN: int = 5
-    OBSTACLE_PLACE: int = 6
-    WIDTH: int = 7
+    PERIOD: int = 0  # time between two messages of a link (s); 0: the world has no periodic messages
+    DELAY: int = 1  # time from sending a message to its use (s)
+    LOSS_BEGINS: int = 2  # probability per message that a good channel turns bad
+    LOSS_ENDS: int = 3  # probability per message that a bad channel turns good again
+    KEY: int = 4  # seed of the message losses, a whole number below 2^53
+    TAKEN: int = 5  # number of samples taken so far
+    OBSTACLE_PLACE: int = 6  # place of the obstacle ahead (m); infinite: none
+    WIDTH: int = 7  # number of columns of the head
 
 
 CHANNEL = _Channel()
 
 
 class _Link(NamedTuple):
-    """Entries of a link, from the vehicle that sends to the one that hears it."""
+    """Column numbers of a link, which is one direction between two vehicles, from a sender to a receiver."""
 
-    NEXT_SENT: int = 0  # when its next message is sent that is not dealt with (s); infinite: it carries none
-    NUMBER: int = 1  # of that message, counted from the first one that arrives, which is 0
+    NEXT_SENT: int = 0  # when the next unprocessed message is sent (s); infinite: no messages on this link
+    NUMBER: int = 1  # number of that message; 0 is the first message that arrives
     BAD: int = 2  # 1 while the channel is bad
-    SEEN_FROM: int = 3  # from when on the receiver measures the sender (s); infinite: never
-    TOLD_S: int = 4  # when the newest state that arrived was sampled (s); below 0: none has
-    TOLD_PLACE: int = 5
-    TOLD_SPEED: int = 6
-    TOLD_COMMAND: int = 7
-    TOLD_HIT: int = 8  # whether Vehicle 1 had hit the obstacle by then
-    WIDTH: int = 9
+    SEEN_FROM: int = 3  # time from which the receiver measures the sender (s); infinite: never
+    TOLD_S: int = 4  # when the newest received state was sampled (s); below 0: nothing received
+    TOLD_PLACE: int = 5  # place of the sender in that state (m)
+    TOLD_SPEED: int = 6  # speed of the sender in that state (m/s)
+    TOLD_COMMAND: int = 7  # acceleration in force of the sender in that state (m/s2)
+    TOLD_HIT: int = 8  # 1 if Vehicle 1 had hit the obstacle at that time, else 0
+    WIDTH: int = 9  # number of columns of a link
 
 
 LINK = _Link()
 
 RING_HEAD = 2
 
-POST_M = 1e6  # so far ahead of Vehicle 1 an obstacle is out of reach; it makes the way of Vehicle 1 the change of a gap
+POST_M = 1e6  # gap to a dummy obstacle out of reach; the change of this gap is the distance that Vehicle 1 travels
 
 _ON_GRID = 1e-9
 
 
 @compiled
 def place_at(vehicles: int) -> int:
-    """First column of the places, counted from the head."""
+    """Return the column at which the places of the vehicles begin, counted from the first column of the messages.
+
+    A place is a position along the road (m). ``vehicles``: number N of vehicles.
+    """
     return CHANNEL.WIDTH
 
 
 @compiled
 def link_at(receiver: int, sender: int, vehicles: int) -> int:
-    """First column of a link, counted from the head."""
+    """Return the first column of the link from ``sender`` to ``receiver`` (vehicle numbers from 0).
+
+    Columns are counted from the first column of the messages; ``vehicles`` is N.
+    """
     return CHANNEL.WIDTH + vehicles + LINK.WIDTH * (receiver * vehicles + sender)
 
 
 @compiled
 def ring_at(vehicles: int) -> int:
-    """First column of the ring, counted from the head."""
+    """Return the first column of the ring buffer of samples, counted from the first column of the messages.
+
+    ``vehicles`` is N.
+    """
     return CHANNEL.WIDTH + vehicles + LINK.WIDTH * vehicles * vehicles
 
 
 class Told(NamedTuple):
-    """The newest state that a vehicle was told of each other one, [n, N] each; views of the columns."""
+    """Newest state of each vehicle that one receiving vehicle has received, by message or by sight.
 
-    at_s: Floats  # when it was sampled; below 0: never
-    place_m: Floats
-    speed_mps: Floats
-    command_mps2: Floats
-    obstacle_hit: Floats  # 1 where Vehicle 1 had hit the obstacle by then
-    own_place_m: Floats  # [n] where the vehicle is
-    obstacle_place_m: Floats  # [n] where the obstacle ahead is
+    Arrays are [n, N] unless stated otherwise, with column j for sender j; they are views of the columns.
+    """
+
+    at_s: Floats  # time at which the state was sampled (s); below 0: nothing received
+    place_m: Floats  # front of vehicle j in that state; 0 is the front of Vehicle 1 at the alert (m)
+    speed_mps: Floats  # speed of vehicle j in that state (m/s)
+    command_mps2: Floats  # acceleration in force of vehicle j in that state (m/s2)
+    obstacle_hit: Floats  # 1 if Vehicle 1 had hit the obstacle at that time
+    own_place_m: Floats  # [n] present place of the receiving vehicle (m)
+    obstacle_place_m: Floats  # [n] place of the obstacle ahead (m); infinite: none
 
 
 class Messages(NamedTuple):
-    """What periodic messages have told whom, in n worlds."""
+    """Periodic messages of n worlds: what each vehicle has received from the others, and the channel's settings."""
 
-    columns: Floats  # [n, M]; M is 0 without periodic messages
-    vehicles: int
+    columns: Floats  # [n, M] the columns that the module describes; M is 0 without periodic messages
+    vehicles: int  # number N of vehicles in a line
 
     @classmethod
     def of(cls, worlds: Worlds) -> Messages:
-        """Those of these worlds."""
+        """Return the messages of ``worlds``, as a view of their columns."""
         return cls(worlds.messages, worlds.N)
 
     @staticmethod
     def ring_length(delay_s: float, time_step_s: float) -> int:
-        """Samples that a message may still carry when it arrives: those of its delay, and one at each end."""
+        """Return the number of samples to store: those taken during a message's delay, and one at each end.
+
+        ``delay_s``: time from sending a message to its use (s); ``time_step_s``: time between two samples (s).
+        """
         return math.ceil(delay_s / time_step_s - _ON_GRID) + 3
 
     @classmethod
@@ -125,17 +141,17 @@ class Messages(NamedTuple):
         cls, heard_s: Floats, seen_s: Floats, key: Floats, samples: int, *, period_s: float, delay_s: float,
         loss_begins: float, loss_ends: float,
     ) -> Messages:  # fmt: skip
-        """The columns before any message is sent.
+        """Return the messages of n worlds at the alert (time 0), before any message is sent.
 
         Args:
-            heard_s: when the first message of vehicle j is of use to vehicle i, [n, N, N]; infinite: never.
-            seen_s: from when on i measures j, [n, N, N]; infinite: never.
-            key: [n], a whole number below 2^53, by which later messages are lost or not.
-            samples: in the ring, see ``ring_length``.
-            period_s: between two messages of a link.
-            delay_s: from sending a message to its use.
+            heard_s: time at which vehicle i can first use a message of vehicle j, [n, N, N] s; infinite: never.
+            seen_s: time from which vehicle i measures vehicle j, [n, N, N] s; infinite: never.
+            key: seed of the message losses, [n], whole numbers below 2^53.
+            samples: length of the ring buffer, see ``ring_length``.
+            period_s: time between two messages of a link, s.
+            delay_s: time from sending a message to its use, s.
             loss_begins: probability that a good channel turns bad, per message.
-            loss_ends: probability that a bad one turns good again.
+            loss_ends: probability that a bad channel turns good again, per message.
 
         """
         n, N = heard_s.shape[:2]
@@ -150,27 +166,31 @@ class Messages(NamedTuple):
 
     @property
     def links(self) -> Floats:
-        """The columns of every link, [n, N, N, LINK]: a view."""
+        """Columns of every link, [n, N, N, LINK.WIDTH], by world, receiver, sender and entry (``LINK``); a view."""
         N = self.vehicles
         return self.columns[:, link_at(0, 0, N) : ring_at(N)].reshape(-1, N, N, LINK.WIDTH)
 
     @property
     def periodic(self) -> Bools:
-        """In which worlds messages go on after the first one, so that what is known grows old, [n]."""
+        """Whether a world sends messages periodically, so that knowledge of others ages between them, [n]."""
         return np.asarray((self.columns[:, CHANNEL.PERIOD : CHANNEL.PERIOD + 1] > 0.0).any(axis=1))
 
     def newest_told(self, vehicle: int) -> Told:
-        """What ``vehicle`` was last told, in worlds with columns of messages."""
+        """Return the newest state of every vehicle that ``vehicle`` (index from 0) has received.
+
+        All worlds must have columns of messages.
+        """
         own, obstacle = self.columns[:, place_at(self.vehicles) + vehicle], self.columns[:, CHANNEL.OBSTACLE_PLACE]
         told = self.links[:, vehicle]
         at_s, place, speed, command, hit = (told[..., entry] for entry in range(LINK.TOLD_S, LINK.WIDTH))
         return Told(at_s, place, speed, command, hit, own, obstacle)
 
     def age_s(self, time_s: Floats) -> Floats:
-        """How old what vehicle i was last told of vehicle j is at ``time_s`` [n], [n, N, N] s: since it was sampled.
+        """Return the age at ``time_s`` [n] of the newest state that vehicle i received from vehicle j, [n, N, N] s.
 
-        0 without periodic messages, where the present is known; infinite where nothing has been told yet. Whether i may
-        act on it is another question (``Vehicles.known_from_s``).
+        Age is counted from when the state was sampled. It is 0 in worlds without periodic messages, where the present
+        state is known, and infinite if nothing was received yet. ``Vehicles.known_from_s`` says from when on vehicle i
+        may act on it.
         """
         age, periodic = np.zeros((len(time_s), self.vehicles, self.vehicles)), self.periodic
         if periodic.any():
@@ -182,7 +202,16 @@ class Messages(NamedTuple):
 
 @compiled
 def chance(key: float, link: int, number: float) -> float:
-    """A number in [0, 1) of message ``number`` of a link in the world of this key: 53 bits of a SplitMix64 hash."""
+    """Return a random number in [0, 1) that decides whether a message is lost; a pure function of its arguments.
+
+    The number has 53 bits of a SplitMix64 hash.
+
+    Args:
+        key: seed of the message losses in this world, a whole number below 2^53.
+        link: number of the link, ``receiver * N + sender``.
+        number: number of the message on this link, from 0.
+
+    """
     z = np.uint64(key) ^ (np.uint64(link + 1) * np.uint64(0x9E3779B97F4A7C15))
     z ^= np.uint64(number + 1.0) * np.uint64(0xD1342543DE82EF95)
     for _ in range(2):
@@ -197,12 +226,22 @@ def hear_rows(
     moving: Floats, params: Floats, wanted: Floats, until_s: Floats, decision_s: Floats, time_step_s: float,
     pieces: Floats,
 ) -> None:  # fmt: skip
-    """Take the messages' columns of every world from its time in ``moving`` to ``until_s`` [n], in place.
+    """Advance the messages, and with them the state, of every world from its present time to ``until_s``, in place.
 
-    ``moving`` [n, S] are the worlds as they were, and go along; ``wanted`` [n, N] is what the vehicles want meanwhile;
-    ``pieces`` [N, 2 K] as in ``Vehicles``.
-    Samples are taken every ``time_step_s``, counted back from the next decision at ``decision_s`` [n]; who stops before
-    it measures the present, and that sample is not kept. A world that cannot be advanced hears nothing.
+    A sample of all vehicles is taken at every multiple of ``time_step_s`` before the next decision. A world that ends
+    between two samples measures the present at its end; that sample is not stored. If the kernel cannot advance a
+    world, the world receives nothing more.
+
+    Args:
+        moving: state rows of the worlds at the start, [n, S], in the layout of ``physics.columns``; advanced too.
+        params: their parameter rows, whose columns of messages are updated.
+        wanted: commands of the vehicles in the meantime, [n, N] m/s2.
+        until_s: end times, [n] s.
+        decision_s: time of the next decision, [n] s.
+        time_step_s: time between decisions, s.
+        pieces: start (s) and command (m/s2) of the K intervals of a fixed sequence of commands, [N, 2 K], equal in all
+            worlds; see ``Vehicles.pieces``.
+
     """
     column = columns(moving)
     N, head = column.vehicles, column.messages
@@ -230,7 +269,18 @@ def hear_rows(
 
 @compiled
 def _start(state: Floats, params: Floats, column: Columns, wanted: Floats) -> None:
-    """Places and the first sample, at the alert."""
+    """Begin the messages of one world at the alert. Updates the rows ``state`` and ``params``.
+
+    Sets the place of each vehicle along the road, stores the first sample of all states, and lets each vehicle measure
+    the vehicles in sight.
+
+    Args:
+        state: state row of one world, [S].
+        params: its parameter row.
+        column: first column of each group of quantities in the two rows.
+        wanted: commands of the vehicles, [N] m/s2.
+
+    """
     N, obstacle, gap, force = column.vehicles, column.obstacle, column.gap, column.command
     told, place = params[column.messages :], place_at(N)
     told[place] = 0.0
@@ -251,7 +301,22 @@ def _move(
     state: Floats, params: Floats, column: Columns, wanted: Floats, end: float, pieces: Floats, table: Floats,
     no_rows: Floats,
 ) -> bool:  # fmt: skip
-    """One world moved to ``end``, its places included; False, and nothing moved, where the kernel cannot."""
+    """Advance one world, and the places of its vehicles, to the time ``end``; return whether the kernel succeeded.
+
+    After a failure nothing has changed.
+
+    Args:
+        state: state row of the world, [S]; updated.
+        params: its parameter row; its places are updated.
+        column: first column of each group of quantities in the two rows.
+        wanted: commands of the vehicles, [N] m/s2.
+        end: time to advance to, s.
+        pieces: start (s) and command (m/s2) of the K intervals of a fixed sequence of commands, [N, 2 K]; see
+            ``Vehicles.pieces``.
+        table: workspace in the layout of ``physics.rows``, N + 1 columns; overwritten.
+        no_rows: empty list of impacts, [0, LISTED.WIDTH].
+
+    """
     N, time = column.vehicles, state[column.time]
     speed, command, gap, obstacle = column.speed, column.command, column.gap, column.obstacle
     with_obstacle = state.shape[0] > obstacle and state[obstacle] < math.inf
@@ -291,7 +356,10 @@ def _move(
 
 @compiled
 def _sample(state: Floats, told: Floats, column: Columns) -> None:
-    """Every vehicle takes a sample of its state, over the oldest one."""
+    """Store a sample of every vehicle's state, over the oldest sample of the ring buffer.
+
+    ``state``: state row of one world, [S]; ``told``: its columns of messages, updated; ``column``: layout of the state.
+    """
     N, obstacle = column.vehicles, column.obstacle
     width, first = RING_HEAD + 3 * N, ring_at(N)
     at = first + width * (int(told[CHANNEL.TAKEN]) % ((told.shape[0] - first) // width))
@@ -306,13 +374,16 @@ def _sample(state: Floats, told: Floats, column: Columns) -> None:
 
 @compiled
 def _receive(time: float, told: Floats, N: int) -> None:
-    """Deal with every message that is of use by now, and measure who is in sight."""
+    """Process every message of one world that can be used by ``time`` (s), and measure the vehicles in sight.
+
+    ``told``: columns of messages of the world, updated; ``N``: number of vehicles.
+    """
     for i in range(N):
         for j in range(N):
             link = link_at(i, j, N)
             while told[link + LINK.NEXT_SENT] + told[CHANNEL.DELAY] <= time + _ON_GRID:
                 u, bad = chance(told[CHANNEL.KEY], i * N + j, told[link + LINK.NUMBER]), told[link + LINK.BAD] == 1.0
-                if told[link + LINK.NUMBER] > 0.0:  # the first one did arrive
+                if told[link + LINK.NUMBER] > 0.0:  # message 0 always arrives
                     bad = u >= told[CHANNEL.LOSS_ENDS] if bad else u < told[CHANNEL.LOSS_BEGINS]
                     told[link + LINK.BAD] = 1.0 if bad else 0.0
                 if not bad:
@@ -325,7 +396,18 @@ def _receive(time: float, told: Floats, N: int) -> None:
 
 @compiled
 def _take(told: Floats, link: int, sender: int, sent_s: float, N: int) -> None:
-    """A message that was sent at ``sent_s`` arrives: the sender's newest sample of then."""
+    """Receive one message: copy the sender's newest sample from the ring buffer to the link.
+
+    It is the newest sample taken at ``sent_s`` or earlier. Nothing changes if the receiver already has a newer one.
+
+    Args:
+        told: columns of messages of one world; updated.
+        link: first column of the link, see ``link_at``.
+        sender: index of the sending vehicle, from 0.
+        sent_s: time at which the message is sent, s.
+        N: number of vehicles.
+
+    """
     width, first = RING_HEAD + 3 * N, ring_at(N)
     length = (told.shape[0] - first) // width
     taken = int(told[CHANNEL.TAKEN])

@@ -1,7 +1,7 @@
-"""Closed-form times of the events that end a segment of constant acceleration.
+"""Closed-form times of the events that bound motion under constant acceleration, and distances to stop.
 
-Between events every quantity is a quadratic in time, so the first event is found exactly and none is missed.
-Only + - * / and sqrt are used: the same world gives the same bits in any batch.
+Between events every quantity is a quadratic in time, so the first event is found exactly and none is missed. Only
++ - * / and sqrt are used, so a world gives the same bits in any batch.
 """
 
 from __future__ import annotations
@@ -16,25 +16,30 @@ from ethbrake_marl.physics.state import Floats
 
 
 class _Bounds(NamedTuple):
-    """Where one rule of the physics ends and another begins."""
+    """Thresholds at which the physics changes from one rule to another."""
 
-    TOUCH_SPEED_MPS: float = 1e-5  # a contact at or below this closing speed is a touch: no impact, no harm
+    TOUCH_SPEED_MPS: float = 1e-5  # contact at this closing speed or less is a touch: no impact, no harm
     PLASTIC_SPEED_MPS: float = 0.05  # a cluster whose largest closing speed is below this does not bounce
-    PENETRATION_M: float = 1e-9  # a gap below minus this means that a contact was missed
-    MOST_EVENTS: int = 1_000_000  # per world and segment; reached by a defect of the kernel (160,000 were seen)
-    FAR_AWAY_M: float = 1e300  # of no obstacle where others of a batch have one: nothing comes near, no bit changes
+    PENETRATION_M: float = 1e-9  # a gap below minus this value means that a contact was missed
+    MOST_EVENTS: int = 1_000_000  # per world and segment; more means a defect of the kernel (largest seen: 160,000)
+    FAR_AWAY_M: float = 1e300  # gap of a world without an obstacle in a batch with obstacles: unreachable
 
 
 BOUND = _Bounds()
 
-ONSET_ROUNDING_S = 1e-9  # a latency that elapses this close before the end of an interval elapses at its end
+ONSET_ROUNDING_S = 1e-9  # a latency that elapses this shortly before the end of an interval elapses at its end
 
 
 def has_acted(latency_s: Any, time_s: Any) -> Any:
-    """Whether a command acts in the interval from 0 to ``time_s``; numbers (in kernels) or arrays, s.
+    """Return whether a command has taken effect before the end of a time interval, for numbers (in kernels) or arrays.
 
-    A latency that elapses at the beginning of the interval counts, one that elapses at its end does not: there the next
-    decision replaces the command before it has acted.
+    A latency that elapses at the start of the interval counts. A latency that elapses at its end does not: the next
+    decision replaces the command before it acts.
+
+    Args:
+        latency_s: time from the start of the interval until the command takes effect, s; may be negative.
+        time_s: length of the interval, s.
+
     """
     return (latency_s <= 0.0) | (latency_s < time_s - ONSET_ROUNDING_S)
 
@@ -44,11 +49,17 @@ command_acts = compiled(has_acted)
 
 @compiled
 def contact(gap: float, closing: float, pressing: float) -> tuple[float, float]:
-    """Time to the first contact of a pair and the closing speed there, or ``(inf, 0)`` when there is none.
+    """Return the time to a pair's first contact (s) and the closing speed there (m/s); ``(inf, 0)`` if there is none.
 
-    With gap ``g >= 0``, closing speed ``w`` and closing acceleration ``b``: ``D = w^2 + 2 b g``;
-    ``w > 0``: none if ``D < 0``, else ``t = 2 g / (w + sqrt D)``; ``w <= 0``: only if ``b > 0``,
-    ``t = (-w + sqrt D) / b``. The closing speed at contact is ``sqrt D``; ``w + b t`` would cancel. [m, m/s, m/s2]
+    With ``D = w^2 + 2 b g``: for ``w > 0`` there is no contact if ``D < 0``, otherwise ``t = 2 g / (w + sqrt(D))``. For
+    ``w <= 0`` there is one only if ``b > 0``: ``t = (sqrt(D) - w) / b``. The closing speed at contact is computed as
+    ``sqrt(D)``; the equal ``w + b t`` would suffer cancellation.
+
+    Args:
+        gap: present gap g >= 0, m.
+        closing: present closing speed w (rear minus front), m/s.
+        pressing: constant closing acceleration b (rear minus front), m/s2.
+
     """
     if closing > 0.0:
         squared = closing * closing + 2.0 * pressing * gap
@@ -64,15 +75,30 @@ def contact(gap: float, closing: float, pressing: float) -> tuple[float, float]:
 
 @compiled
 def drift(gap: float, closing: float, pressing: float, duration: float) -> float:
-    """Gap after ``duration`` of constant closing acceleration: ``g - (w + b t / 2) t``. [m]"""
+    """Return the gap (m) after the time t at constant closing acceleration: ``g - (w + b t / 2) t``.
+
+    Args:
+        gap: present gap g, m.
+        closing: present closing speed w (rear minus front), m/s.
+        pressing: closing acceleration b (rear minus front), m/s2.
+        duration: t, s.
+
+    """
     return gap - (closing + 0.5 * pressing * duration) * duration
 
 
 @compiled
 def speed_event(speed: float, acceleration: float, command: float, limit: float) -> tuple[float, float]:
-    """Time until the speed next reaches a value where the forces change, and that value; ``(inf, 0)`` if never.
+    """Return the time (s) until the speed next reaches a value where forces change, and that value (m/s).
 
-    These values are standstill (brakes then hold) and, for a driving vehicle, its speed limit.
+    These values are standstill, where brakes hold, and the speed limit of a vehicle that drives. ``(inf, 0)``: never.
+
+    Args:
+        speed: present speed, m/s.
+        acceleration: constant acceleration, m/s2.
+        command: command in force, m/s2; positive drives.
+        limit: speed up to which the vehicle drives, m/s.
+
     """
     if acceleration == 0.0:
         return math.inf, 0.0
@@ -90,10 +116,16 @@ def speed_event(speed: float, acceleration: float, command: float, limit: float)
 
 @compiled
 def force_range(speed: float, command: float, limit: float) -> tuple[float, float]:
-    """Acceleration this vehicle's own forces give when it moves forward, and when it moves backward.
+    """Return a vehicle's own acceleration (m/s2) if it is about to move forward, and if it is about to move backward.
 
-    The two differ where the force is set-valued: brakes at standstill hold against a push from either side,
-    and a driving vehicle at its speed limit gives only as much drive as keeps it there.
+    The two differ where the force is set-valued: brakes at standstill hold against a push from either side, and a
+    driving vehicle at its speed limit drives only as much as keeps it there.
+
+    Args:
+        speed: present speed, m/s.
+        command: command in force, m/s2; negative brakes.
+        limit: speed up to which the vehicle drives, m/s.
+
     """
     if command < 0.0:
         if speed > 0.0:
@@ -111,7 +143,10 @@ def force_range(speed: float, command: float, limit: float) -> tuple[float, floa
 
 @compiled
 def settle(low: float, high: float) -> float:
-    """Acceleration of a free body whose forces range over ``[low, high]``: the value nearest to rest."""
+    """Return the acceleration of a body whose own forces allow ``[low, high]`` (m/s2): the value nearest to 0.
+
+    The body is a vehicle, or several that move as one.
+    """
     if low > 0.0:
         return low
     if high < 0.0:
@@ -123,10 +158,18 @@ def settle(low: float, high: float) -> float:
 def solo_motion(
     speed: float, command: float, onset: float, limit: float, duration: float
 ) -> tuple[float, float, float]:
-    """A vehicle on its own for ``duration``: coast until ``onset``, then brake to standstill or drive to the limit.
+    """Move a vehicle alone; return its final speed (m/s), its distance (m) and its acceleration (m/s2).
 
-    Returns the speed after it, the way, and the acceleration where that was constant all along (else NaN);
-    ``speed >= 0``. [m/s, m, m/s2]
+    It coasts until ``onset``, then brakes to standstill or drives up to the limit. The acceleration is NaN unless it
+    was constant throughout.
+
+    Args:
+        speed: present speed, m/s, at least 0.
+        command: command, m/s2; negative brakes.
+        onset: time from now until the command takes effect, s; 0 or less: at once.
+        limit: speed up to which the vehicle drives, m/s.
+        duration: length of the motion, s.
+
     """
     way = 0.0
     steady = command
@@ -151,17 +194,33 @@ def solo_motion(
 
 @compiled
 def stopping_distance(speed: float, latency_left: float, capacity: float) -> float:
-    """Distance to rest under full braking once the latency has elapsed: ``v tau + v^2 / (2 a)``, 0 if not moving on."""
+    """Return the distance (m) to rest under full braking after the remaining latency: ``v tau + v^2 / (2 a)``.
+
+    The distance is 0 if the vehicle does not move forward.
+
+    Args:
+        speed: present speed v, m/s.
+        latency_left: time tau until the brakes act, s.
+        capacity: largest deceleration a, m/s2.
+
+    """
     speed = max(speed, 0.0)
     return speed * latency_left + speed * speed / (2.0 * capacity)
 
 
 @compiled
 def ramped_stopping_distance(speed: float, latency_left: float, capacity: float, rate: float) -> float:
-    """``stopping_distance`` of brakes that build up from 0 at ``rate`` r (m/s3): with the capacity a it is
+    """Return the distance (m) to rest under full braking with brakes that build up from 0 at a constant rate.
 
-    ``v tau + v a / (2 r) - a^3 / (24 r^2) + v^2 / (2 a)``, and ``v tau + 2/3 v sqrt(2 v / r)`` where the vehicle stands
-    before its brakes are full, ``v < a^2 / (2 r)``.
+    It is ``v tau + v a / (2 r) - a^3 / (24 r^2) + v^2 / (2 a)``. If the vehicle stops before its brakes reach full
+    force, ``v < a^2 / (2 r)``, it is ``v tau + (2 / 3) v sqrt(2 v / r)``.
+
+    Args:
+        speed: present speed v, m/s.
+        latency_left: time tau until the brakes act, s.
+        capacity: largest deceleration a, m/s2.
+        rate: r, m/s3; infinite: the brakes act at once.
+
     """
     speed = max(speed, 0.0)
     if math.isinf(rate):
@@ -174,7 +233,15 @@ def ramped_stopping_distance(speed: float, latency_left: float, capacity: float,
 
 @compiled
 def stopping_distances(speed: Floats, latency_left: Floats, capacity: Floats, rate: Floats) -> Floats:
-    """``ramped_stopping_distance`` of n vehicles, each [n]."""
+    """Return the distance to rest under full braking of n vehicles, [n] m; see ``ramped_stopping_distance``.
+
+    Args:
+        speed: present speeds, [n] m/s.
+        latency_left: time until the brakes act, [n] s.
+        capacity: largest decelerations, [n] m/s2.
+        rate: rates at which brakes build up, [n] m/s3; infinite: at once.
+
+    """
     distance = np.empty(len(speed))
     for k in range(len(speed)):
         distance[k] = ramped_stopping_distance(speed[k], latency_left[k], capacity[k], rate[k])

@@ -1,31 +1,31 @@
-"""The paper's fixed-step map (eq. dynamics2): impacts are looked for, and take effect, at sample times only.
+"""The paper's fixed-step map (eq. dynamics2): impacts are detected, and take effect, at sample times only.
 
 With the sampling period h, one step of a vehicle with command u, from sample n to sample n + 1, is
 
     x(n + 1) = x(n) + h f(n) + h^2 / 2 u(n)
     v(n + 1) = f(n) + h u(n)
 
-where f(n) is the vehicle's speed after the impacts of sample n. A pair whose gap is <= 0 at a sample and which is
-closing exchanges velocity by the paper's eq. (13): for Vehicle 2 that is f = f1 after f3, the rear impact first, then
-the front impact with the already changed speed; the vehicle on the other side of the pair is updated with it.
+where f(n) is the vehicle's speed after the impacts of sample n. A pair with a gap <= 0 at a sample that is closing
+exchanges velocity by the paper's eq. (13). For Vehicle 2 that is f = f1 after f3: first the rear impact, then the front
+impact with the changed speed. The other vehicle of the pair is updated with it.
 
-How the paper's open points are read here:
+The paper leaves these points open; here they are read as follows:
 
-* f1 is handed the state that f3 has changed, so the closing speed of the front impact is the changed one. Its harm is
-  the square of that same speed; the printed J_harm takes the speeds before both, which differs only where both pairs
+* f1 gets the state that f3 has changed, so the closing speed of the front impact is the changed one. Its harm is the
+  square of that same speed. The printed J_harm uses the speeds before both impacts, which differs only if both pairs
   meet at one sample.
 * The printed f1 and f3 also act on overlapping vehicles that separate, which would pull them together again. The text
-  below eq. (13) asks for a positive relative velocity, and so does this map, for the exchange and for its harm.
-* Samples are at ``tau_2 + n h``, tau_2 being the latency of Vehicle 2. Before its first sample a world moves exactly
-  and no impact is looked for: the paper assumes that there is none.
-* The command of a step is the one in force at the sample that begins it (zero-order hold); a latency that ends
-  between two samples takes effect at the later one.
-* ``0 <= v <= v_max`` is a constraint on u in the paper and no part of its map. Here each command is cut to the
-  largest one that keeps the constraint at the next sample, for every vehicle. An impact can leave a negative speed;
-  clamping it would destroy momentum, so it stays, and brakes bring it to rest from below.
+  below eq. (13) asks for a positive relative velocity. This map requires it too, for the exchange and for its harm.
+* Samples are at ``tau_2 + n h``, where tau_2 is the latency of Vehicle 2. Before its first sample a world moves exactly
+  and no impact is detected: the paper assumes that there is none.
+* The command of a step is the one in force at the sample at its start (zero-order hold). A latency that ends between
+  two samples takes effect at the later one.
+* In the paper ``0 <= v <= v_max`` is a constraint on u and not part of the map. Here each command of every vehicle is
+  limited to the largest one that satisfies the constraint at the next sample. An impact can leave a negative speed.
+  Clamping it would violate conservation of momentum, so it stays, and brakes bring it to rest from below.
 
-Only N = 3 is defined by the paper. For any N, the pairs are treated once per sample, from the rear pair to the front
-pair. Gaps become negative between a contact and its sample and while vehicles overlap; nothing pushes them apart.
+The paper defines only N = 3. For any N, the pairs are treated once per sample, from the rear pair to the front pair.
+Gaps become negative between a contact and its sample and while vehicles overlap; nothing pushes the vehicles apart.
 Source: the paper, section "Optimization Problem".
 """
 
@@ -45,19 +45,27 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
 SHORTEST_STEP_S = 1e-6
 
-MOST_STEPS = 10**9  # of one call
+MOST_STEPS = 10**9  # largest number of steps in one call
 
-_ON_SAMPLE = 1e-6  # part of a step within which two times are one sample: time is rounded, the grid is not
+_ON_SAMPLE = 1e-6  # part of a step: times this close count as one sample, because times are rounded
 
 
 @compiled
 def exchange(
     front_mps: float, rear_mps: float, front_t: float, rear_t: float, restitution: float
 ) -> tuple[float, float]:
-    """Speeds of a pair after its impact, the paper's eq. (13).
+    """Return the speeds of a pair (front, rear) after its impact, by the paper's eq. (13), in m/s.
 
-    With w = v_{i+1} - v_i: ``v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})`` and
-    ``v_{i+1}+ = v_{i+1} - m_i (1 + e) w / (m_i + m_{i+1})``. [m/s, t]
+    With w = v_{i+1} - v_i: ``v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})`` and ``v_{i+1}+ = v_{i+1} - m_i (1 + e)
+    w / (m_i + m_{i+1})``.
+
+    Args:
+        front_mps: speed v_i of the front vehicle, m/s.
+        rear_mps: speed v_{i+1} of the rear vehicle, m/s.
+        front_t: mass m_i of the front vehicle, t.
+        rear_t: mass m_{i+1} of the rear vehicle, t.
+        restitution: coefficient of restitution e.
+
     """
     impulse = (1.0 + restitution) * (rear_mps - front_mps) / (front_t + rear_t)
     return front_mps + rear_t * impulse, rear_mps - front_t * impulse
@@ -68,10 +76,22 @@ def exchange_at_sample(
     k: int, gaps: Floats, speeds: Floats, mass: Floats, restitution: float, hit: Bools, first_harm: Floats,
     total_harm: Floats, count: Ints,
 ) -> None:  # fmt: skip
-    """The impacts of world ``k`` at a sample, from the rear pair to the front pair, each counted in the ledger.
+    """Apply the impacts of world ``k`` at a sample, from the rear pair to the front pair, and add their harm.
 
     As in ``advance``, harm is the squared closing speed of the impact itself, and a closing speed of at most
-    ``TOUCH_SPEED_MPS`` is a touch, which does none.
+    ``TOUCH_SPEED_MPS`` is a touch without harm.
+
+    Args:
+        k: row of the world in all arrays.
+        gaps: [n, P] m.
+        speeds: [n, N] m/s; updated.
+        mass: [n, N] t.
+        restitution: coefficient of restitution of this world.
+        hit: whether a pair has had an impact, [n, P]; updated.
+        first_harm: first-impact harm, [n, P] m2/s2; updated.
+        total_harm: harm of all impacts, [n, P] m2/s2; updated.
+        count: number of impacts, [n, P]; updated.
+
     """
     for p in range(gaps.shape[1] - 1, -1, -1):
         closing = speeds[k, p + 1] - speeds[k, p]
@@ -92,10 +112,17 @@ def exchange_at_sample(
 
 @compiled
 def held_motion(speed: float, command: float, limit: float, step: float) -> tuple[float, float]:
-    """Speed after a step of held command, and the way: ``v + h u`` and ``h v + h^2 / 2 u``. [m/s, m]
+    """Return speed (m/s) and distance (m) after a step of constant command: ``v + h u`` and ``h v + h^2 u / 2``.
 
-    u is the command, cut so that the speed ends on standstill or on its limit instead of beyond it. The way is written
-    as the mean of both speeds times h, which is the same for a constant u. Brakes act against the motion.
+    u is the command, limited so that the speed ends at standstill or at its limit instead of beyond it. The distance is
+    computed as h times the mean of both speeds, which is the same for constant u. Brakes act against the motion.
+
+    Args:
+        speed: speed v at the start, m/s; may be negative after an impact.
+        command: command, m/s2; negative brakes.
+        limit: speed up to which the vehicle drives, m/s.
+        step: length h of the step, s.
+
     """
     after = speed
     if command < 0.0:
@@ -107,7 +134,10 @@ def held_motion(speed: float, command: float, limit: float, step: float) -> tupl
 
 @compiled
 def held_speeds(speeds: Floats, command: Floats, limit: Floats, step: float) -> Floats:
-    """The speeds of ``held_motion`` after a step, [n, N] m/s."""
+    """Return the speeds after a step of constant command, [n, N] m/s; see ``held_motion``.
+
+    Speeds (m/s), commands (m/s2) and limits (m/s) are [n, N]; ``step`` is the length of the step in s.
+    """
     after = np.empty(speeds.shape)
     for k in range(speeds.shape[0]):
         for i in range(speeds.shape[1]):
@@ -119,7 +149,19 @@ def held_speeds(speeds: Floats, command: Floats, limit: Floats, step: float) -> 
 def move_to_grid(
     k: int, duration: float, time: float, gaps: Floats, speeds: Floats, command: Floats, latency: Floats, limit: Floats
 ) -> None:
-    """Exact motion of world ``k`` before its first sample, without impacts."""
+    """Move world ``k`` exactly, before its first sample and without impacts. Updates ``gaps`` and ``speeds``.
+
+    Args:
+        k: row of the world in all arrays.
+        duration: length of the motion, s.
+        time: present time, s.
+        gaps: [n, P] m; updated.
+        speeds: [n, N] m/s; updated.
+        command: [n, N] m/s2.
+        latency: time before which commands have no effect, [n, N] s.
+        limit: speed up to which each vehicle drives, [n, N] m/s.
+
+    """
     way_in_front = 0.0
     for i in range(speeds.shape[1]):
         after, way, _ = solo_motion(speeds[k, i], command[k, i], latency[k, i] - time, limit[k, i], duration)
@@ -135,7 +177,20 @@ def sample_worlds(
     last: Ints, latency: Floats, mass: Floats, limit: Floats, restitution: Floats, first_harm: Floats,
     total_harm: Floats, count: Ints,
 ) -> None:  # fmt: skip
-    """Take every world from its sample ``first`` to its sample ``last``, in place; -1 is the time before sample 0."""
+    """Advance every world by the paper's fixed-step map, from one sample to another, in place.
+
+    Sample 0 is at the latency of Vehicle 2. Arguments that are not listed are fields of ``Worlds`` and ``Vehicles``
+    under short names; ``gaps``, ``speeds``, ``time`` and ``hit`` are updated.
+
+    - ``command``: commands, [n, N] m/s2.
+    - ``until``: end times, [n] s; used only in a world that ends before sample 0.
+    - ``step``: sampling period, s.
+    - ``first``: number of the sample at which each world starts, [n]; -1: before sample 0.
+    - ``last``: number of the sample at which it ends, [n]; -1: before sample 0.
+    - ``first_harm``: first-impact harm, [n, P] m2/s2; updated.
+    - ``total_harm``: harm of all impacts, [n, P] m2/s2; updated.
+    - ``count``: number of impacts, [n, P]; updated.
+    """
     for k in range(speeds.shape[0]):
         start = latency[k, 1]
         begin = first[k]
@@ -161,18 +216,25 @@ def sample_worlds(
 def advance_sampled(
     worlds: Worlds, command_mps2: ArrayLike, *, until_s: ArrayLike, step_s: float = 0.1
 ) -> tuple[Worlds, Impacts]:
-    """Advance ``worlds`` by the paper's fixed-step map, each under its constant command, and report the impacts.
+    """Advance ``worlds`` by the paper's fixed-step map under constant commands; return new worlds and impacts.
 
-    ``command_mps2`` [n, N] is the signed acceleration each vehicle wants, ignored before its latency; ``until_s`` an
-    absolute time (scalar or [n]). Steps are whole: a world ends at its first sample at or after ``until_s``, or at
-    ``until_s`` itself where that is before its first sample. Impacts of the last sample belong to the next call, so
-    calls can be chained; the state returned is the paper's s(n), before them. ``Impacts.rows`` is None. The result of
-    a world does not depend on the batch it is in. Inputs are left alone.
+    Samples are ``step_s`` apart, the first one at the latency of Vehicle 2. A world ends at its first sample at or
+    after ``until_s``, or at ``until_s`` itself if that is before its first sample. Impacts of the last sample belong to
+    the next call, so calls can be chained; the returned state is the paper's s(n), before these impacts.
+    ``Impacts.rows`` is None. The result of a world does not depend on its batch. Inputs are not changed.
 
     Gaps of the result may be negative: it can be continued here, but not by ``advance``.
 
-    Raises ``InvalidInput`` for a command beyond a vehicle's capacity, an end before a world's time, a step below
-    1e-6 s, a world whose time is between two samples, negative speeds before the first sample, or an obstacle ahead.
+    Args:
+        worlds: n worlds of N vehicles.
+        command_mps2: commanded acceleration, [n, N] m/s2, ignored before a vehicle's latency.
+        until_s: absolute end time, one number or [n], s.
+        step_s: sampling period h, s.
+
+    Raises ``InvalidInput`` for a command beyond a vehicle's capacity, an end before a world's time, a step below 1e-6
+    s, a world whose time is between two samples, negative speeds before the first sample, brakes that build up or come
+    in pieces, or an obstacle ahead.
+
     """
     if worlds.obstacle_ahead.any():
         k = int(np.argmax(worlds.obstacle_ahead))
@@ -192,10 +254,20 @@ def advance_sampled(
 
 
 def sample_on(worlds: Worlds, command: Floats, until: Floats, step_s: float) -> Impacts:
-    """``advance_sampled`` of what it would accept, in place; it checks nothing, and leaves ``command_mps2`` alone."""
+    """Advance ``worlds`` in place by the paper's fixed-step map, without checks, and return the impacts.
+
+    Like ``advance_sampled``; ``command_mps2`` of the worlds is not updated.
+
+    Args:
+        worlds: n worlds of N vehicles; updated.
+        command: commanded accelerations, [n, N] m/s2.
+        until: absolute end times, [n] s.
+        step_s: sampling period, s.
+
+    """
     vehicles = worlds.vehicles
     start = vehicles.latency_s[:, 1]
-    position, end = (worlds.time_s - start) / step_s, (until - start) / step_s  # times on the grid may be rounded
+    position, end = (worlds.time_s - start) / step_s, (until - start) / step_s  # times of samples may be rounded
     first = np.where(position < -_ON_SAMPLE, -1.0, np.rint(position)).astype(np.int64)
     last = np.where(end < -_ON_SAMPLE, -1.0, np.ceil(end - _ON_SAMPLE)).astype(np.int64)
     gaps, time = worlds.gaps_m, worlds.time_s
@@ -208,7 +280,10 @@ def sample_on(worlds: Worlds, command: Floats, until: Floats, step_s: float) -> 
 
 
 def _refuse_unsampled(worlds: Worlds, until: Floats, step_s: float) -> None:
-    """Refuse a step, an end or a state that the map does not know."""
+    """Raise ``InvalidInput`` for a step length, an end time or a state that the fixed-step map does not cover.
+
+    ``until``: end times, [n] s; ``step_s``: sampling period, s.
+    """
     if not (SHORTEST_STEP_S <= step_s < math.inf):
         raise InvalidInput(f"step_s = {step_s:g}: must be finite and at least {SHORTEST_STEP_S:g} s")
     good = (until >= worlds.time_s) & (until <= worlds.time_s + MOST_STEPS * step_s)

@@ -1,5 +1,7 @@
-"""Brakes in pieces: from its onset on such a vehicle has the command of the piece in force, whatever else it is told.
-Its world moves as one in which brakes build up, at rates that may be infinite.
+"""Braking in pieces: from its onset on, a vehicle follows a fixed sequence of commands instead of the given command.
+
+A *piece* is a time interval of constant command. The world is advanced like one with brake build-up, whose rates may be
+infinite.
 """
 
 from __future__ import annotations
@@ -14,7 +16,11 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(bare=True)
 def begin_piece(table: Floats, i: int, now: float) -> None:
-    """Give vehicle ``i`` the command of its piece at ``now`` (s from the segment's start), and plan the next one."""
+    """Set the command of vehicle ``i`` to that of its piece (interval of constant command) at the time ``now``.
+
+    Also writes down when its next piece begins (row NEXT_PIECE). Times are in seconds from the start of the segment.
+    ``table``: one world in the layout of ``physics.rows``.
+    """
     count = (table.shape[0] - ROW.PIECES) // 2
     table[ROW.NEXT_PIECE, i] = math.inf
     for piece in range(count):
@@ -27,7 +33,10 @@ def begin_piece(table: Floats, i: int, now: float) -> None:
 
 @compiled(bare=True)
 def pieces_to_come(table: Floats) -> bool:
-    """Whether some vehicle's next piece is still to begin."""
+    """Return whether some vehicle has a piece (interval of constant command) that has not begun yet.
+
+    ``table``: one world in the layout of ``physics.rows``.
+    """
     if table.shape[0] > ROW.OF_BUILD_UP:
         for i in range(table.shape[1]):
             if table[ROW.NEXT_PIECE, i] < math.inf:
@@ -37,15 +46,34 @@ def pieces_to_come(table: Floats) -> bool:
 
 @compiled(bare=True)
 def force_at(table: Floats, i: int, command: float, latency_s: float, time_s: float) -> float:
-    """The force of vehicle ``i`` at ``time_s``, the end of a segment; no command acts before its latency. [m/s2]"""
+    """Return the force (m/s2) of a vehicle at the end of a segment.
+
+    The force is the acceleration by brakes or engine; before the latency has elapsed the command counts as 0.
+
+    Args:
+        table: the world at the end of the segment, in the layout of ``physics.rows``.
+        i: column of the vehicle.
+        command: its command in the segment, m/s2.
+        latency_s: time before which its commands have no effect, s.
+        time_s: end of the segment, s, counted like ``latency_s``.
+
+    """
     acts = command_acts(latency_s, time_s)
     if not builds_up(table):
         return command if acts else 0.0
-    wanted = table[ROW.COMMAND, i] if acts else 0.0  # of its piece, where it brakes in pieces
+    wanted = table[ROW.COMMAND, i] if acts else 0.0  # the command of its piece, if it brakes in pieces
     return force_now(table[ROW.FORCE, i], wanted, table[ROW.BRAKE_RATE, i], table[ROW.RELEASE_RATE, i])
 
 
 @compiled
 def force_now(force: float, wanted: float, brake_rate: float, release_rate: float) -> float:
-    """The force at the moment at which another command begins to act: it jumps only at an infinite rate. [m/s2]"""
+    """Return the force (m/s2) just after a command takes effect: it jumps to the command only if its rate is infinite.
+
+    Args:
+        force: acceleration by brakes or engine just before, m/s2.
+        wanted: the command, m/s2.
+        brake_rate: rate at which the force falls, m/s3.
+        release_rate: rate at which the force rises, m/s3.
+
+    """
     return wanted if math.isinf(brake_rate if wanted < force else release_rate) else force

@@ -1,6 +1,6 @@
-"""State and parameters of ``n`` independent lines of ``N`` vehicles.
+"""State and parameters of ``n`` independent worlds, each a line of ``N`` vehicles.
 
-Shape letters, used everywhere in this package:
+Shape letters that the whole package uses:
 
 ===  =========================================================
 n    worlds, advanced together and independent of each other
@@ -10,7 +10,7 @@ L    learners
 F    features of an observation
 ===  =========================================================
 
-Only gaps and speeds are stored: absolute positions would lose digits as the line moves on.
+Only gaps and speeds are stored: absolute positions would lose precision as the line moves on.
 """
 
 from __future__ import annotations
@@ -35,35 +35,39 @@ UInt64s = NDArray[np.uint64]
 
 GRAVITY_MPS2 = 9.81
 
-_ON_ROADS = ("braking_capacity_mps2", "driving_capacity_mps2")  # what friction limits
+_ON_ROADS = ("braking_capacity_mps2", "driving_capacity_mps2")  # limited by friction
 
 
 def as_road_allows(quantities: Mapping[str, Floats], friction: Floats) -> dict[str, Floats]:
-    """The quantities, of which no capacity is above ``friction * GRAVITY_MPS2``."""
+    """Return ``quantities`` with the braking and driving capacities limited to ``friction * GRAVITY_MPS2``.
+
+    ``quantities`` maps field names such as ``braking_capacity_mps2`` to arrays; ``friction`` broadcasts to their shape.
+    Other fields stay as they are.
+    """
     most = friction * GRAVITY_MPS2
     return {key: np.minimum(value, most) if key in _ON_ROADS else value for key, value in quantities.items()}
 
 
 @dataclass(frozen=True, slots=True)
 class Vehicles:
-    """What does not change during an episode."""
+    """Parameters of the vehicles: everything that does not change during an episode."""
 
     braking_capacity_mps2: Floats  # [n, N] largest deceleration, > 0
     driving_capacity_mps2: Floats  # [n, N] largest forward acceleration, >= 0
-    latency_s: Floats  # [n, N] commands are ignored before this time, >= 0; a channel (``v2x``) may add to the own part
+    latency_s: Floats  # [n, N] commands have no effect before this time, >= 0; includes delays of a ``v2x`` channel
     mass_t: Floats  # [n, N] > 0
-    speed_limit_mps: Floats  # [n, N] driving stops here, > 0
+    speed_limit_mps: Floats  # [n, N] speed up to which a vehicle drives, > 0
     restitution: Floats  # [n] in [0, 1]
-    # [n, N] > 0, how fast the acceleration in force falls to a lower command, and rises to a higher one (m/s3);
+    # [n, N] > 0, rates at which the acceleration in force falls to a lower command and rises to a higher one (m/s3);
     # infinite: at once
     brake_rate_mps3: Floats
     release_rate_mps3: Floats
-    # [n, N, 2 K] when each piece of a vehicle's braking begins (s after its latency), then their commands (m/s2), which
-    # it has whatever else it is told; infinite: no such piece; [n, N, 0]: nobody brakes in pieces
+    # [n, N, 2 K] braking in pieces: start of each of K pieces (s after the latency; infinite: none), then their
+    # commands (m/s2), which replace every other command; [n, N, 0]: no vehicle brakes in pieces
     pieces: Floats
-    own_latency_s: Floats  # [n, N] the vehicle's own part of its latency, which is what others are told of it
-    # [n, N, N] from when on vehicle i acts on news of vehicle j; infinite: never. Never before latency_s of vehicle i,
-    # and of itself (i is j) exactly from then on. Without a channel both of these share the memory of ``latency_s``
+    own_latency_s: Floats  # [n, N] part of the latency without the channel; messages report this part
+    # [n, N, N] time from which vehicle i acts on news of vehicle j; infinite: never. At least latency_s of vehicle i,
+    # and equal to it for i = j. Without a channel this and own_latency_s share the memory of latency_s
     known_from_s: Floats
 
     def __repr__(self) -> str:
@@ -71,7 +75,7 @@ class Vehicles:
         return f"Vehicles({count_of(n, 'world')} of {N}, masses {_span(self.mass_t)} t)"
 
     def take(self, rows: ArrayLike) -> Vehicles:
-        """Select worlds by index or mask (always a copy)."""
+        """Return the vehicles of the worlds selected by ``rows`` (indices or a mask [n]); always a copy."""
         index = np.asarray(rows)
         return _combined(lambda column: np.ascontiguousarray(column[index]), self)
 
@@ -88,9 +92,11 @@ class Vehicles:
         release_rate_mps3: Floats | None = None,
         pieces: Floats | None = None,
     ) -> Vehicles:
-        """Vehicles without a channel: latencies are all own, and all news is known from them on.
+        """Return vehicles without a channel: each has only its own latency and knows everything from then on.
 
-        Without rates the acceleration in force is the command at once; without pieces nobody brakes in such.
+        Arguments are arrays as in the fields of this class: capacities, latency, mass (t) and speed limit are [n, N],
+        ``restitution`` is [n], rates are [n, N]. Rates None: a command takes full effect at once. ``pieces`` None: no
+        vehicle follows a fixed sequence of commands.
         """
         known = cls.known_at_once(latency_s)
         at_once = np.full(mass_t.shape, np.inf)
@@ -103,9 +109,10 @@ class Vehicles:
 
     @staticmethod
     def known_at_once(latency_s: Floats) -> Floats:
-        """``known_from_s`` [n, N, N] without a channel: all news, from the own latency [n, N] on.
+        """Return ``known_from_s`` [n, N, N] without a channel, from the latencies [n, N] s.
 
-        A view of ``latency_s`` that takes no memory (its last axis has stride 0) and cannot be written.
+        Vehicle i acts on news of every vehicle from its own latency on. The result is a read-only view of
+        ``latency_s``; its last axis has stride 0, so it takes no memory.
         """
         latency = np.ascontiguousarray(latency_s, np.float64)
         (n, N), size = latency.shape, latency.itemsize
@@ -115,17 +122,25 @@ class Vehicles:
 
     @property
     def build_up(self) -> Bools:
-        """Worlds in which some vehicle's brakes build up, its rates not infinite, or brake in pieces, [n]."""
+        """Whether some vehicle of a world has a finite brake or release rate, or a fixed sequence of commands, [n]."""
         rates = np.minimum(self.brake_rate_mps3, self.release_rate_mps3)
         return np.asarray(np.isfinite(rates).any(axis=1) | self.in_pieces)
 
     @property
     def in_pieces(self) -> Bools:
-        """Worlds in which some vehicle brakes in pieces, [n]."""
+        """Whether some vehicle of a world brakes in pieces, that is, by a fixed sequence of commands, [n]."""
         return np.asarray(np.isfinite(self.pieces).any(axis=(1, 2)))
 
     def piece_commands(self, command_mps2: Floats, time_s: Floats) -> Floats:
-        """The commands [n, N] m/s2 at the times ``time_s`` [n]: whoever brakes in pieces has that of its piece."""
+        """Return the commands in which vehicles that brake in pieces follow their current piece, [n, N] m/s2.
+
+        A piece is a time interval of constant command.
+
+        Args:
+            command_mps2: commands of all vehicles, [n, N] m/s2; kept for vehicles without pieces.
+            time_s: absolute time in each world, [n] s.
+
+        """
         command, count = command_mps2, self.pieces.shape[2] // 2
         for piece in range(count):
             begins = self.latency_s + self.pieces[:, :, piece]
@@ -134,10 +149,10 @@ class Vehicles:
         return command
 
     def hide_from(self, vehicle: int) -> Bools:
-        """Worlds in which a channel hides something of the line from ``vehicle`` at its first decision, [n].
+        """Return whether a channel hides part of the line from ``vehicle`` (index from 0) at its first decision, [n].
 
-        Either news of another vehicle has not arrived by then, or another one reacts later than the own part of its
-        latency, which is all that a message tells. Never without a channel.
+        Either news of another vehicle has not arrived yet, or another vehicle reacts later than its own latency, which
+        is all that a message reports. Without a channel nothing is hidden.
         """
         late = self.latency_s > self.own_latency_s
         hidden = (self.known_from_s[:, vehicle] > self.latency_s[:, [vehicle]]) | late
@@ -146,7 +161,7 @@ class Vehicles:
 
     @property
     def is_known_at_once(self) -> bool:
-        """Whether nothing comes link by link, whatever memory says so: no channel, or one that changes nothing."""
+        """Whether every vehicle knows everything from its own latency on: there is no channel, or it has no effect."""
         if self._is_view:
             return True
         own, latency = self.own_latency_s, self.latency_s
@@ -154,7 +169,7 @@ class Vehicles:
 
     @property
     def _is_view(self) -> bool:
-        """Whether own latency and news are the latency's memory, as ``at_once`` makes them."""
+        """Whether own latency and news share the memory of the latency, as ``at_once`` makes them."""
         latency, news = self.latency_s, self.known_from_s
         return self.own_latency_s is latency and news.base is latency and news.strides[1:] == (latency.itemsize, 0)
 
@@ -166,7 +181,7 @@ _WITHOUT_NEWS = _OF_VEHICLES[:-2]
 
 @dataclass(frozen=True, slots=True)
 class Worlds:
-    """The state of ``n`` worlds at their times ``time_s``.
+    """State of ``n`` worlds at their times ``time_s``.
 
     >>> import ethbrake_marl as eb
     >>> worlds = eb.make_worlds(
@@ -178,17 +193,17 @@ class Worlds:
 
     """
 
-    vehicles: Vehicles  # what does not change
-    gaps_m: Floats  # [n, P] bumper to bumper, >= 0 (below only in the sampled map)
+    vehicles: Vehicles  # constant parameters
+    gaps_m: Floats  # [n, P] bumper to bumper, >= 0 (negative only in the paper's fixed-step map)
     speeds_mps: Floats  # [n, N] forward positive; negative only after a bounce-back
     time_s: Floats  # [n] since Vehicle 1 began to brake
-    pair_hit: Bools  # [n, P] this pair has had an impact
+    pair_hit: Bools  # [n, P] whether the pair has had an impact
     command_mps2: Floats  # [n, N] signed acceleration in force up to this time; 0 up to the latency
     obstacle_gap_m: Floats  # [n] from Vehicle 1's front to an unmovable obstacle ahead, >= 0; infinite: there is none
-    obstacle_hit: Bools  # [n] Vehicle 1 has had an impact with it
-    messages: Floats  # [n, M] what periodic messages have told whom (``physics.messages``); [n, 0] without them
-    # [n, 1 + 2 N] friction of the road, and what brakes and engines of each vehicle can on a dry one (m/s2), of which
-    # the capacities are what the road allows; [n, 0]: nothing is known of a road
+    obstacle_hit: Bools  # [n] whether Vehicle 1 has had an impact with the obstacle
+    messages: Floats  # [n, M] state of the periodic messages (``physics.messages``); [n, 0] without them
+    # [n, 1 + 2 N] friction of the road, and braking and driving capacities on a dry road (m/s2), from which friction
+    # gives the capacities of ``vehicles``; [n, 0]: no friction is modelled
     road: Floats
 
     def __repr__(self) -> str:
@@ -206,28 +221,31 @@ class Worlds:
         return int(self.speeds_mps.shape[1])
 
     def _each(self, change: Callable[..., NDArray[Any]], *others: Worlds) -> Worlds:
-        """``change`` of each column of these worlds and of the others, which picks or joins rows."""
+        """Return new worlds, each field of which is ``change(own field, field of the first of others, ...)``.
+
+        ``change`` takes one array per batch and returns one array: it selects or joins rows.
+        """
         parts = (self, *others)
         columns = (change(*(getattr(w, name) for w in parts)) for name in _OF_WORLDS)
         return Worlds(_combined(change, *(w.vehicles for w in parts)), *columns)
 
     def copy(self) -> Worlds:
-        """The same worlds in memory of their own, but for ``vehicles``, which do not change."""
+        """Return a copy in new memory; ``vehicles`` are shared, because they do not change."""
         return Worlds(self.vehicles, *(getattr(self, name).copy() for name in _OF_WORLDS))
 
     def take(self, rows: ArrayLike) -> Worlds:
-        """Select worlds by index or mask (always a copy)."""
+        """Return the worlds selected by ``rows`` (indices or a mask [n]); always a copy."""
         index = np.asarray(rows)
         return self._each(lambda column: np.ascontiguousarray(column[index]))
 
     @staticmethod
     def concatenate(parts: Sequence[Worlds]) -> Worlds:
-        """Join worlds with the same number of vehicles into one batch."""
+        """Join the batches ``parts``, all with the same number of vehicles, into one batch, in this order."""
         parts = _alike(parts)
         return parts[0]._each(lambda *columns: np.concatenate(columns), *parts[1:])
 
     def assign(self, rows: Ints, fresh: Worlds) -> Worlds:
-        """The batch with ``rows`` replaced by the len(rows) worlds of ``fresh``; nothing is changed in place."""
+        """Return a copy of the batch with the worlds at indices ``rows`` [k] replaced by the k worlds of ``fresh``."""
 
         def assigned(whole: NDArray[Any], part: NDArray[Any]) -> NDArray[Any]:
             copy = whole.copy()
@@ -246,14 +264,21 @@ class Worlds:
         command_mps2: ArrayLike = 0.0,
         pair_hit: ArrayLike = False,
     ) -> Worlds:
-        """These lines as they run at a later time, each to its full shape: as another simulator has moved them.
-
-        Raises ``InvalidInput`` naming the field and its first bad entry.
+        """Return these worlds with a later state, for example from another simulator.
 
         >>> import ethbrake_marl as eb
         >>> alert = eb.load_scenario("paper-random").sample(2, seed=7).worlds
         >>> alert.running(0.7, [4.0, 6.0], [18.0, 17.0, 19.0], command_mps2=[-5.0, -2.0, 0.0]).time_s
         array([0.7, 0.7])
+
+        Args:
+            time_s: time since Vehicle 1 began to brake, broadcast to [n], s.
+            gaps_m: bumper to bumper, broadcast to [n, P], m.
+            speeds_mps: broadcast to [n, N], m/s.
+            command_mps2: acceleration in force of each vehicle, broadcast to [n, N], m/s2.
+            pair_hit: whether each pair has had an impact, broadcast to [n, P].
+
+        Raises ``InvalidInput`` naming the field and its first bad entry.
 
         """
         (n, N), inf = self.speeds_mps.shape, math.inf
@@ -267,11 +292,15 @@ class Worlds:
         )
 
     def read_only(self) -> Worlds:
-        """The same worlds as arrays that cannot be written to; these stay as they are."""
+        """Return the same worlds as read-only views."""
         return self._each(_unwritable)
 
     def on_road(self, friction: Floats, dry: Mapping[str, Floats] | None = None) -> Worlds:
-        """These worlds on a road of that ``friction`` [n]; ``dry``: other capacities on a dry one, [n, N]."""
+        """Return these worlds on a road with this ``friction`` [n]; capacities are at most ``friction * GRAVITY_MPS2``.
+
+        ``dry`` gives new capacities on a dry road, [n, N] by field name, for example ``{"braking_capacity_mps2":
+        array}``; fields that it does not name keep theirs.
+        """
         on_dry = {name: self.dry(name) for name in _ON_ROADS} | dict(dry or {})
         vehicles = replace(self.vehicles, **as_road_allows(on_dry, friction[:, np.newaxis]))
         return replace(
@@ -280,11 +309,11 @@ class Worlds:
 
     @property
     def friction(self) -> Floats:
-        """Friction of the road, [n]; infinite where nothing is known of it."""
+        """Friction coefficient of the road, [n]; infinite if no friction is modelled."""
         return self.road[:, 0] if self.road.shape[1] else np.full(self.n, np.inf)
 
     def dry(self, name: str) -> Floats:
-        """A field of ``vehicles``, a capacity as it is on a dry road, [n, N]."""
+        """Return the field ``name`` of ``vehicles``, [n, N]; a braking or driving capacity as it is on a dry road."""
         value: Floats = getattr(self.vehicles, name)
         if self.road.shape[1] and name in _ON_ROADS:
             begin = 1 + self.N * _ON_ROADS.index(name)
@@ -292,9 +321,11 @@ class Worlds:
         return value
 
     def play_pieces(self, pieces: Mapping[int, Sequence[tuple[float, float]]]) -> Worlds:
-        """These worlds, in which the vehicles (index from 0) brake in these pieces, and nobody else does.
+        """Return these worlds with some vehicles braking in pieces, that is, by a fixed sequence of commands.
 
-        A piece is its time (s after the latency has elapsed; the first is 0) and its braking (m/s2).
+        ``pieces`` maps a vehicle (index from 0) to its sequence of (start, braking): seconds after its latency, 0 for
+        the first piece; and deceleration in m/s2. Vehicles that it does not name do not brake in pieces, nor does a
+        vehicle with a single piece.
         """
         several = {i: np.array(each, np.float64) for i, each in pieces.items() if len(each) > 1}
         if not several and not self.vehicles.pieces.shape[2]:
@@ -306,7 +337,10 @@ class Worlds:
         return replace(self, vehicles=replace(self.vehicles, pieces=found.reshape(self.n, self.N, 2 * most)))
 
     def refuse_build_up(self, who: str) -> None:
-        """Raise ``InvalidInput`` where brakes of a world build up, or come in pieces: ``who`` has no exact answer."""
+        """Raise ``InvalidInput`` if some vehicle has a finite brake or release rate, or follows a sequence of commands.
+
+        For callers that have no exact answer in these worlds. ``who`` names the caller in the message.
+        """
         slow = self.vehicles.build_up
         if self.vehicles.in_pieces.any():
             raise InvalidInput(
@@ -320,31 +354,35 @@ class Worlds:
             )
 
     def first_decision_s(self, deciders: Sequence[int]) -> Floats:
-        """Time of the first decision, [n] s: the least latency of the ``deciders``, or the worlds' time if it is later.
+        """Return the time of the first decision, [n] s: the least latency of the ``deciders``, at least ``time_s``.
 
-        With nobody to decide it is the worlds' time.
+        ``deciders`` are the indices (from 0) of the vehicles that choose their commands. Without deciders it is
+        ``time_s``.
         """
         if len(deciders) == 0:
             return self.time_s.copy()
         first: Floats = np.maximum(self.vehicles.latency_s[:, list(deciders)].min(axis=1), self.time_s)
         return first
 
-    # The obstacle ahead of Vehicle 1 is for the kernels one more vehicle in front, which nothing moves. Everybody else
-    # keeps the numbers of the vehicles, and the obstacle has columns of its own.
+    # The kernels treat the obstacle ahead of Vehicle 1 as one more vehicle in front, which nothing moves. Everywhere
+    # else the obstacle has columns of its own, so the vehicles keep their indices.
 
     @property
     def obstacle_ahead(self) -> Bools:
-        """Which worlds have an obstacle ahead of Vehicle 1, [n]."""
+        """Whether a world has an obstacle ahead of Vehicle 1, [n]."""
         return np.isfinite(self.obstacle_gap_m)
 
     def with_obstacle(self) -> Worlds:
-        """These worlds, all with an obstacle ahead, with that obstacle as vehicle 0 and the vehicles one later."""
+        """Return these worlds with the obstacle as vehicle 0, so that vehicle i becomes vehicle i + 1.
+
+        Every world must have an obstacle.
+        """
 
         def ahead(value: float, columns: Floats) -> Floats:
             return np.concatenate([np.full((len(columns), 1), value), columns], axis=1)
 
         vehicles = self.vehicles
-        written_out = Vehicles.at_once(  # inside the physics nobody observes
+        written_out = Vehicles.at_once(  # the physics needs no observations
             ahead(0.0, vehicles.braking_capacity_mps2),
             ahead(0.0, vehicles.driving_capacity_mps2),
             ahead(0.0, vehicles.latency_s),
@@ -369,12 +407,12 @@ class Worlds:
         )
 
     def with_post_ahead(self, duration_s: Floats) -> Worlds:
-        """These worlds, each with an obstacle ahead: its own, or one that Vehicle 1 cannot reach in ``duration_s`` [n].
+        """Return these worlds with an obstacle each: their own, or one out of Vehicle 1's reach for ``duration_s`` [n].
 
-        Worlds know gaps and speeds, no places. Such a post makes the way of Vehicle 1 the change of one more gap, and
-        changes no motion. It is farther than Vehicle 1 can travel, ``T sqrt(2 E / m_1)``, had it all the energy E the
-        line can ever have: impacts and brakes only take energy; driving adds at most ``m a v`` per second, and never
-        above the speed limit.
+        Worlds store gaps and speeds, not places. With the obstacle, the change of its gap is the distance that Vehicle
+        1 travels. An added obstacle changes no motion: it is farther away than ``T sqrt(2 E / m_1)``, the distance that
+        Vehicle 1 would travel in the duration T if it had all the energy E that the line can ever have. Impacts and
+        brakes only remove energy; driving adds at most ``m a v`` per second, and never above the speed limit.
         """
         vehicles = self.vehicles
         driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
@@ -384,7 +422,10 @@ class Worlds:
 
 
 def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
-    """The same worlds, all with as many pieces; a road known of some is of infinite friction for the others."""
+    """Return the batches ``parts``, made alike so that their columns can be joined.
+
+    All get columns for equally many pieces of braking; if some have a road, the others get one with infinite friction.
+    """
     most = max(part.vehicles.pieces.shape[2] for part in parts)
     if any(part.vehicles.pieces.shape[2] < most for part in parts):
         parts = [
@@ -396,7 +437,10 @@ def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
 
 
 def _padded(pieces: Floats, most: int) -> Floats:
-    """Pieces [n, N, 2 K] as [n, N, most]."""
+    """Return ``pieces`` [n, N, 2 K] with added empty pieces (infinite entries), [n, N, most].
+
+    ``most`` is even: each piece has a start and a command.
+    """
     n, N, width = pieces.shape
     halves = pieces.reshape(n, N, 2, width // 2)
     more = [(0, 0), (0, 0), (0, 0), (0, (most - width) // 2)]
@@ -407,14 +451,14 @@ _OF_WORLDS = tuple(f.name for f in fields(Worlds))[1:]
 
 
 def _unwritable(array: NDArray[Any]) -> NDArray[Any]:
-    """The same array, which cannot be written to; the one given can."""
+    """Return a read-only view of ``array``; ``array`` itself stays writable."""
     view = array.view()
     view.flags.writeable = False
     return view
 
 
 def _span(values: Floats) -> str:
-    """The least and the largest of the values, or the one that all have; ``none`` where there are none."""
+    """Format the smallest and largest value; one value if they are equal, ``none`` if there are no values."""
     if not values.size:
         return "none"
     low, high = float(values.min()), float(values.max())
@@ -422,7 +466,11 @@ def _span(values: Floats) -> str:
 
 
 def _combined(change: Callable[..., NDArray[Any]], *parts: Vehicles) -> Vehicles:
-    """``change`` of each column of these vehicles, which picks or joins rows; without a channel it stays one memory."""
+    """Return new vehicles, each field of which is ``change(field of the first part, field of the second, ...)``.
+
+    ``change`` takes one array per part and returns one array: it selects or joins rows. If no part has a channel,
+    ``latency_s``, ``own_latency_s`` and ``known_from_s`` share one memory in the result, as in ``at_once``.
+    """
     at_once = all(part._is_view for part in parts)
     columns = [
         change(*(getattr(part, name) for part in parts)) for name in (_WITHOUT_NEWS if at_once else _OF_VEHICLES)
@@ -431,7 +479,7 @@ def _combined(change: Callable[..., NDArray[Any]], *parts: Vehicles) -> Vehicles
 
 
 def sum_rows(values: Floats) -> Floats:
-    """``values.sum(axis=1)`` to the same bits; faster where a row is short, which NumPy adds up entry by entry."""
+    """Return ``values.sum(axis=1)`` to the same bits; faster for short rows, which NumPy adds entry by entry."""
     if not 0 < values.shape[1] < 8:
         total: Floats = values.sum(axis=1)
         return total
@@ -442,10 +490,10 @@ def sum_rows(values: Floats) -> Floats:
 
 
 def real_numbers(value: ArrayLike) -> Floats:
-    """``value`` as float64, the same array where it is one already.
+    """Return ``value`` as float64, without a copy if it already is.
 
-    Raises ``ValueError``, with the reason as its text, for what is no number, or which numpy would make one of: truth
-    values, masked entries, texts, tensors that need gradients or lie on another device.
+    Raises ``ValueError``, with the reason as its text, for anything that is not a number, even if numpy would convert
+    it: truth values, masked entries, texts, tensors that need gradients or are on another device.
     """
     if type(value) is np.ndarray and value.dtype.kind in "fiu":
         return np.asarray(value, np.float64)
@@ -473,7 +521,7 @@ def real_numbers(value: ArrayLike) -> Floats:
 
 
 def checked_numbers(name: str, value: ArrayLike) -> Floats:
-    """``real_numbers``; raises ``InvalidInput``, which names the value, where that raises."""
+    """Return ``value`` as a float64 array; raise ``InvalidInput`` with ``name`` and the value if it is not numeric."""
     try:
         return real_numbers(value)
     except ValueError as error:
@@ -495,23 +543,25 @@ def make_worlds(
     obstacle_gap_m: ArrayLike | None = None,
     friction: ArrayLike | None = None,
 ) -> Worlds:
-    """Build checked worlds at ``t = 0``; every parameter broadcasts to its full shape.
+    """Build and check worlds at ``t = 0``; every parameter broadcasts to its full shape.
 
     Args:
         gaps_m: bumper to bumper, [n, P], [P] or one number, m.
         speeds_mps: [n, N] or [N], m/s.
-        braking_capacity_mps2: largest deceleration, to [n, N], m/s2.
-        driving_capacity_mps2: largest forward acceleration, to [n, N], m/s2.
-        latency_s: commands are ignored before this time, to [n, N], s.
-        mass_t: to [n, N], t.
-        restitution: of every impact, in [0, 1], to [n].
-        speed_limit_mps: driving stops here, to [n, N], m/s.
-        brake_rate_mps3: how fast the acceleration in force falls to a lower command, to [n, N], m/s3; inf: at once.
-        release_rate_mps3: how fast it rises to a higher one.
-        obstacle_gap_m: distance to an obstacle ahead of Vehicle 1, to [n], m; None: there is none.
-        friction: of the road, to [n]: capacities are at most ``friction * GRAVITY_MPS2``; None: as they are given.
+        braking_capacity_mps2: largest deceleration, m/s2, broadcast to [n, N].
+        driving_capacity_mps2: largest forward acceleration, m/s2, broadcast to [n, N].
+        latency_s: time before which commands have no effect, s, broadcast to [n, N].
+        mass_t: mass, t, broadcast to [n, N].
+        restitution: coefficient of restitution of every impact, in [0, 1], broadcast to [n].
+        speed_limit_mps: speed up to which a vehicle drives, m/s, broadcast to [n, N].
+        brake_rate_mps3: rate at which the acceleration in force falls to a lower command, m/s3, broadcast to [n, N];
+            inf: at once.
+        release_rate_mps3: rate at which it rises to a higher command, m/s3, broadcast to [n, N]; inf: at once.
+        obstacle_gap_m: gap from Vehicle 1 to an obstacle ahead, m, broadcast to [n]; None: no obstacle.
+        friction: friction of the road, broadcast to [n]; it limits capacities to ``friction * GRAVITY_MPS2``. None: no
+            limit.
 
-    Raises ``InvalidInput`` naming the field, the first bad entry and its range.
+    Raises ``InvalidInput`` with the field, the first invalid entry and the valid range.
 
     """
     speeds = np.atleast_2d(checked_numbers("speeds_mps", speeds_mps))
@@ -563,7 +613,18 @@ def _full(
     open_low: bool = False,
     finite: bool = True,
 ) -> Floats:
-    """Broadcast ``value`` to ``shape`` in its own memory and check that it is in range, and ``finite``."""
+    """Return a new array with ``value`` broadcast to ``shape``; raise ``InvalidInput`` for an entry out of range.
+
+    Args:
+        name: name of the field, for the message.
+        value: number or array.
+        shape: shape of the result.
+        low: least valid entry.
+        high: largest valid entry.
+        open_low: ``low`` itself is invalid.
+        finite: infinite entries are invalid.
+
+    """
     given = checked_numbers(name, value)
     try:
         full = np.array(np.broadcast_to(given, shape), dtype=np.float64, order="C")

@@ -1,4 +1,4 @@
-"""A segment of constant command as pieces of constant acceleration: what a picture needs to be exact between events."""
+"""The motion within a segment (an interval of constant commands) as pieces of constant jerk, to draw it exactly."""
 
 from __future__ import annotations
 
@@ -21,10 +21,17 @@ _CAPACITY = 64
 
 @compiled
 def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) -> int:
-    """Write down time from the start, gaps, speeds, accelerations and jerks where each piece begins; their number.
+    """Write the state at the start of each piece of constant jerk into ``rows``; return the number of pieces.
 
-    Those that do not fit into ``rows`` [capacity, 1 + P + 3 N] are only counted; minus their number where a contact
-    was missed.
+    The state is time, gaps, speeds, accelerations and jerks. Pieces that do not fit into ``rows`` are only counted. The
+    number is negative if a contact was missed.
+
+    Args:
+        table: one world in the layout of ``physics.rows``; it is advanced.
+        restitution: coefficient of restitution of every impact.
+        duration: length of the segment, s.
+        rows: result, [capacity, 1 + P + 3 N].
+
     """
     vehicles, building = table.shape[1], builds_up(table)
     start_events(table, building)
@@ -55,21 +62,22 @@ def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) ->
 
 
 def segment_pieces(worlds: Worlds, command_mps2: Floats, until_s: Floats) -> list[Floats]:
-    """The motion of each world until a time, under one command: a row per piece of constant jerk.
+    """Return the motion of each world until a time, under constant commands: a row per time interval of constant jerk.
 
     Args:
-        worlds: n, of N vehicles; they stay as they are.
-        command_mps2: signed accelerations wanted, [n, N] m/s2.
-        until_s: where the segments end, [n] s.
+        worlds: n worlds of N vehicles; they are not changed.
+        command_mps2: commanded accelerations, [n, N] m/s2.
+        until_s: end of each segment, [n] s.
 
-    Returns for each world [k, 1 + N + 3 N]: the absolute time at which the piece begins (s), how far Vehicle 1 has come
-    since the segment began, the gaps (m), the speeds (m/s), the accelerations (m/s2) and the jerks (m/s3).
+    Returns one array [k, 1 + N + 3 N] per world, with a row per interval. Its columns: absolute time at which the
+    interval begins (s), distance that Vehicle 1 has travelled since the segment began (m), then N - 1 gaps (m), N
+    speeds (m/s), N accelerations (m/s2) and N jerks (m/s3).
 
     """
     v, N, durations = worlds.vehicles, worlds.N, until_s - worlds.time_s
-    front_gaps = worlds.with_post_ahead(durations).obstacle_gap_m  # says where Vehicle 1 is
+    front_gaps = worlds.with_post_ahead(durations).obstacle_gap_m  # its change is the distance that Vehicle 1 travels
     latencies, restitutions = v.latency_s, v.restitution
-    # all but the post's own
+    # columns of the vehicles, without the dummy obstacle
     wanted = [*range(N + 1), *(part * (N + 1) + i for part in (1, 2, 3) for i in range(1, N + 1))]
     found = []
     for k in range(worlds.n):

@@ -1,4 +1,4 @@
-"""Read a policy bundle, and refuse one that is damaged or observes what is no longer known."""
+"""Read a policy bundle (a folder with manifest and weights); refuse a damaged one, and one with unknown features."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _LIMITS_BYTES = {MANIFEST: 1 << 20, WEIGHTS: 256 << 20}
 
 
 def load_policy(path: str | os.PathLike[str]) -> Policy:
-    """Read the bundle at ``path``: a bundle's own folder, or a run's folder (then its ``policy/``).
+    """Load the policy bundle at ``path``: the folder of a bundle, or of a training run (then its ``policy/``).
 
-    Raises ``InvalidInput`` when there is none, ``CorruptBundle`` (file, what is wrong) when it cannot be trusted.
+    Raises ``InvalidInput`` if there is none; ``CorruptBundle`` with file and reason if it is damaged.
     """
     if not isinstance(path, str | os.PathLike):
         raise InvalidInput(f"policy {path!r:.60}: must be the path of a run or of a policy bundle")
@@ -77,10 +77,10 @@ def _read(path: Path) -> bytes:
 
 
 def _check_observed(path: Path, manifest: Manifest) -> None:
-    """Compare what the policy observes with what these features are now.
+    """Check that the features that a policy observes are the same today as when it was trained.
 
-    Raises ``InvalidInput`` naming a registered feature that is missing or was changed, ``CorruptBundle`` for features
-    that this version does not have, or scales otherwise.
+    ``path``: its manifest file, for messages. Raises ``InvalidInput`` for a registered feature that is missing or was
+    changed; ``CorruptBundle`` for features that this version does not have, or scales differently.
     """
     seen = manifest.observation
     for was in seen.registered:
@@ -103,9 +103,9 @@ def _check_observed(path: Path, manifest: Manifest) -> None:
                 f"{of}, whose function gives other numbers than when it was trained; register it as it was, or train"
                 " again"
             )
-    with suppress(InvalidInput):  # a feature that there is no more
+    with suppress(InvalidInput):  # a feature that no longer exists
         today = ObservationSchema.of(seen.spec)
-        known = seen.model_copy(update={"registered": today.registered})  # compared above, within rounding
+        known = seen.model_copy(update={"registered": today.registered})  # registered features are compared above
         if known == today and [each.name for each in seen.registered] == [each.name for each in today.registered]:
             return
     raise CorruptBundle(

@@ -1,7 +1,7 @@
-"""Layers of a network: a product and a hyperbolic tangent that give the same bits in any batch, on any machine.
+"""Layers of a network: matrix product and hyperbolic tangent with the same bits in any batch, on any machine.
 
-Vector units and mathematics libraries round ``tanh`` and sums differently, by machine and even by where in an array a
-number stands. Here both are fixed sequences of IEEE operations.
+Vector units and mathematics libraries round ``tanh`` and sums differently, by machine and even by the position of a
+number in an array. Here both are fixed sequences of IEEE operations.
 """
 
 from __future__ import annotations
@@ -15,14 +15,17 @@ from ethbrake_marl.physics.elementary import PER_LN2, exp_rest
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.policies.network_spec import Float32s
 
-_SATURATED = 10.0  # from 9.02 on the single-precision result is 1
+_SATURATED = 10.0  # the single-precision result is 1 from 9.02 on
 
 _SMALL = 1e-4  # below, x - x^3 / 3 is exact to double precision
 
 
 @compiled
 def squash(values: NDArray[np.float32]) -> None:
-    """Replace ``values`` [k, rows] by their hyperbolic tangents, within half a unit of the last place (and a hair)."""
+    """Replace every entry of ``values`` [k, rows] by its hyperbolic tangent, in place.
+
+    The error is slightly above half a unit in the last place.
+    """
     for j in range(values.shape[0]):
         row = values[j]
         for r in range(row.shape[0]):
@@ -49,10 +52,18 @@ def layers_of(name: str, hidden: int, tensors: Mapping[str, Float32s]) -> Layers
 
 @compiled
 def dense(weight: Float32s, bias: Float32s, x: Float32s, y: Float32s) -> None:
-    """Fill ``y = weight x + bias`` for weight [O, K], bias [O], x [K, rows], y [O, rows]; rows are independent.
+    """Compute one layer of a network, ``y = weight x + bias``, and write it into ``y``; rows are independent.
 
-    Inputs are added in groups of four, ``(a + b) + (c + d)``, always in this order and never fused or reordered
-    (no fastmath): half the rounding of a plain running sum, and the same result whatever the other rows hold.
+    Inputs are added in groups of four, ``(a + b) + (c + d)``, always in this order, without fused or reordered
+    operations (no fastmath). This halves the rounding error of a plain running sum, and the result does not depend on
+    the other rows.
+
+    Args:
+        weight: [O, K] for K inputs and O outputs.
+        bias: [O].
+        x: inputs, [K, rows].
+        y: result, [O, rows].
+
     """
     inputs = weight.shape[1]
     whole = inputs - inputs % 4

@@ -23,9 +23,9 @@ _PACKAGES = ("ethbrake-marl", "gymnasium", "numba", "numpy", "safetensors", "sta
 
 
 def installed_versions() -> dict[str, str]:
-    """Name -> version of this package, Python and every package that a training's numbers depend on.
+    """Return name -> version of Python, this package and every package that a training's results depend on.
 
-    Those that gave a part to this process are among them.
+    Packages that have added a part to this process (``registry.versions_used``) are included.
     """
     return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES} | versions_used()
 
@@ -40,30 +40,30 @@ class _Strict(FileModel):
 
 
 class FeatureDefinition(_Strict):
-    """A registered feature as it was when the policy was trained."""
+    """Definition of a registered feature at the time when the policy was trained."""
 
-    name: Annotated[str, Field(max_length=64)]
-    of: Of
-    unit: str
-    scale: float
-    low: float
-    high: float
-    unknown: float
-    tried: Annotated[tuple[float, ...], Field(max_length=64)]  # what it gave in a few worlds
+    name: Annotated[str, Field(max_length=64)]  # name under which it was registered
+    of: Of  # ``own``: of the vehicle itself; ``neighbour``: of a neighbour
+    unit: str  # unit of the value
+    scale: float  # the observed number is clip(value / scale, low, high)
+    low: float  # least observed number
+    high: float  # largest observed number
+    unknown: float  # value for an unknown neighbour, in ``unit``
+    tried: Annotated[tuple[float, ...], Field(max_length=64)]  # its values in a few test worlds
 
 
 class ObservationSchema(_Strict):
-    """What the policy sees: neighbours on each side, feature names in order, and a hash of how each is scaled."""
+    """The observation of the policy: neighbours on each side, feature names in order, and a hash of the scaling."""
 
-    front: Neighbours
-    rear: Neighbours
-    features: Annotated[tuple[str, ...], Field(min_length=1, max_length=4096)]
-    scaling_sha256: Sha256
+    front: Neighbours  # number of observed neighbours ahead
+    rear: Neighbours  # number of observed neighbours behind
+    features: Annotated[tuple[str, ...], Field(min_length=1, max_length=4096)]  # full names, in order
+    scaling_sha256: Sha256  # hash of names, units, scales and bounds of the features
     registered: Annotated[tuple[FeatureDefinition, ...], Field(max_length=4096, exclude_if=not_)] = ()
 
     @classmethod
     def of(cls, spec: ObservationSpec) -> Self:
-        """Describe ``spec`` so that a later change of a name, unit, scale or bound is noticed."""
+        """Describe the observation ``spec``, so that a later change of a name, unit, scale or bound is detected."""
         names = tuple(f.name for f in spec.features)
         scaling = [[f.name, f.unit, f.scale, f.low, f.high] for f in spec.features]
         return cls(
@@ -82,31 +82,31 @@ class ObservationSchema(_Strict):
 
     @property
     def spec(self) -> ObservationSpec:
-        """The observation as the environment builds it, from the names; raises ``UnknownName``."""
+        """The observation with these features; raises ``UnknownName`` if one of them does not exist any more."""
         return choose_observation(self.features)
 
 
 class Manifest(_Strict):
-    """Everything about a policy but its tensors; ``action`` is a fraction of the own capacity, -1 = full braking.
+    """Everything about a policy except its tensors; an action is a fraction of the own capacity, -1 = full braking.
 
-    Format 3 is for policies of several networks, 4 for one that scores its choices, 5 for one that chooses among
-    policies; any other network is written as ever, for earlier versions too.
+    Format 3 is for a mixture of experts, 4 for a network that scores actions, 5 for one that also chooses among
+    policies. Any other network keeps format 2, which earlier versions can read.
     """
 
-    format: Literal["ethbrake-policy"] = "ethbrake-policy"
-    format_version: Literal[2, 3, 4, 5] = 2
-    algorithm: Annotated[str, Field(pattern=NAME_PATTERN)]
-    network: NetworkSpec
-    observation: ObservationSchema
-    action: Literal["fraction_of_own_capacity"] = "fraction_of_own_capacity"
-    learners: Annotated[tuple[str, ...], Field(min_length=1)]
-    scenario: dict[str, JsonValue]
-    reward: dict[str, JsonValue]
-    seeds: dict[str, int]
-    steps: Annotated[int, Field(ge=0)]
-    versions: dict[str, str]
-    weights_sha256: Sha256
-    manifest_sha256: Sha256  # of everything above, see ``content_sha256``
+    format: Literal["ethbrake-policy"] = "ethbrake-policy"  # marks the file as a manifest
+    format_version: Literal[2, 3, 4, 5] = 2  # depends on the network, see above
+    algorithm: Annotated[str, Field(pattern=NAME_PATTERN)]  # name of the training algorithm
+    network: NetworkSpec  # sizes and kind of the networks
+    observation: ObservationSchema  # features that the policy observes
+    action: Literal["fraction_of_own_capacity"] = "fraction_of_own_capacity"  # meaning of an action
+    learners: Annotated[tuple[str, ...], Field(min_length=1)]  # vehicles that the policy learned to control
+    scenario: dict[str, JsonValue]  # scenario of the training, every value
+    reward: dict[str, JsonValue]  # reward of the training, every setting
+    seeds: dict[str, int]  # seeds of the training, by purpose
+    steps: Annotated[int, Field(ge=0)]  # decisions of learners in training
+    versions: dict[str, str]  # package -> version, at the time of training
+    weights_sha256: Sha256  # hash of the file with the tensors
+    manifest_sha256: Sha256  # hash of all fields above, see ``content_sha256``
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Manifest:
@@ -139,9 +139,10 @@ class Manifest(_Strict):
 
 
 def content_sha256(content: Mapping[str, Any]) -> str:
-    """SHA-256 of a manifest's plain content without its own hash: sorted keys, no blanks, ASCII.
+    """Return the SHA-256 of a manifest's plain content, leaving out the key ``manifest_sha256``.
 
-    It binds names, architecture and weights together, against accidents and edits; it is no signature.
+    The content is written as JSON with sorted keys, no spaces, ASCII. The hash ties names, architecture and weights
+    together and detects accidents and edits; it is not a signature.
     """
     hashed = {key: value for key, value in content.items() if key != "manifest_sha256"}
     return hashlib.sha256(json.dumps(hashed, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

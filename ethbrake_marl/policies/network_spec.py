@@ -20,42 +20,44 @@ PerhapsHidden = Annotated[tuple[Width, ...], Field(max_length=8)]
 
 
 class TensorRow(NamedTuple):
-    """One tensor of a bundle."""
+    """Name and shape of a tensor in a bundle."""
 
-    name: str
-    shape: tuple[int, ...]
+    name: str  # such as ``policy.0.weight``
+    shape: tuple[int, ...]  # length of each axis
 
     def inside(self, part: str) -> TensorRow:
-        """The same tensor, as one of a part of a larger policy."""
+        """Return the row of this tensor as part of a larger policy: the name becomes ``part.name``."""
         return self._replace(name=f"{part}.{self.name}")
 
 
 class NetworkSpec(FileModel):
-    """The networks of a policy: an actor, and perhaps a critic, both multilayer perceptrons on the same observation.
+    """The networks of a policy: an actor, and optionally a critic, both multilayer perceptrons on the same observation.
 
-    The action is ``output(actor(observation))`` in [-1, 1]. ``clip`` cuts the actor's mean at the bounds (PPO's
+    The action is ``output(actor(observation))`` in [-1, 1]. ``clip`` clips the actor's mean to the bounds (PPO's
     Gaussian, whose noise is one number per action). ``tanh`` squashes it (SAC's Gaussian, whose noise is a second head
     of the actor). Without ``value_hidden`` there is no critic: a policy needs none to act.
 
-    ``networks`` above 1 is a mixture of experts: as many actors of this shape, and a gating network with
+    ``networks`` above 1 is a mixture of experts: that many actors of this shape, and a gating network with
     ``gate_hidden`` layers that scores them. The expert with the highest score acts, the first one if scores are equal.
-    The gating network is asked at every decision and has no memory. A mixture has neither noise nor critic.
+    The gating network is evaluated at every decision and has no memory. A mixture has neither noise nor critic.
 
-    Output ``choice`` scores actions: ``choices`` of them, evenly from -1 to 1. The action with the highest score is
+    Output ``choice`` scores ``choices`` actions, evenly spaced from -1 to 1. The action with the highest score is
     taken, the lowest one if scores are equal. There is neither noise nor critic. The actor may also score whole
-    policies, ``among``; their scores come before the actions', and all see the same observation.
+    policies, ``among``; their scores come before those of the actions, and all of them get the same observation.
     """
 
-    observation_size: Annotated[int, Field(ge=1, le=4096)]
-    action_size: Annotated[int, Field(ge=1, le=64)]
-    policy_hidden: Annotated[PerhapsHidden, Field(min_length=1)]
-    value_hidden: PerhapsHidden
-    activation: Activation
-    output: Literal["clip", "tanh", "choice"]
+    observation_size: Annotated[int, Field(ge=1, le=4096)]  # F, length of an observation
+    action_size: Annotated[int, Field(ge=1, le=64)]  # A, length of an action
+    policy_hidden: Annotated[PerhapsHidden, Field(min_length=1)]  # width of each hidden layer of an actor
+    value_hidden: PerhapsHidden  # width of each hidden layer of the critic; empty: no critic
+    activation: Activation  # function between the layers
+    output: Literal["clip", "tanh", "choice"]  # what makes an action of the actor's outputs
+    # number of actions that output "choice" scores; None for other outputs
     choices: Annotated[int | None, Field(ge=2, le=4096, exclude_if=lambda choices: choices is None)] = None
+    # number of actors; above 1: a mixture of experts
     networks: Annotated[int, Field(ge=1, le=16, exclude_if=lambda networks: networks == 1)] = 1
-    gate_hidden: Annotated[PerhapsHidden, Field(exclude_if=not_)] = ()
-    among: Annotated[tuple[NetworkSpec, ...], Field(max_length=16, exclude_if=not_)] = ()
+    gate_hidden: Annotated[PerhapsHidden, Field(exclude_if=not_)] = ()  # hidden layers of the gating network
+    among: Annotated[tuple[NetworkSpec, ...], Field(max_length=16, exclude_if=not_)] = ()  # policies that are scored
 
     @model_validator(mode="after")
     def _a_gate_between_several(self) -> NetworkSpec:
@@ -80,25 +82,28 @@ class NetworkSpec(FileModel):
 
     @property
     def actors(self) -> tuple[str, ...]:
-        """How the tensors' names of each actor begin."""
+        """First part of the tensor names of each actor: ``("policy",)``, or ``("network_1", "network_2", ...)``."""
         return ("policy",) if self.networks == 1 else tuple(f"network_{m + 1}" for m in range(self.networks))
 
     @property
     def actions(self) -> Float32s:
-        """Those among which output ``choice`` chooses, [choices]."""
+        """The actions that output ``choice`` scores, [choices], from -1 to 1."""
         found: Float32s = np.linspace(-1.0, 1.0, self.choices or 0).astype(np.float32)
         return found
 
     @property
     def format_version(self) -> Literal[2, 3, 4, 5]:
-        """Of a bundle with this network."""
+        """Format version that the manifest of a policy with this network has."""
         if self.choices is not None:
             return 5 if self.among else 4
         return 2 if self.networks == 1 else 3
 
     @property
     def tensors(self) -> tuple[TensorRow, ...]:
-        """Every tensor of a bundle, all float32. Weights are [outputs, inputs] as in ``y = W x + b``."""
+        """Name and shape of every tensor in a bundle with this network, all float32.
+
+        Weights are [outputs, inputs] as in ``y = W x + b``.
+        """
         actors = [row for name in self.actors for row in self._network(name, self.policy_hidden, self._outputs)]
         if self.networks > 1:
             return (*actors, *self._network("gate", self.gate_hidden, self.networks))
@@ -114,7 +119,7 @@ class NetworkSpec(FileModel):
 
     @property
     def _outputs(self) -> int:
-        """Outputs of each actor: actions, or scores."""
+        """Number of outputs of each actor: its actions, or with output ``choice`` its scores."""
         return self.action_size if self.choices is None else len(self.among) + self.choices
 
     def _network(self, name: str, hidden: tuple[int, ...], outputs: int) -> list[TensorRow]:

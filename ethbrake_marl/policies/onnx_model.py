@@ -1,4 +1,4 @@
-"""A policy as an ONNX model, for other runtimes."""
+"""Export of a policy as an ONNX model, for other runtimes."""
 
 from __future__ import annotations
 
@@ -15,9 +15,18 @@ from ethbrake_marl.policies.network_spec import Activation, Float32s, NetworkSpe
 
 
 def onnx_model(manifest: Manifest, observation: ObservationSpec, tensors: Mapping[str, Float32s]) -> bytes:
-    """The ONNX model of a policy with these tensors: its actions, and the accelerations that they ask for."""
+    """Return the ONNX model of a policy, as bytes; it computes actions and the accelerations that these command.
+
+    Raises ``MissingExtra`` without the package onnx.
+
+    Args:
+        manifest: manifest of the policy.
+        observation: its observation, which must contain the own braking and driving capacities.
+        tensors: its tensors, by name.
+
+    """
     with naming_extras():
-        import onnx  # only here: an extra
+        import onnx  # an optional extra, imported only here
     helper, float32, spec = onnx.helper, onnx.TensorProto.FLOAT, manifest.network
     nodes: list[Any] = []
     constants: list[Any] = []
@@ -35,7 +44,7 @@ def onnx_model(manifest: Manifest, observation: ObservationSpec, tensors: Mappin
     bounds = [constant(name, np.array(at, np.float32)) for name, at in (("lowest", -1.0), ("highest", 1.0))]
 
     def network(name: str, hidden: int, activation: Activation) -> str:
-        """One network of the policy, from the observation on."""
+        """Add the network whose tensors begin with ``name``, from the observation on; return its output's name."""
         x = "observation"
         for layer in [*(f"{name}.{k}" for k in range(hidden)), f"{name}.output"]:
             weight, bias = (constant(f"{layer}.{part}", tensors[f"{layer}.{part}"]) for part in ("weight", "bias"))
@@ -45,10 +54,10 @@ def onnx_model(manifest: Manifest, observation: ObservationSpec, tensors: Mappin
         return x
 
     def actor(spec: NetworkSpec, prefix: str) -> str:
-        """The actions [n, 1] of a policy, or of one among which it chooses."""
+        """Add the policy whose tensors begin with ``prefix``; return the name of its actions [n, 1]."""
         outputs = [network(prefix + name, len(spec.policy_hidden), spec.activation) for name in spec.actors]
         x = outputs[0]
-        if len(outputs) > 1:  # the one that the gate chooses
+        if len(outputs) > 1:  # take the expert that the gating network selects
             gate = network(f"{prefix}gate", len(spec.gate_hidden), spec.activation)
             chosen = node("ArgMax", [gate], axis=1, keepdims=1)
             x = node("GatherElements", [node("Concat", outputs, axis=1), chosen], axis=1)
@@ -63,7 +72,7 @@ def onnx_model(manifest: Manifest, observation: ObservationSpec, tensors: Mappin
         return node("GatherElements", [node("Concat", [*members, actions], axis=1), chosen], axis=1)
 
     action = node("Identity", [actor(spec, "")], output="action")
-    capacities = []  # in m/s2, [n, 1]
+    capacities = []  # braking and driving capacity in m/s2, [n, 1] each
     features = [f.name for f in observation.features]
     for name in ("own.braking_capacity", "own.driving_capacity"):
         column = features.index(name)
@@ -78,7 +87,7 @@ def onnx_model(manifest: Manifest, observation: ObservationSpec, tensors: Mappin
     found = [helper.make_tensor_value_info(name, float32, ["n", 1]) for name in ("action", "acceleration_mps2")]
     graph = helper.make_graph(nodes, "policy", given, found, constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], producer_name="ethbrake-marl")
-    model.ir_version = 8  # old enough for every runtime since 2022
+    model.ir_version = 8  # supported by every runtime since 2022
     told = {
         "algorithm": manifest.algorithm,
         "manifest_sha256": manifest.manifest_sha256,

@@ -1,4 +1,4 @@
-"""A policy in memory: its manifest, its tensors, and the actions that it takes."""
+"""A policy in memory: its manifest, its tensors and its deterministic action."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ WEIGHTS = "weights.safetensors"
 
 @dataclass(frozen=True)
 class Policy:
-    """A policy in memory: its manifest, its tensors, and ``policy(observation)`` for the deterministic action.
+    """A policy in memory: manifest, tensors, and ``policy(observation)`` for the deterministic action.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -44,8 +44,8 @@ class Policy:
 
     """
 
-    manifest: Manifest
-    tensors: Mapping[str, Float32s]
+    manifest: Manifest  # network, observation, training, versions and hashes
+    tensors: Mapping[str, Float32s]  # weights and biases by name, see ``NetworkSpec.tensors``
 
     def __repr__(self) -> str:
         told, scenario = self.manifest, self.manifest.scenario.get("name")
@@ -64,35 +64,40 @@ class Policy:
 
     @cached_property
     def observation(self) -> ObservationSpec:
-        """What to observe for this policy, at the time steps of the scenario that it was trained on.
+        """The observation that this policy takes, with the time step of the scenario that it was trained on.
 
-        Found from the names at first use, which takes as long as to act. Raises ``UnknownName``.
+        It is built from the feature names on first use. Raises ``UnknownName`` if a feature does not exist any more.
         """
         spec, step = self.manifest.observation.spec, self.manifest.scenario.get("time_step_s")
         return spec.at_steps_of(float(step)) if isinstance(step, int | float) else spec
 
     def policy_sha256(self) -> str:
-        """The hash in its manifest."""
+        """Return the hash of the policy (manifest and weights), as hexadecimal digits."""
         return self.manifest.manifest_sha256
 
     @property
     def steps(self) -> int:
-        """Decisions of learners after which it was taken."""
+        """Number of learners' decisions in training before the policy was saved."""
         return self.manifest.steps
 
     @property
     def drivers(self) -> dict[str, Policy]:
-        """The policy that drives each of its learners."""
+        """Vehicle -> policy for each vehicle that the policy learned to control: ``{"vehicle_2": policy}``."""
         return dict.fromkeys(self.manifest.learners, self)
 
     @classmethod
     def make(
         cls, tensors: Mapping[str, Float32s], *, observation: ObservationSpec | ObservationSchema, **manifest: Any
     ) -> Self:
-        """A policy from ``tensors`` and the fields of ``Manifest`` (all but hashes and format, which follow).
+        """Make a policy from tensors and the fields of its manifest; hashes and format are computed.
 
-        ``versions`` are the installed ones where they are not given. Raises ``InvalidInput`` naming the tensor or field
-        that does not fit.
+        Args:
+            tensors: weights and biases by name, see ``NetworkSpec.tensors``.
+            observation: the observation that the networks take.
+            **manifest: the other fields of ``Manifest``; ``versions`` defaults to the installed versions.
+
+        Raises ``InvalidInput`` naming the tensor or field that does not fit.
+
         """
         data = _serialise(tensors)
         seen = observation if isinstance(observation, ObservationSchema) else ObservationSchema.of(observation)
@@ -110,7 +115,7 @@ class Policy:
 
     @property
     def among(self) -> tuple[Policy, ...]:
-        """The policies among which it chooses; most choose among none."""
+        """The policies that this policy's network chooses among (``NetworkSpec.among``); empty for most policies."""
         follows = {"network", "observation", "format_version", "weights_sha256", "manifest_sha256"}
         fields = self.manifest.model_dump(exclude=follows)
         found = []
@@ -122,26 +127,26 @@ class Policy:
 
     @staticmethod
     def stands_in(folder: Path) -> bool:
-        """Whether the files of a bundle stand in ``folder``; they are not read."""
+        """Return whether ``folder`` contains the files of a policy bundle; they are not read."""
         return all((folder / name).is_file() for name in (MANIFEST, WEIGHTS))
 
     def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
-        """Write it as the new folder ``folder``, completely or not at all; raises ``AlreadyExists``.
+        """Write the bundle as a new folder, completely or not at all; raise ``AlreadyExists`` if the folder exists.
 
-        With ``replace`` a folder that is there goes once the new one is written.
+        With ``replace`` an existing folder is deleted once the new one is written.
         """
-        own = content_sha256(self.manifest.model_dump(mode="json"))  # an older version may have written keys that go
+        own = content_sha256(self.manifest.model_dump(mode="json"))  # keys of older versions are not written
         manifest = self.manifest.model_copy(update={"manifest_sha256": own})
         with new_folder(Path(folder), replace=replace) as partial:
             write_file(partial / WEIGHTS, _serialise(self.tensors))
             write_file(partial / MANIFEST, manifest.model_dump_json(indent=2).encode() + b"\n")
 
     def to_onnx(self) -> bytes:
-        """The ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
+        """Return the ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
 
-        The acceleration is the action times the own braking (below 0) or driving capacity (above 0), both read from the
-        observation. Results agree with ours within rounding, not to the bit: products are summed in another order.
-        Raises ``MissingExtra`` if the package onnx is not installed.
+        The acceleration is the action times the own braking capacity (action below 0) or driving capacity (above 0),
+        both read from the observation. Results agree with this package's within rounding, not to the bit, because
+        products are summed in another order. Raises ``MissingExtra`` if the package onnx is not installed.
         """
         return onnx_model(self.manifest, self.observation, self.tensors)
 
@@ -151,7 +156,11 @@ def _serialise(tensors: Mapping[str, Float32s]) -> bytes:
 
 
 def checked_tensors(data: bytes, manifest: Manifest) -> dict[str, Float32s]:
-    """Check ``data`` against the tensor table, then read it; raises ``ValueError`` naming the tensor."""
+    """Load the tensors of a policy from safetensors ``data``, after checking names and shapes against its ``manifest``.
+
+    The result maps names to read-only arrays. Raises ``ValueError`` naming the first tensor that does not fit or is not
+    finite.
+    """
     rows = [ArrayRow(row.name, "F32", row.shape) for row in manifest.network.tensors]
     check_arrays(safetensors_headers(data), rows, "tensor")
     try:

@@ -1,7 +1,7 @@
-"""Policies that come with the package, and how they are chosen by name.
+"""Policies that ship with the package, and how they are chosen by name.
 
-Each is a folder of ``_policies/``: a bundle, and beside it ``card.md``, which says what it was trained on, how good
-it is and where it is bad.
+Each is a folder in ``_policies/`` with a bundle and ``card.md``, which says what the policy was trained on, how good it
+is and where it fails.
 """
 
 from __future__ import annotations
@@ -20,17 +20,22 @@ _FOLDER = Path(__file__).resolve().parents[1] / "_policies"
 
 
 def shipped_policies() -> dict[str, Path]:
-    """Name -> folder of every policy that ships."""
+    """Return name -> folder of the bundle of every shipped policy."""
     return {path.parent.name: path.parent for path in sorted(_FOLDER.glob("*/policy"))}
 
 
 def shipped_name(kind: str, scenario: Scenario | None, harm_count: HarmCount) -> str:
-    """Name of the policy of this kind for ``scenario``, of those trained for ``harm_count`` if there is one.
+    """Return the name of the shipped policy that fits ``kind`` and ``scenario`` best.
 
-    ``universal`` is for all scenarios, ``ppo`` and ``sac`` for the one that they were trained on, ``ppo-SCENARIO`` and
-    ``sac-SCENARIO`` for that one; ``-total`` behind says that a policy was trained for total harm. ``policy`` is the
-    one whose name ends in the scenario's, where ``universal`` does more harm, and ``universal`` elsewhere. Raises
-    ``InvalidInput`` listing what ships.
+    ``ppo-SCENARIO`` and ``sac-SCENARIO`` are for one scenario; the suffix ``-total`` means trained for total harm.
+    Raises ``InvalidInput`` with a list of the shipped policies if none fits.
+
+    Args:
+        kind: ``universal``: the policy for all scenarios; ``ppo`` or ``sac``: one trained on this scenario; ``policy``:
+            the policy whose name ends in the scenario's, otherwise ``universal``.
+        scenario: scenario in which the policy will be used; None: any.
+        harm_count: preferred harm of the training: ``"first"`` impact of each pair, or ``"total"``.
+
     """
     names, here = shipped_policies(), None if scenario is None else scenario.name
     if kind == "policy":
@@ -54,7 +59,7 @@ def shipped_name(kind: str, scenario: Scenario | None, harm_count: HarmCount) ->
 
 
 def load_shipped(name: str) -> Policy:
-    """The shipped policy called ``name``; raises ``UnknownName`` with a suggestion."""
+    """Load the shipped policy called ``name``, such as ``universal``; raise ``UnknownName`` with a suggestion."""
     folders = shipped_policies()
     if name not in folders:
         raise unknown_name("shipped policy", name, folders)
@@ -64,9 +69,17 @@ def load_shipped(name: str) -> Policy:
 def load_named_policy(
     path: str, kind: str = "ppo", scenario: Scenario | None = None, harm_count: HarmCount = "first"
 ) -> Policy:
-    """The policy of a run or bundle at ``path``; ``shipped``: the one of this kind for ``scenario``; ``shipped/NAME``.
+    """Load a policy: from a folder, or a shipped one.
 
-    A folder that is called so is ``./shipped``. Raises what ``load_policy`` and the functions above raise.
+    Args:
+        path: a run or a bundle, ``shipped/NAME``, or ``shipped``: the one that ``shipped_name`` selects. A folder of
+            that name is written ``./shipped``.
+        kind: see ``shipped_name``; used only for ``shipped``.
+        scenario: see ``shipped_name``.
+        harm_count: see ``shipped_name``.
+
+    Raises what ``load_policy``, ``load_shipped`` and ``shipped_name`` raise.
+
     """
     head, slash, name = path.partition("/")
     if head != SHIPPED:

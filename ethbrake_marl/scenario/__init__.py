@@ -1,4 +1,4 @@
-"""Scenarios: strict YAML files that describe families of worlds, and the reproducible lists drawn from them."""
+"""Scenarios: strict YAML files that describe families of worlds, and reproducible lists of worlds drawn from them."""
 
 from typing import TYPE_CHECKING
 

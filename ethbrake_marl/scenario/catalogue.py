@@ -1,4 +1,4 @@
-"""The catalogue of scenarios: those that ship, those of registered folders, and files by path."""
+"""The catalogue of scenarios. Shipped and registered scenarios are found by name, other files by path."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def shipped_folder(folder: Literal["scenarios", "train"] = "scenarios") -> Path:
-    """The scenarios, or recipes, that ship: the checkout's ``folder``, or the copy inside an installed package.
+    """Return the folder of the shipped scenarios, or of the shipped recipes if ``folder`` is ``"train"``.
 
-    Raises ``InvalidInput`` when neither is there: the installation is damaged.
+    It lies in the checkout or in the installed package. Raises ``InvalidInput`` if neither folder exists: the
+    installation is damaged.
     """
     checkout, installed = _PACKAGE.parent / folder, _PACKAGE / "_data" / folder
     if (_PACKAGE.parent / "pyproject.toml").is_file() and checkout.is_dir():
@@ -37,30 +38,30 @@ def shipped_folder(folder: Literal["scenarios", "train"] = "scenarios") -> Path:
 
 _SUFFIXES = (".yaml", ".yml")
 
-FOLDERS: dict[str, Path] = {}  # registered, by their path
+FOLDERS: dict[str, Path] = {}  # path as text -> registered folder
 
 
 @dataclass(frozen=True, slots=True)
 class CatalogueEntry:
-    """One shipped or registered scenario."""
+    """Name, title and file of a shipped or registered scenario."""
 
-    name: str
-    title: str
-    path: Path
-    origin: str = "shipped"  # or the registered folder
+    name: str  # name of the scenario
+    title: str  # one line for lists and figures
+    path: Path  # its file
+    origin: str = "shipped"  # ``shipped``, or the path of the registered folder
 
     @property
     def shipped(self) -> bool:
-        """Whether this package brings it."""
+        """Whether the scenario ships with this package."""
         return self.origin == "shipped"
 
 
 def register_scenarios(folder: str | os.PathLike[str]) -> None:
-    """Make the scenarios of a folder known by name, ``--scenario my-name``: every ``my-name.yaml`` directly in it.
+    """Register the scenarios of a folder by name: every ``my-name.yaml`` directly in it becomes ``--scenario my-name``.
 
-    Whether a file is in order is said when it is used. Registering the same folder again changes nothing. Raises
-    ``InvalidInput`` for a folder that is missing or has no such file, ``AlreadyExists`` for one that has a name which a
-    shipped scenario, or one of another registered folder, has.
+    A file is checked when it is used. Registering the same folder again changes nothing. Raises ``InvalidInput`` for a
+    folder that is missing or has no such file; ``AlreadyExists`` if one of its names belongs to a shipped scenario or
+    to one of another registered folder.
     """
     path = Path(folder).resolve()
     if not path.is_dir():
@@ -78,12 +79,12 @@ def register_scenarios(folder: str | os.PathLike[str]) -> None:
 
 
 def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenario:
-    """Load a shipped or registered scenario by name, or a file by path (see ``scenario_path``), or what one would say.
+    """Load a scenario by name, by path of its file, or from a mapping with the content of such a file.
 
-    A ``Scenario`` is given back as it is.
+    A ``Scenario`` is returned unchanged. ``scenario_path`` says how names and paths are found.
 
-    Raises ``UnknownName`` with a suggestion for an unknown name, and ``InvalidInput`` with file, line, path inside
-    it and value for a file that does not describe a scenario, or whose name differs from the file's.
+    Raises ``UnknownName`` with a suggestion for an unknown name; ``InvalidInput`` with file, line, path inside the file
+    and value for a file that does not describe a scenario, or whose ``name`` differs from the file's name.
     """
     if isinstance(scenario, Scenario):
         return scenario
@@ -94,13 +95,13 @@ def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenar
 
 
 def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
-    """The file of a scenario; it need not exist when a path is given.
+    """Return the path of a scenario's file. If ``name_or_path`` is a path, the file need not exist.
 
-    A path is what ends in ``.yaml`` or ``.yml``. A shipped scenario has its name, ``stress-wide``; where that begins
-    with its folder's, ``stress/wide`` means the same unless there is such a file. A registered one has its name. Any
-    other name, ``mine`` or ``my/folder/mine``, is that of ``mine.yaml`` in ``folder``. Shipped and registered names go
-    first, so that a stray file cannot change what a paper's command means.
-    Raises ``UnknownName`` with a suggestion for an unknown name.
+    Text that ends in ``.yaml`` or ``.yml`` is a path. A shipped scenario is found by name, ``stress-wide``; if its name
+    begins with the name of its folder, ``stress/wide`` means the same, unless such a file exists. A registered scenario
+    is found by name. Any other name, ``mine`` or ``my/folder/mine``, means ``mine.yaml`` in ``folder``. Shipped and
+    registered names come first, so a stray file cannot change what a command in a paper means. Raises ``UnknownName``
+    with a suggestion for an unknown name.
     """
     text = str(name_or_path)
     path = folder / text
@@ -121,21 +122,24 @@ def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
     raise unknown_name("scenario", text, paths)
 
 
-BENCHMARK = (  # each ships with a table of best known harm, so that shares of the possible reduction are known
+BENCHMARK = (  # each ships with a table of best known harm, the basis of shares of the possible reduction
     *("paper-random", "paper-random-brake-only", "paper-random-obstacle", "paper-delay-high", "paper-distance"),
     *("realistic-motorway", "realistic-mixed", "stress-wide", "cooperation-2-blocked", "cooperation-2-five"),
 )
 
 
 def group_of_scenarios(name: str) -> list[str]:
-    """``benchmark``, or the scenarios of a folder of those that ship, such as ``standards``; else none."""
+    """Return the names of the scenarios in a group: ``benchmark``, or a folder of shipped ones such as ``standards``.
+
+    The list is empty for any other name.
+    """
     if name == "benchmark":
         return list(BENCHMARK)
     return sorted(stem for stem, path in _shipped_paths().items() if path.parent.name == name)
 
 
 def list_scenarios() -> list[CatalogueEntry]:
-    """Every shipped and registered scenario, sorted by name."""
+    """Return every shipped and registered scenario, sorted by name."""
     shipped = _shipped_paths()
     scenarios = [(_load(path), path) for path in _known_paths().values()]
     entries = [
@@ -146,7 +150,10 @@ def list_scenarios() -> list[CatalogueEntry]:
 
 
 def _known_paths() -> dict[str, Path]:
-    """Name -> file of every shipped and registered scenario; raises ``AlreadyExists`` for a name that two have."""
+    """Return name -> file of every shipped and registered scenario.
+
+    Raise ``AlreadyExists`` if two have the same name.
+    """
     shipped = _shipped_paths()
     known = dict(shipped)
     for folder in FOLDERS.values():
@@ -180,9 +187,9 @@ def _load(path: Path) -> Scenario:
 
 
 def _with_members(document: Document, folder: Path) -> Document:
-    """The document with what it names in place of the names: members of a mixture, and files of tables.
+    """Return the document with the content of other files inserted: scenarios of a mixture, and rows of tables.
 
-    Paths count from ``folder``.
+    Paths in the document are relative to ``folder``.
     """
     content = _with_rows(document, (), document.content, folder)
     listed = content.get("mixture") if isinstance(content, dict) else None
@@ -200,7 +207,15 @@ def _with_members(document: Document, folder: Path) -> Document:
 
 
 def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> Any:
-    """What a scenario says, with the rows of its table's file."""
+    """Return the content of one scenario, with the rows of its table read from the table's file.
+
+    Args:
+        document: file that contains the scenario, for messages.
+        at: path of the scenario inside the document; ``()``: all of it.
+        content: the scenario's content.
+        folder: folder that the path of the table's file starts from.
+
+    """
     table = content.get("table") if isinstance(content, dict) else None
     if not (isinstance(table, dict) and isinstance(table.get("file"), str)) or "rows" in table:
         return content
@@ -209,7 +224,7 @@ def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> 
         raise InvalidInput(f"{where}: table.file = {table['file']}: must be a path from the scenario's folder on")
     with document.refusing_at((*at, "table", "file")):
         rows = read_rows(folder / path, table.get("columns"), table.get("weights"))
-        kept = {key: value for key, value in table.items() if key != "file"}  # the rows are the scenario, not the file
+        kept = {key: value for key, value in table.items() if key != "file"}  # the file's name does not matter
         return {**content, "table": {**kept, **rows}}
 
 
@@ -236,7 +251,10 @@ _HEAD = """\
 
 
 def check_file_name(kind: str, name: str) -> None:
-    """Raise ``InvalidInput`` for what cannot be the name of a scenario or recipe, which is that of its file."""
+    """Raise ``InvalidInput`` unless ``name`` is valid for a scenario or recipe, and so for its file.
+
+    ``kind`` is ``"scenario"`` or ``"recipe"``, for the message.
+    """
     if re.fullmatch(NAME_PATTERN, name) is None:
         raise InvalidInput(
             f"{kind} name {name!r}: must be 1 to 64 lower case letters, digits, - and _, beginning with a letter or"
@@ -245,10 +263,10 @@ def check_file_name(kind: str, name: str) -> None:
 
 
 def new_scenario_text(name: str, based_on: str = "paper-random") -> str:
-    """Text of a commented YAML file for a new scenario ``name`` with the values of ``based_on``, all keys written out.
+    """Return a commented YAML file for a new scenario ``name`` with the values of the scenario ``based_on``.
 
-    A key that stands for another way to declare gaps or speeds is there as a comment with an example.
-    Save it as ``<name>.yaml``. Raises ``InvalidInput`` for a name that cannot be one, or an unknown ``based_on``.
+    All keys are written out. A key for another way to declare gaps or speeds is included as a comment with an example.
+    Save the text as ``<name>.yaml``. Raises ``InvalidInput`` for an invalid name or an unknown ``based_on``.
     """
     check_file_name("scenario", name)
     base = load_scenario(based_on)
@@ -276,11 +294,11 @@ _EXAMPLES = {
     "table": "{file: rows.csv, columns: [gap_1_m, gap_2_m]}",
     "roles": "{vehicle_2: learner}",
     "v2x": "nominal",
-}  # of keys that are no quantity and may be left out
+}  # examples for optional keys that are not quantities
 
 
 def _line(key: str, values: Mapping[str, object]) -> str:
-    """``key: value``; a key that goes only with the other way to declare the same stands in a comment."""
+    """Return the line ``key: value`` of a scenario file, or a comment with an example if ``values`` lacks the key."""
     if key in values:
         return f"{key}:{_value(values[key])}"
     if key in QUANTITY.declared:
@@ -290,7 +308,7 @@ def _line(key: str, values: Mapping[str, object]) -> str:
 
 
 def _short_member(entry: dict[str, Any]) -> dict[str, Any]:
-    """A member of a mixture by its name, where that is a shipped scenario that says the same."""
+    """Return an entry of a mixture's list with a shorter ``scenario``: only the name, if it equals a shipped one."""
     content, name = entry["scenario"], entry["scenario"]["name"]
     as_shipped = name in _shipped_paths() and member_content(load_scenario(name)) == content
     return {**entry, "scenario": name} if as_shipped else entry
@@ -307,7 +325,7 @@ def _comment(key: str) -> str:
 
 
 def _value(value: object) -> str:
-    """Roles one per line, everything else on the line of its key."""
+    """Format a value for the line of its key; a mapping of texts, such as roles, becomes one line per entry."""
     if isinstance(value, dict) and all(isinstance(entry, str) for entry in value.values()):
         return "".join(f"\n  {key}: {flow_text(entry)}" for key, entry in value.items())
     return f" {flow_text(value)}"

@@ -1,23 +1,25 @@
-"""The channel between vehicles: V2X messages per link, lost information, on-board sensing as the fall-back.
+"""The channel between vehicles: V2X messages on each link, losses, and on-board sensing as the fall-back.
 
-A message carries its sender's state, capacities and latency. On the link from vehicle j to vehicle i it is of use from
+A message carries its sender's state, capacities and latency. On the link from vehicle j to vehicle i, i can use it
+from this time on:
 
     tau_ij = U(0, T) + k T + L_radio + t_proc + t_act        (T the message period)
 
-on, where ``U(0, T)`` is the wait for the next message, ``k`` the periods lost to a burst (Gilbert-Elliott channel:
-``P(k >= m) = p / (p + r) (1 - r)^(m - 1)``), and with the share ``lost`` of links no message ever arrives. Sensors see
-the direct neighbours: they add a hop of ``sensing_s``. Vehicle i reacts from
+``U(0, T)`` is the wait for the next message. ``k`` is the number of periods lost to a burst (Gilbert-Elliott channel:
+``P(k >= m) = (p / (p + r)) (1 - r)^(m - 1)``). On the share ``lost`` of the links no message ever arrives. Sensors see
+the direct neighbours, with a delay of ``sensing_s``, called a hop. Vehicle i can react from
 
     latency_i = max(own latency_i, min(tau_i1, latency_(i-1) + hop_(i, i-1)))
 
-on (nobody reacts to an emergency before its news: Vehicle 1's own message, or the sight of the vehicle ahead that
-brakes), and knows of vehicle j from ``max(latency_i, tau_ij)``, or ``max(latency_i, hop_ij)`` for a direct neighbour
-in sight if that is sooner. Of latencies themselves only the own parts are observed: what a channel has drawn shows when
-it happens. The rule of the paper, preset ``paper``: everything, from the own latency on.
+on, because nobody reacts to an emergency before learning of it: by Vehicle 1's own message, or by seeing the vehicle
+ahead brake. Vehicle i knows of vehicle j from ``max(latency_i, tau_ij)``, or for a direct neighbour in sight from
+``max(latency_i, hop_ij)`` if that is earlier. Of latencies a vehicle observes only the own parts: delays that the
+channel draws become visible only when they end. Under the preset ``paper``, the paper's rule, a vehicle knows
+everything from its own latency on.
 
-With ``persistence: first`` that is all: from its first message on j is known as it is. With ``periodic`` each message
-is one of many, T apart, and lost or not by the same Gilbert-Elliott channel; what i knows is as old as the newest that
-arrived (``physics.messages``).
+With ``persistence: first`` that is all: from its first message on, the present state of j is known. With ``periodic``
+messages follow every T, each lost or not by the same Gilbert-Elliott channel. What i knows of j is then as old as the
+newest message that arrived (``physics.messages``).
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.physics.messages import Messages
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Vehicles, Worlds
 
-PER_LINK = 4  # uniform numbers of one link: wait, burst, loss, hop; one Philox counter
+PER_LINK = 4  # uniform numbers per link: wait, burst, loss, hop; the output of one Philox counter
 
 Hears = Literal["all", "front", "none"]
 
@@ -54,27 +56,30 @@ Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
 
 class Equipage(FileModel):
-    """What one vehicle, or a type of vehicles, has of V2X."""
+    """V2X equipment of one vehicle or of a type of vehicles."""
 
     sends: bool = Field(default=True, description="whether others can hear of it")
     hears: Hears = Field(default="all", description="whose messages it gets, of those that the channel brings")
 
 
 class Equipped(NamedTuple):
-    """Who has what of V2X in n worlds; of one world also what every possible world has."""
+    """V2X equipment of the vehicles in n worlds.
 
-    sends: Bools  # [n, N]
-    hears: Ints  # [n, N] index of a word of ``Hears``
+    It has a single row (n = 1) if all worlds share it, or if it says what every vehicle has at least in all worlds.
+    """
+
+    sends: Bools  # [n, N] whether vehicle i sends messages
+    hears: Ints  # [n, N] whose messages vehicle i gets: 0 everybody's, 1 only those from ahead, 2 nobody's
 
     @classmethod
     def of(cls, equipage: Sequence[Equipage]) -> Equipped:
-        """One world of these vehicles, [1, N]."""
+        """Return the equipment of one world whose vehicle i has ``equipage[i]``, [1, N]."""
         hears = [get_args(Hears).index(each.hears) for each in equipage]
         return cls(np.array([[each.sends for each in equipage]]), np.array([hears]))
 
     @property
     def unheard(self) -> Bools:
-        """Whether vehicle i never gets a message of vehicle j, [n, N, N]."""
+        """Whether vehicle i never gets a message from vehicle j, [n, N, N]."""
         receiver, sender = np.indices((self.sends.shape[1],) * 2)
         hears = self.hears[:, :, np.newaxis]
         unheard: Bools = ~self.sends[:, np.newaxis] | (hears == 2) | ((hears == 1) & (sender >= receiver))
@@ -82,31 +87,38 @@ class Equipped(NamedTuple):
 
 
 class Channel(NamedTuple):
-    """Everything that decides who knows what, and when."""
+    """All settings that decide what each vehicle knows, and when; symbols as at the top of this file."""
 
-    timing: Literal["latency", "fixed", "messages"]  # tau: the receiver's own latency, a number, or generated
-    hears: Hears = "all"  # whose messages a vehicle gets: all vehicles', only those from ahead, nobody's
-    senses: Senses = "both"  # direct neighbours in sight
-    link_latency_s: float = 0.0  # tau of timing "fixed"
-    loss_begins: float = 0.0  # p, per message period
-    loss_ends: float = 1.0  # r, per message period; mean burst 1 / r
-    lost: float = 0.0  # share of links on which nothing ever arrives
-    message_period_s: float = 0.1  # T
-    radio_s: float = 0.02  # L_radio
-    processing_s: float = 0.1  # t_proc
-    actuation_s: float = 0.2  # t_act
-    sensing_s: tuple[float, float] = (0.8, 1.1)  # a hop is drawn evenly from it
-    persistence: Persistence = "first"  # whether what was once heard stays present, or each message grows old
+    # delay tau of a link: "latency": none beyond the receiver's own latency; "fixed": link_latency_s; "messages": drawn
+    # from the settings of messages and losses below
+    timing: Literal["latency", "fixed", "messages"]
+    hears: Hears = "all"  # whose messages a vehicle receives: everybody's, only from vehicles ahead, nobody's
+    senses: Senses = "both"  # which direct neighbours are in sight
+    link_latency_s: float = 0.0  # delay tau of every link for timing "fixed" (s)
+    loss_begins: float = 0.0  # p, probability per message period that a burst of losses begins
+    loss_ends: float = 1.0  # r, probability per message period that it ends; mean burst 1 / r periods
+    lost: float = 0.0  # share of links on which no message ever arrives
+    message_period_s: float = 0.1  # T, time between two messages (s)
+    radio_s: float = 0.02  # L_radio, time on the air (s)
+    processing_s: float = 0.1  # t_proc, time until the receiver has read the message (s)
+    actuation_s: float = 0.2  # t_act, time until the brakes answer (s)
+    sensing_s: tuple[float, float] = (0.8, 1.1)  # smallest and largest delay of seeing a direct neighbour, a hop (s)
+    # what a vehicle knows of a sender after its first message: "first": the sender's present state; "periodic": the
+    # state in the newest message that has arrived
+    persistence: Persistence = "first"
 
     @property
     def delay_s(self) -> float:
-        """Time from sending a message until it is of use (s); infinite where nobody sends any."""
+        """Time from sending a message to its use (s); infinite if no messages are sent."""
         if self.timing == "messages":
             return self.radio_s + self.processing_s + self.actuation_s
         return self.link_latency_s if self.timing == "fixed" else math.inf
 
     def samples(self, time_step_s: float) -> int:
-        """Samples of its state that a vehicle keeps for messages on their way; 0 without periodic messages."""
+        """Return how many samples of its state a vehicle stores for delayed messages; 0 without periodic messages.
+
+        ``time_step_s``: time between two samples, which is the time between two decisions (s).
+        """
         return Messages.ring_length(self.delay_s, time_step_s) if self.persistence == "periodic" else 0
 
 
@@ -119,11 +131,11 @@ CHANNELS = {
     "sensors-only": Channel("messages", hears="none"),
 }
 
-PRESETS = tuple(CHANNELS)  # those that are built in; ``register_preset`` adds to the channels
+PRESETS = tuple(CHANNELS)  # names of the built-in presets; ``register_preset`` adds more to CHANNELS
 
-_LATEST = np.array([[1.0, 0.0, 1.0, 1.0]])  # uniform numbers of one link: a whole period, the longest burst, not lost
+_LATEST = np.array([[1.0, 0.0, 1.0, 1.0]])  # uniform numbers of the latest possible message that is not lost
 
-_OF_LATER = ("message_period_s", "loss_begins", "loss_ends")  # of every message after the first one
+_OF_LATER = ("message_period_s", "loss_begins", "loss_ends")  # settings that apply to messages after the first
 
 _OF_MESSAGES = ("message_period_s", "loss_begins", "loss_ends", "radio_s", "processing_s", "actuation_s")
 
@@ -144,7 +156,10 @@ Preset = Annotated[str, AfterValidator(_known_preset), _PresetSchema]
 
 
 class V2X(FileModel):
-    """A preset, and what differs from it; see ``docs/v2x.md``. Written as its name alone, or as a mapping."""
+    """The V2X channel of a scenario: a preset and the settings that differ from it; see ``docs/v2x.md``.
+
+    In YAML it is written as the preset's name alone, or as a mapping.
+    """
 
     preset: Preset = Field(
         default="paper", description="where to start from; the other keys take the place of its values"
@@ -215,12 +230,15 @@ class V2X(FileModel):
         right = (
             "without sight of the vehicle ahead, one that hears nothing would never react; use senses: both or front"
         )
-        # one that is given: only preset paper itself sees nobody
+        # name a key that the user gave: of the presets only paper has senses none
         self._require(not blind, "senses" if self.senses is not None else "lost", right)
         return self
 
     def _leave_out(self, names: tuple[str, ...], why: str) -> None:
-        """Refuse the first of these keys that is given: it would do nothing."""
+        """Raise an error for the first of the keys ``names`` that is given, because it would have no effect.
+
+        ``why`` says the reason in the message.
+        """
         for name in names:
             self._require(getattr(self, name) is None, name, f"{why}; leave it out")
 
@@ -230,25 +248,25 @@ class V2X(FileModel):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """A preset's name, or a mapping."""
+        """Return the JSON schema: the name of a preset, or a mapping."""
         mapping = handler(core)
         return {"anyOf": [{"enum": list(CHANNELS), "type": "string"}, mapping]}
 
     @property
     def channel(self) -> Channel:
-        """The preset with everything that was given in its place."""
+        """The preset's channel with the given settings replaced."""
         given = {name: getattr(self, name) for name in Channel._fields[1:] if getattr(self, name) is not None}
         base = CHANNELS[self.preset]
         return base._replace(timing="fixed" if self.link_latency_s is not None else base.timing, **given)
 
     @property
     def by_link(self) -> bool:
-        """Whether anything differs from the paper's rule: all news, from the own latency on."""
+        """Whether the channel differs from the paper's rule: a vehicle knows everything after its own latency."""
         return self.channel != CHANNELS["paper"]
 
     @property
     def drawn(self) -> bool:
-        """Whether chance decides: what is known when differs from world to world."""
+        """Whether what is known, and when, is random: it differs from world to world."""
         channel = self.channel
         low, high = channel.sensing_s
         by_messages = channel.timing == "messages" and channel.hears != "none"
@@ -257,7 +275,13 @@ class V2X(FileModel):
         return self.by_link and (by_messages or lossy or (channel.senses != "none" and low != high))
 
     def latest_reaction_s(self, own_latency_s: Floats, equipped: Equipped) -> Floats:
-        """Upper bound of each vehicle's latency, [N], from that of its own part [N], and what all surely have."""
+        """Return an upper bound of the time at which each vehicle can react, [N] s.
+
+        Args:
+            own_latency_s: upper bounds of the vehicles' own latencies, without the channel, [N] s.
+            equipped: equipment that the vehicles have at least in every world, [1, N].
+
+        """
         channel, latest = self.channel, own_latency_s.copy()
         if channel.timing == "latency":
             return latest
@@ -270,13 +294,19 @@ class V2X(FileModel):
 
     @staticmethod
     def width(vehicles: int) -> int:
-        """How many uniform numbers the news of a line takes."""
+        """Return how many uniform numbers the links of a line of ``vehicles`` vehicles need per world."""
         return PER_LINK * vehicles * vehicles
 
     def with_news(self, vehicles: Vehicles, u: Floats, equipped: Equipped) -> Vehicles:
-        """These vehicles with the latencies and the news of the channel drawn by ``u`` [n, N * N * PER_LINK] in [0, 1).
+        """Return these vehicles with the latencies, and the times of first knowledge, that the channel gives them.
 
-        Their latencies, so far all own, stay as ``own_latency_s``.
+        The previous latencies, which must be without a channel, become ``own_latency_s``.
+
+        Args:
+            vehicles: parameters of n worlds.
+            u: uniform numbers in [0, 1) for the links, [n, N * N * PER_LINK].
+            equipped: V2X equipment, of each world or one for all.
+
         """
         (N, channel), (heard, seen) = (vehicles.latency_s.shape[1], self.channel), self.heard_and_seen(u, equipped)
         latency = vehicles.latency_s.copy()
@@ -285,11 +315,19 @@ class V2X(FileModel):
                 told = np.minimum(heard[:, i, 0], latency[:, i - 1] + seen[:, i, i - 1])
                 latency[:, i] = np.maximum(latency[:, i], told)
         known = np.maximum(latency[:, :, np.newaxis], np.minimum(heard, seen))
-        known[:, np.arange(N), np.arange(N)] = latency  # no vehicle waits for a message from itself
+        known[:, np.arange(N), np.arange(N)] = latency  # a vehicle knows itself from its latency on
         return replace(vehicles, latency_s=latency, known_from_s=known)
 
     def heard_and_seen(self, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
-        """When a first message of vehicle j reaches vehicle i, and when i sees j, [n, N, N] s each; infinite: never."""
+        """Return when vehicle i can use the first message of vehicle j, and when i sees j, [n, N, N] s each.
+
+        Infinite means never.
+
+        Args:
+            u: uniform numbers in [0, 1) for the links, [n, N * N * PER_LINK].
+            equipped: V2X equipment, of each world or one for all.
+
+        """
         N = equipped.sends.shape[1]
         channel, links = self.channel, u.reshape(len(u), N, N, PER_LINK)
         low, high = channel.sensing_s
@@ -303,14 +341,14 @@ class V2X(FileModel):
         return heard, np.where(in_sight[channel.senses], hop, np.inf)
 
     def with_channel(self, worlds: Worlds, u: Floats, key: Floats, time_step_s: float, equipped: Equipped) -> Worlds:
-        """These worlds at the alert with their news and, where messages are periodic, their columns, none sent yet.
+        """Return these worlds with what each vehicle knows when, and the columns of periodic messages.
 
         Args:
-            worlds: whose latencies are all own.
-            u: what the news is drawn by, [n, N * N * PER_LINK] in [0, 1).
-            key: [n] in [0, 1), one for all later losses of a world.
-            time_step_s: between two decisions, at which vehicles sample their states.
-            equipped: who has what of it, in each world or in all.
+            worlds: worlds without a channel, at the alert (time 0).
+            u: uniform numbers for the links, [n, N * N * PER_LINK] in [0, 1).
+            key: seed of each world's later losses, [n] in [0, 1).
+            time_step_s: time between two decisions, at which vehicles sample their states.
+            equipped: V2X equipment, of each world or one for all.
 
         """
         channel = self.channel
@@ -325,9 +363,14 @@ class V2X(FileModel):
         return replace(worlds, messages=messages.columns)
 
     def with_fixed_news(self, worlds: Worlds, time_step_s: float, where: str, equipped: Equipped | None) -> Worlds:
-        """Worlds that somebody gives with this channel; ``InvalidInput`` where it leaves something to chance.
+        """Return worlds from the user with this channel; raise ``InvalidInput`` if the channel is random.
 
-        ``equipped``: who has what of it; None: that is drawn, too.
+        Args:
+            worlds: worlds without a channel.
+            time_step_s: time between two decisions, s.
+            where: source of the worlds, for the message.
+            equipped: V2X equipment of the vehicles, one row for all worlds; None: the scenario draws it.
+
         """
         if not self.by_link:
             return worlds
@@ -341,10 +384,16 @@ class V2X(FileModel):
 
 
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
-    """Message periods k lost to a burst, in the shape of the uniform numbers ``u`` in [0, 1).
+    """Return the number k of message periods that a burst of losses lasts, in the shape of ``u``.
 
-    ``k >= m`` exactly where ``u < p / (p + r) (1 - r)^(m - 1)``: the inverse distribution function of the
-    Gilbert-Elliott channel in its long-run state, by multiplication alone, so every machine gets the same k.
+    ``k >= m`` exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``: the inverse distribution function of the stationary
+    Gilbert-Elliott channel. It uses multiplication only, so every machine gets the same k.
+
+    Args:
+        u: uniform numbers in [0, 1).
+        loss_begins: probability p per message that a good channel turns bad.
+        loss_ends: probability r per message that a bad channel turns good again.
+
     """
     bound = loss_begins / (loss_begins + loss_ends)
     bounds = []
@@ -357,9 +406,14 @@ def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
 
 
 def link_delays(channel: Channel, u: Floats) -> Floats:
-    """The delay tau (s) of each link from its uniform numbers ``u`` [..., PER_LINK]; infinite where nothing arrives.
+    """Return the delay tau (s) of each link, [...]; infinite: no message arrives.
 
-    Where the receiver's own latency is all that counts, minus infinity.
+    Minus infinity for timing ``latency``, where only the receiver's own latency counts.
+
+    Args:
+        channel: settings of the channel.
+        u: uniform numbers in [0, 1) of each link, [..., PER_LINK].
+
     """
     delay = np.full(u.shape[:-1], -np.inf if channel.timing == "latency" else channel.link_latency_s)
     if channel.timing == "messages":
@@ -373,14 +427,14 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
 
 
 def register_preset(name: str, settings: Mapping[str, Any]) -> None:
-    """Make ``v2x: name`` known to every scenario.
+    """Register a channel under a name, so that every scenario can use ``v2x: name``.
 
     Args:
         name: 1 to 64 of ``a-z``, digits, ``-`` and ``_``.
-        settings: what a scenario would say, a preset and what differs from it: ``{"preset": "nominal", "lost": 0.1}``.
+        settings: what ``v2x`` in a scenario would contain, for example ``{"preset": "nominal", "lost": 0.1}``.
 
-    Registering the same again changes nothing. Raises ``AlreadyExists`` for another channel under a name that is taken,
-    ``InvalidInput`` for a name that is none and for settings that are no channel.
+    Registering the same channel again changes nothing. Raises ``AlreadyExists`` if the name belongs to another channel,
+    ``InvalidInput`` for an invalid name or settings that are not a channel.
 
     """
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:

@@ -1,6 +1,6 @@
-"""Checks of a scenario that concern a whole field or several fields at once.
+"""Checks of a scenario that concern a whole field or several fields together.
 
-Each raises pydantic's error for the first defect, with the path inside the field or file and the value.
+Each check raises pydantic's error for the first defect, with the path inside the field or file and the value.
 """
 
 from __future__ import annotations
@@ -17,11 +17,14 @@ from ethbrake_marl.scenario.distributions import support
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.roles import LEARNER, ScriptSpec
 
-MOST_SAMPLES = 1_000  # that a message may be older than the newest one
+MOST_SAMPLES = 1_000  # longest history of samples that delayed messages may need
 
 
 def check_whole(scenario: ScenarioFields) -> None:
-    """Fields that limit each other: quantities declared twice, time step, horizon, latency, speeds, gaps, scripts."""
+    """Check the fields of a scenario that depend on each other; raise pydantic's error for the first defect.
+
+    These are: quantities declared twice, time step, horizon, latency, channel, speeds, gaps, obstacle and scripts.
+    """
     alone = "speed_deviations_mps" in scenario.model_fields_set and scenario.line_speed_mps is None
     right = "needs line_speed_mps, the speed that it is added to"
     require(not alone, ("speed_deviations_mps",), scenario.speed_deviations_mps, right)
@@ -61,7 +64,7 @@ def check_whole(scenario: ScenarioFields) -> None:
 
 
 def _check_reactions(scenario: ScenarioFields) -> None:
-    """However late the news is, every vehicle may act before the horizon."""
+    """Raise an error unless every vehicle can act before the horizon, however late its news is."""
     for name in scenario.v2x.vehicles or ():
         right = f"unknown vehicle; this scenario has vehicle_1 ... vehicle_{scenario.vehicles}"
         require(name in scenario.vehicle_names, ("v2x", "vehicles", name), UNSHOWN, right)
@@ -104,7 +107,7 @@ def _check_speeds(scenario: ScenarioFields) -> None:
 
 
 def _check_derived(scenario: ScenarioFields) -> None:
-    """Gaps that follow from time gaps, and an obstacle's distance that follows from its margin, are in range."""
+    """Raise an error if a gap from a time gap, or an obstacle's distance from its margin, is out of range."""
     largest = QUANTITY.usual["gaps_m"].high
     for pair, (_, high) in enumerate(scenario.bounds("gaps_m") if scenario.time_gaps_s is not None else ()):
         right = f"is up to {high:g} m at the speed of vehicle_{pair + 2}; a gap must not be above {largest:g} m"
@@ -119,7 +122,10 @@ def _check_derived(scenario: ScenarioFields) -> None:
 
 
 def _check_scripts(scenario: ScenarioFields) -> None:
-    """A constant command is within the vehicle's capacity; where impacts are early, no script depends on the state."""
+    """Raise an error for a script with a command beyond capacity, or if vehicle_1 learns without an obstacle ahead.
+
+    If early impacts are rejected, also for a script that depends on the state.
+    """
     for i, script in scenario.scripts.items():
         deceleration = ScriptSpec.parse(script).hardest_mps2 or 0.0
         field = "braking_capacity_mps2" if deceleration > 0.0 else "driving_capacity_mps2"

@@ -1,4 +1,4 @@
-"""``ScenarioFields``: what a scenario file declares of a line of vehicles, and what follows from it alone."""
+"""``ScenarioFields``: the fields of a scenario file, and what follows from the fields alone."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from ethbrake_marl.physics.state import Floats, Ints, Worlds, as_road_allows
 from ethbrake_marl.scenario.channel import V2X, Equipage, Equipped
 from ethbrake_marl.scenario.distributions import LEAVE_OUT, AnyQuantity, AnyTypeQuantity, Quantity, TableColumn, support
 from ethbrake_marl.scenario.fields import ALSO, MEANING, QUANTITY, Entry, columns_of_table, is_tabled
+from ethbrake_marl.scenario.member import Member
 from ethbrake_marl.scenario.roles import LEARNER, Role, Roles, ScriptSpec
 from ethbrake_marl.scenario.vehicle_types import (
     ANY,
     LEFT_OUT,
     ListedByVehicle,
-    Member,
     ObjectiveName,
     PerVehicle,
     Table,
@@ -38,7 +38,7 @@ from ethbrake_marl.scenario.vehicle_types import (
 
 
 class ScenarioFields(FileModel):
-    """What is declared of a line of vehicles, and what follows from the declaration alone. See ``Scenario``."""
+    """The declared fields of a scenario, and what follows from the declaration alone. See ``Scenario``."""
 
     name: str = Field(pattern=NAME_PATTERN, description="name; equal to the file's name without .yaml")
     title: str = Field(default="", description="one line for lists and figures")
@@ -111,7 +111,7 @@ class ScenarioFields(FileModel):
     )
 
     _members: tuple[ScenarioFields, ...] = PrivateAttr(default=())
-    _columns: dict[Entry, TableColumn] = PrivateAttr(default_factory=dict)  # those of the table
+    _columns: dict[Entry, TableColumn] = PrivateAttr(default_factory=dict)  # columns of the table, by what they give
 
     @model_validator(mode="after")
     def _tabulated(self) -> ScenarioFields:
@@ -122,7 +122,10 @@ class ScenarioFields(FileModel):
 
     @classmethod
     def of_dump(cls, content: Mapping[str, Any]) -> Self:
-        """That of which ``model_dump`` wrote every key, also those that nobody gave; raises ``ValueError``."""
+        """Rebuild a scenario from the result of ``model_dump``, which also writes keys with default values.
+
+        Raises ``ValueError`` if the content is not a scenario.
+        """
         usual = {key: (None, field.default) for key, field in cls.model_fields.items()}
 
         def given(part: Any) -> Any:
@@ -130,7 +133,7 @@ class ScenarioFields(FileModel):
                 return {key: given(value) for key, value in part.items() if value is not None}
             return [given(each) for each in part] if isinstance(part, list | tuple) else part
 
-        usual["v2x"] = None, given(V2X().model_dump(mode="json"))  # beside a mixture it would hold for all members
+        usual["v2x"] = None, given(V2X().model_dump(mode="json"))  # next to a mixture it would apply to all members
 
         def declared(scenario: Mapping[str, Any]) -> dict[str, Any]:
             told = {key: given(value) for key, value in scenario.items() if given(value) not in usual.get(key, ())}
@@ -145,14 +148,17 @@ class ScenarioFields(FileModel):
     )
     @classmethod
     def _given(cls, value: Any) -> Any:
-        """``null`` is no value: a key that is not used is left out."""
+        """Refuse ``null`` as the value of a quantity: a key that is not used must be left out."""
         require(value is not None, (), value, LEAVE_OUT)
         return value
 
     @field_validator(*QUANTITY.needed, mode="before")
     @classmethod
     def _needed(cls, value: Any, info: ValidationInfo) -> Any:
-        """None where every type declares it, and nobody else has to."""
+        """Require a value for a quantity without default, unless every vehicle type or the table gives it.
+
+        A mixture needs none either.
+        """
         key, data = str(info.field_name), info.data
         kinds = data.get("vehicle_types")
         without = None if kinds is None else next((k for k, kind in kinds.items() if getattr(kind, key) is None), None)
@@ -177,7 +183,7 @@ class ScenarioFields(FileModel):
     @field_validator("types")
     @classmethod
     def _types(cls, value: Any, info: ValidationInfo) -> Any:
-        """Every entry names types that are declared, and a list has one entry per vehicle."""
+        """Check that every entry names declared types, and that a list has one entry per vehicle."""
         if not {"vehicles", "vehicle_types"} <= info.data.keys():
             return value
         vehicles, kinds = info.data["vehicles"], info.data["vehicle_types"]
@@ -198,7 +204,7 @@ class ScenarioFields(FileModel):
     @field_validator("table")
     @classmethod
     def _columns_of_line(cls, value: Table | None, info: ValidationInfo) -> Table | None:
-        """Every column is one of this line's, and its numbers are in range."""
+        """Check that every column of the table exists for this line and that its numbers are in range."""
         if value is None or "vehicles" not in info.data:
             return value
         known = columns_of_table({**QUANTITY.usual, **QUANTITY.optional}, info.data["vehicles"])
@@ -214,7 +220,7 @@ class ScenarioFields(FileModel):
     @field_validator(*QUANTITY.declared)
     @classmethod
     def _entries(cls, value: Any, info: ValidationInfo) -> Any:
-        """Every entry of a quantity is in range over its whole support, and a list has the right length."""
+        """Check that all possible values of a quantity are in range, and that a list has the right length."""
         rule, vehicles = QUANTITY.declared[str(info.field_name)], info.data.get("vehicles")
         if value is None:
             return value
@@ -275,12 +281,12 @@ class ScenarioFields(FileModel):
 
     @property
     def members(self) -> tuple[ScenarioFields, ...]:
-        """The scenarios of a mixture, whole; none for any other scenario."""
+        """The scenarios that a mixture consists of; empty for any other scenario."""
         return self._members
 
     @cached_property
     def vehicle_names(self) -> tuple[str, ...]:
-        """``vehicle_1`` (front) to ``vehicle_N`` (rear)."""
+        """Names ``vehicle_1`` (front) to ``vehicle_N`` (rear)."""
         return tuple(f"vehicle_{i + 1}" for i in range(self.vehicles))
 
     @property
@@ -295,29 +301,35 @@ class ScenarioFields(FileModel):
         return {i: role for i, role in enumerate(roles) if role != LEARNER}
 
     def play_pieces(self, worlds: Worlds, driven: Sequence[int] = ()) -> Worlds:
-        """These worlds, in which its scripts brake in the pieces of their ``profile``, but for ``driven`` vehicles."""
+        """Return these worlds with the pieces of ``profile`` scripts: braking by a fixed sequence of commands.
+
+        ``driven``: indices (from 0) of controlled vehicles, which follow no script.
+        """
         return worlds.play_pieces({i: ScriptSpec.parse(s).pieces for i, s in self.scripts.items() if i not in driven})
 
     @property
     def has_obstacle(self) -> bool:
-        """Whether an obstacle stands ahead of Vehicle 1, however its distance is declared."""
+        """Whether there is an obstacle ahead of Vehicle 1; for a mixture: in one of its scenarios or more."""
         if self.members:
             return any(member.has_obstacle for member in self.members)
         return self.declares("obstacle_gap_m") or self.obstacle_margin_m is not None
 
     @property
     def has_friction(self) -> bool:
-        """Whether the road is known, in some member of a mixture at least."""
+        """Whether the friction of the road is declared; for a mixture: in one of its scenarios or more."""
         return any(member.has_friction for member in self.members) or self.declares("friction")
 
     @property
     def builds_up(self) -> bool:
-        """Whether brakes may build up, in some member of a mixture at least."""
+        """Whether brakes may build up (have a finite rate); for a mixture: in one of its scenarios or more."""
         own = self.declares("brake_rate_mps3") or self.declares("release_rate_mps3")
         return own or any(member.builds_up for member in self.members)
 
     def declares(self, field: str) -> bool:
-        """Whether it says what a quantity is: under its key, by type, or in its table for every vehicle or pair."""
+        """Return whether the scenario declares the quantity ``field``, for example ``"mass_t"``.
+
+        It may do so under the key itself, in a vehicle type, or for all vehicles in its table.
+        """
         kinds = (self.vehicle_types or {}).values() if field in QUANTITY.of_a_type else ()
         return (
             getattr(self, field) is not None
@@ -327,21 +339,27 @@ class ScenarioFields(FileModel):
 
     @property
     def table_entries(self) -> dict[Entry, TableColumn]:
-        """The columns of the table by what they say; none without a table."""
+        """Columns of the scenario's table, ``{("gaps_m", 0): column}`` by quantity and index; empty without one."""
         return self._columns
 
     @property
     def by_link(self) -> bool:
-        """Whether news may come link by link, in some member of a mixture at least; see ``V2X.by_link``."""
+        """Whether the channel differs from the paper's rule: a vehicle knows everything after its own latency.
+
+        For a mixture: in one of its scenarios or more.
+        """
         return any(member.by_link for member in self.members) or self.v2x.by_link
 
     @property
     def types_of_line(self) -> TypesOfLine | None:
-        """Which types may stand where; None without types."""
+        """The vehicle types that are possible at each place of the line, and their weights; None without types."""
         return None if self.vehicle_types is None else TypesOfLine(self.vehicle_types, self.types, self.vehicles)
 
     def equipped(self, types: Ints | None = None) -> Equipped:
-        """Who has what of V2X in worlds with these types [n, N]; without them, what everybody surely has, [1, N]."""
+        """Return the V2X equipment of the vehicles in worlds with these vehicle ``types`` (indices, [n, N]).
+
+        Without ``types``: one row, [1, N], with the equipment that every vehicle has at least, whatever its type.
+        """
         line, each = self.types_of_line, []
         own = self.v2x.vehicles or {}
         for i, name in enumerate(self.vehicle_names):
@@ -358,9 +376,11 @@ class ScenarioFields(FileModel):
         return Equipped(np.stack(sends, axis=1), np.stack(hears, axis=1))
 
     def possible_quantities(self, field: str) -> tuple[dict[int, AnyTypeQuantity], ...]:
-        """``quantities`` by the type that the vehicle has (index; 0 without types), one mapping per entry.
+        """Return the declarations of a quantity by vehicle type, one mapping for each vehicle, pair or world.
 
-        A type that says nothing of it has what is declared beside the types. Raises as ``quantities``.
+        For example ``({0: 2.0, 1: 9.5}, ...)`` for ``mass_t``. The keys are indices of the types that are possible
+        there; without types the only one is 0. A type that does not declare the quantity gets the declaration outside
+        the types. Raises like ``quantities``.
         """
         line = self.types_of_line
         if line is None or field not in QUANTITY.of_a_type:
@@ -375,7 +395,10 @@ class ScenarioFields(FileModel):
         return tuple(found)
 
     def supports(self, field: str) -> tuple[tuple[float, float], ...]:
-        """Smallest and largest value of every entry of ``quantities``, whatever type stands there."""
+        """Return (smallest, largest) value of the quantity ``field`` for each vehicle, pair or world.
+
+        All vehicle types that are possible are considered.
+        """
         found = []
         for each in self.possible_quantities(field):
             lows, highs = zip(*(support(quantity) for quantity in each.values()), strict=True)
@@ -383,9 +406,10 @@ class ScenarioFields(FileModel):
         return tuple(found)
 
     def quantities(self, field: str) -> tuple[AnyQuantity, ...]:
-        """What is declared under a key, one entry per vehicle (gaps: per pair; restitution, line speed: one).
+        """Return the declaration of the quantity ``field``: a number or distribution for each vehicle, pair or world.
 
-        Raises ``InvalidInput`` for a key that this scenario does not use, ``gaps_m`` beside ``time_gaps_s``.
+        Gaps have one entry per pair; restitution and line speed have one per world. Raises ``InvalidInput`` for a key
+        that this scenario does not use, for example ``gaps_m`` if ``time_gaps_s`` is given.
         """
         declared: AnyQuantity | tuple[AnyQuantity, ...] | None = getattr(self, QUANTITY.declared[field].name)
         if self.members:
@@ -397,18 +421,21 @@ class ScenarioFields(FileModel):
         return tuple(self.table_entries.get((field, i), entry) for i, entry in enumerate(entries))
 
     def bounds(self, field: str, *, dry: bool = False) -> tuple[tuple[float, float], ...]:
-        """Smallest and largest value of each entry of ``gaps_m``, ``speeds_mps``, ..., however it is declared.
+        """Return (smallest, largest) value of a quantity, for each vehicle, pair or world, however it is declared.
 
-        Capacities are what the road allows; ``dry``: what they are on a dry one.
+        Args:
+            field: key of the quantity as a world has it: ``gaps_m``, ``speeds_mps``, ``mass_t``, ...
+            dry: do not limit braking and driving capacities by the friction of the road.
+
         """
         found = [world_quantities(member, _supports_of(member)) for member in self.members or (self,)]
-        at_once = np.full((2, self.vehicles), QUANTITY.declared[field].high)  # of members that declare no rate
+        at_once = np.full((2, self.vehicles), QUANTITY.declared[field].high)  # for members that declare no rate
         lows, highs = zip(*((each if dry else on_road(each)).get(field, at_once) for each in found), strict=True)
         return tuple(zip(np.min(lows, axis=0).tolist(), np.max(highs, axis=0).tolist(), strict=True))
 
     @property
     def farthest_obstacle_m(self) -> float:
-        """Upper bound of the distance to an obstacle that is declared by its margin."""
+        """Largest possible distance (m) from Vehicle 1 to an obstacle that is declared by ``obstacle_margin_m``."""
         found = on_road(world_quantities(self, _supports_of(self)))
         low, high = ({key: bounds[[row]] for key, bounds in found.items()} for row in (0, 1))
         slowest = high | {key: low[key] for key in ("braking_capacity_mps2", "brake_rate_mps3") if key in low}
@@ -418,10 +445,15 @@ class ScenarioFields(FileModel):
 
 
 def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]) -> dict[str, Floats]:
-    """Every quantity of k worlds, each [k, entries], from what ``declared(key)`` gives for the keys in use.
+    """Return every quantity of k worlds, [k, entries] each, from the declared ones.
 
-    ``speed = line speed + own deviation`` and ``gap = time gap x speed of the rear vehicle of the pair``. Both only
-    grow with what they are made of, so the bounds of what is declared give the bounds of what the worlds have.
+    Derived quantities are ``speed = line speed + own deviation`` and ``gap = time gap x speed of the pair's rear
+    vehicle``. Both increase with their inputs, so bounds of the declared values give bounds of the derived ones.
+
+    Args:
+        scenario: the scenario that declares the quantities.
+        declared: function of a key such as ``"time_gaps_s"`` that returns its values in the k worlds, [k, entries].
+
     """
     other = {"gaps_m": scenario.time_gaps_s, "speeds_mps": scenario.line_speed_mps}
     found = {key: declared(key) for key in QUANTITY.usual if other.get(key) is None}
@@ -438,16 +470,27 @@ def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]
 
 
 def on_road(found: Mapping[str, Floats]) -> dict[str, Floats]:
-    """Quantities of worlds, their capacities as the road allows them: at most friction times gravity."""
+    """Return the quantities of worlds with capacities limited by friction: at most friction times gravity.
+
+    ``found`` maps keys such as ``"friction"`` and ``"braking_capacity_mps2"`` to values, [k, entries]. Without friction
+    nothing is limited.
+    """
     return as_road_allows(found, found["friction"]) if "friction" in found else dict(found)
 
 
 def obstacle_gap(
     scenario: ScenarioFields, found: Mapping[str, Floats], declared: Callable[[str], Floats]
 ) -> Floats | None:
-    """Distance from Vehicle 1 to the obstacle ahead, [k], of worlds with the quantities ``found``; None without one.
+    """Return the distance from Vehicle 1 to the obstacle ahead in k worlds, [k] m; None without an obstacle.
 
-    As declared, or ``margin + v_1 tau_1 + v_1^2 / (2 a_1)``: so far beyond where Vehicle 1 stops by itself.
+    The distance is declared, or it is ``margin + v_1 tau_1 + v_1^2 / (2 a_1)``: the margin beyond the point where
+    Vehicle 1 stops by full braking.
+
+    Args:
+        scenario: the scenario that declares the obstacle.
+        found: other quantities of these worlds, [k, entries] by key.
+        declared: function of ``"obstacle_gap_m"`` or ``"obstacle_margin_m"`` that returns its value in each world, [k].
+
     """
     if scenario.declares("obstacle_gap_m"):
         return declared("obstacle_gap_m")
@@ -459,5 +502,5 @@ def obstacle_gap(
 
 
 def _supports_of(scenario: ScenarioFields) -> Callable[[str], Floats]:
-    """Smallest and largest value of every entry of each declared key, [2, entries]."""
+    """Return a function: key of a quantity -> smallest and largest value for each vehicle or pair, [2, entries]."""
     return lambda key: np.array(scenario.supports(key)).T

@@ -1,7 +1,7 @@
 """A quantity of a scenario: a fixed number, or a declared distribution.
 
-Each distribution is a pure function of one uniform number ``u`` in [0, 1): its inverse cumulative distribution
-function. One quantity therefore uses up exactly one uniform number, whatever its distribution is.
+Each distribution is drawn from one uniform number ``u`` in [0, 1), by its inverse cumulative distribution function. So
+a quantity uses exactly one uniform number, whatever its distribution is.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ethbrake_marl.physics.state import Floats
 
 LEAVE_OUT = "must be a number or a distribution; a key that is not used is left out"
 
-LEAST_MASS = 1e-6  # of a normal distribution inside its bounds; below it the inverse loses its digits
+LEAST_MASS = 1e-6  # least probability of a normal distribution within its bounds; below, the inverse loses precision
 
 _LEAST = f"[low, high] must hold at least {LEAST_MASS:g} of the untruncated distribution"
 
@@ -32,11 +32,15 @@ Numbers = Annotated[tuple[Number, ...], Field(strict=False, min_length=1)]
 
 
 class _Distribution(FileModel):
-    """A way to draw a quantity."""
+    """Base class of the distributions, such as ``Uniform``, that a scenario file may name for a quantity.
+
+    A subclass declares its parameters as fields, and defines two members: the property ``support``, which is the
+    smallest and largest possible value; and ``value(u)``, which turns uniform numbers ``u`` in [0, 1) into values.
+    """
 
 
 class Uniform(_Distribution):
-    """``{uniform: [low, high]}``: every value from low to high is equally likely."""
+    """``{uniform: [low, high]}``: uniform distribution from low to high."""
 
     uniform: Pair = Field(description="[low, high]")
 
@@ -47,20 +51,21 @@ class Uniform(_Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
+        """Smallest and largest possible value."""
         return self.uniform
 
     def value(self, u: Floats) -> Floats:
-        """``low + (high - low) u``, in the shape of ``u`` in [0, 1).
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape: ``low + (high - low) u``.
 
-        Never above high: u is at most 1 - 2^-53, so (high - low) u is rounded to less than the rounded high - low.
+        A value is never above high: u is at most 1 - 2^-53, so (high - low) u rounds to less than the rounded high -
+        low.
         """
         low, high = self.uniform
         return low + (high - low) * u
 
 
 class LogUniform(_Distribution):
-    """``{loguniform: [low, high]}``: every ratio is equally likely, as between 1 and 2 so between 2 and 4."""
+    """``{loguniform: [low, high]}``: the logarithm is uniform, so 1 to 2 is as likely as 2 to 4."""
 
     loguniform: Pair = Field(description="[low, high], both above 0")
 
@@ -73,28 +78,28 @@ class LogUniform(_Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
+        """Smallest and largest possible value."""
         return self.loguniform
 
     def value(self, u: Floats) -> Floats:
-        """``low (high / low)^u``, in the shape of ``u`` in [0, 1)."""
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape: ``low (high / low)^u``."""
         low, high = self.loguniform
         return np.clip(low * exp_each((u * log(high / low)).ravel()).reshape(u.shape), low, high)
 
 
 class NormalShape(_Distribution):
-    """Mean and standard deviation of the untruncated bell, and the bounds that cut it."""
+    """Mean and standard deviation of a normal distribution before truncation, and the bounds of the truncation."""
 
-    mean: Number
-    sd: Number
-    low: Number
-    high: Number
+    mean: Number  # before truncation
+    sd: Number  # standard deviation before truncation
+    low: Number  # smallest possible value
+    high: Number  # largest possible value
 
 
 class Normal(_Distribution):
     """``{normal: {mean, sd, low, high}}``: a normal distribution truncated to [low, high]."""
 
-    normal: NormalShape
+    normal: NormalShape  # its parameters
 
     @model_validator(mode="after")
     def _possible(self) -> Normal:
@@ -106,18 +111,22 @@ class Normal(_Distribution):
         return self
 
     def _bounds(self) -> tuple[float, float]:
-        """Probability below low and below high."""
+        """Return the probabilities that the untruncated distribution is below low, and below high."""
         shape = self.normal
         low, high = (normal_probability((end - shape.mean) / shape.sd) for end in (shape.low, shape.high))
         return low, high
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
+        """Smallest and largest possible value."""
         return self.normal.low, self.normal.high
 
     def value(self, u: Floats) -> Floats:
-        """``mean + sd Q(p_low + (p_high - p_low) u)`` with the normal quantile Q; same shape as ``u`` in [0, 1)."""
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+
+        A value is ``mean + sd Q(p_low + (p_high - p_low) u)``; Q is the normal quantile, p_low and p_high are the
+        probabilities of being below the bounds.
+        """
         shape = self.normal
         below, above = self._bounds()
         quantile = normal_quantile_each((below + (above - below) * u).ravel()).reshape(u.shape)
@@ -125,19 +134,19 @@ class Normal(_Distribution):
 
 
 class LogNormalShape(_Distribution):
-    """Median, standard deviation of the logarithm, and the bounds that cut it."""
+    """Median and standard deviation of the logarithm, before truncation, and the bounds of the truncation."""
 
-    median: Number
-    sigma: Number
-    low: Number
-    high: Number
+    median: Number  # before truncation
+    sigma: Number  # standard deviation of the logarithm, before truncation
+    low: Number  # smallest possible value
+    high: Number  # largest possible value
 
 
 class LogNormal(_Distribution):
-    """``{lognormal: {median, sigma, low, high}}``: its logarithm is normal; truncated to [low, high]."""
+    """``{lognormal: {median, sigma, low, high}}``: the logarithm is normal; truncated to [low, high]."""
 
-    lognormal: LogNormalShape
-    _of_logarithm: Normal = PrivateAttr()
+    lognormal: LogNormalShape  # its parameters
+    _of_logarithm: Normal = PrivateAttr()  # distribution of the logarithm
 
     @model_validator(mode="after")
     def _possible(self) -> LogNormal:
@@ -154,20 +163,23 @@ class LogNormal(_Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
+        """Smallest and largest possible value."""
         return self.lognormal.low, self.lognormal.high
 
     def value(self, u: Floats) -> Floats:
-        """``exp`` of the normal logarithm at ``u`` in [0, 1); same shape as ``u``."""
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+
+        A value is ``exp(x)``; x has the truncated normal distribution of the logarithm.
+        """
         drawn = exp_each(self._of_logarithm.value(u).ravel()).reshape(u.shape)
         return np.clip(drawn, *self.support)
 
 
 class Choice(_Distribution):
-    """``{choice: [a, b, ...]}``: one of these values, equally likely or as ``weights: [...]`` says."""
+    """``{choice: [a, b, ...]}``: one of these values, with equal probability or in proportion to ``weights: [...]``."""
 
-    choice: Numbers
-    weights: Numbers | None = None
+    choice: Numbers  # the possible values
+    weights: Numbers | None = None  # weight of each value; None: equal
 
     @model_validator(mode="after")
     def _weighted(self) -> Choice:
@@ -180,11 +192,14 @@ class Choice(_Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
+        """Smallest and largest possible value."""
         return min(self.choice), max(self.choice)
 
     def value(self, u: Floats) -> Floats:
-        """The first entry whose cumulative weight is above ``u``; same shape as ``u`` in [0, 1)."""
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+
+        It is the first entry whose cumulative weight (of a total of 1) is above u.
+        """
         cumulative = np.cumsum(np.asarray(self.weights or (1.0,) * len(self.choice)))
         cumulative /= cumulative[-1]
         return np.asarray(self.choice)[np.searchsorted(cumulative, u, side="right")]
@@ -192,35 +207,41 @@ class Choice(_Distribution):
 
 @dataclass(frozen=True, slots=True, repr=False)
 class TableColumn:
-    """A column of a scenario's table: every world takes the value of its own row."""
+    """A column of a scenario's table of measured values; every world takes one row of the table, by weight."""
 
-    name: str
-    rows: Floats = data_field(compare=False)  # [rows]
-    cumulative: Floats = data_field(compare=False)  # [rows] share of the worlds up to this row
+    name: str  # name of the column, such as ``gap_1_m``
+    rows: Floats = data_field(compare=False)  # [rows] value in each row of the table
+    cumulative: Floats = data_field(compare=False)  # [rows] cumulative weight of the rows, up to 1
 
     def __repr__(self) -> str:
         return f"column {self.name} of the table"
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
+        """Smallest and largest possible value."""
         return float(self.rows.min()), float(self.rows.max())
 
     @property
     def middle(self) -> TableColumn:
-        """The one row that stands for all: the median."""
+        """Column whose only row is the weighted median of this column."""
         order = np.argsort(self.rows, kind="stable")
         shares = np.cumsum(np.diff(self.cumulative, prepend=0.0)[order])
         return replace(self, rows=self.rows[order][[np.searchsorted(shares, 0.5)]], cumulative=np.ones(1))
 
     def value(self, u: Floats) -> Floats:
-        """That of the first row whose cumulative weight is above ``u``; same shape as ``u`` in [0, 1)."""
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+
+        It is the value of the first row whose cumulative weight is above u.
+        """
         found: Floats = self.rows[np.searchsorted(self.cumulative, u, side="right")]
         return found
 
 
 def _kind(value: object) -> str | None:
-    """Which member of ``Quantity`` a value means; decides whose error messages are shown."""
+    """Return the tag of the kind of ``Quantity`` that a value from a file means, such as ``"#uniform"``.
+
+    None for a list, or a mapping without a known distribution. The tag decides which error messages are shown.
+    """
     if isinstance(value, _Distribution):
         return f"#{type(value).__name__.lower()}"
     if isinstance(value, dict):
@@ -230,7 +251,7 @@ def _kind(value: object) -> str | None:
 
 DISTRIBUTIONS = ("uniform", "loguniform", "normal", "lognormal", "choice")
 
-# Tags begin with # so that they can be told from keys in the location of an error.
+# Tags begin with # to distinguish them from keys in the location of an error.
 Quantity = Annotated[
     Annotated[Number, Tag("#number")]
     | Annotated[Uniform, Tag("#uniform")]
@@ -243,9 +264,9 @@ Quantity = Annotated[
 
 
 class WithLoad(_Distribution):
-    """``{with_load: [empty, full]}``, of a vehicle type only: moves with the load of the vehicle, from 0 to 1.
+    """``{with_load: [empty, full]}``, in a vehicle type only: a linear function of the vehicle's load, from 0 to 1.
 
-    ``spread`` is added to it, of its own for every vehicle.
+    ``spread`` is a distribution around 0 of a random amount that each vehicle adds.
     """
 
     with_load: Pair = Field(description="[empty, full]: at load 0 and at load 1")
@@ -260,12 +281,15 @@ class WithLoad(_Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
+        """Smallest and largest possible value."""
         low, high = support(self.spread)
         return min(self.with_load) + low, max(self.with_load) + high
 
     def value(self, load: Floats, u: Floats) -> Floats:
-        """``empty + (full - empty) load``, and the spread at ``u``; ``load`` in [0, 1] and ``u`` have one shape."""
+        """Return ``empty + (full - empty) load``, plus the random amount that the uniform numbers ``u`` give.
+
+        ``load`` in [0, 1] and ``u`` in [0, 1) have the same shape, as has the result.
+        """
         empty, full = self.with_load
         moved = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))
         return moved if self.spread == 0.0 else moved + values(self.spread, u)
@@ -277,10 +301,10 @@ AnyTypeQuantity = AnyQuantity | WithLoad
 
 
 def support(quantity: AnyTypeQuantity) -> tuple[float, float]:
-    """Smallest and largest value that the quantity can take."""
+    """Return the smallest and largest value that ``quantity`` can have."""
     return (quantity, quantity) if isinstance(quantity, float) else quantity.support
 
 
 def values(quantity: AnyQuantity, u: Floats) -> Floats:
-    """The quantity's values for uniform numbers ``u`` in [0, 1), in the shape of ``u``."""
+    """Return the values of ``quantity`` drawn by uniform numbers ``u`` in [0, 1), in the shape of ``u``."""
     return np.full(u.shape, quantity) if isinstance(quantity, float) else quantity.value(u)

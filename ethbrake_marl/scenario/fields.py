@@ -1,4 +1,4 @@
-"""Fields of a scenario: the quantities of a world and how they are drawn, roles, and types of vehicles."""
+"""The quantities of a scenario: name, unit, range and meaning of each, and which random number draws it."""
 
 from __future__ import annotations
 
@@ -11,127 +11,131 @@ import numpy as np
 from ethbrake_marl.files.model import UNITS
 from ethbrake_marl.physics.state import Floats, Worlds
 
-BLOCK = 8  # uniform numbers per vehicle and world; a multiple of 4, the numbers of one Philox counter
+BLOCK = 8  # uniform numbers per vehicle and world; a multiple of 4, the output of one Philox counter
 
-V2X_NEWS = (1,)  # the stream of the links' delays and losses
+V2X_NEWS = (1,)  # stream of the links' delays and losses
 
-OBSTACLE = (2,)  # the stream of the obstacle's distance
+OBSTACLE = (2,)  # stream of the obstacle's distance
 
-TYPES = (3,)  # the stream of the vehicles' types and loads
+TYPES = (3,)  # stream of the vehicles' types and loads
 
-MIXTURE = (4,)  # the stream of what each world of a mixture is drawn from
+MIXTURE = (4,)  # stream that selects the member of a mixture for each world
 
-LATER_LOSSES = (5,)  # the stream of a world's key, from which its later messages are lost or not
+LATER_LOSSES = (5,)  # stream of each world's key, the seed of its later message losses
 
-SURROUNDINGS = (6,)  # the stream of friction, of the row of a table, and of the time before the alert
+SURROUNDINGS = (6,)  # stream of friction, the row of the table, and the time before the alert
 
-BRAKES = (7,)  # the stream of the rates of brakes that build up, BLOCK numbers per vehicle
+BRAKES = (7,)  # stream of brake and release rates, BLOCK numbers per vehicle
 
-OF_WORLD = 4  # numbers per world of the streams of obstacle, mixture, later losses and surroundings
+OF_WORLD = 4  # numbers per world in the streams OBSTACLE, MIXTURE, LATER_LOSSES and SURROUNDINGS
 
-PER_TYPE = 4  # numbers per vehicle of the stream of types: type, load, and two that are free; one Philox counter
+PER_TYPE = 4  # numbers per vehicle in the stream TYPES: type, load, two unused; one Philox counter
 
-ROW = (SURROUNDINGS, 1)  # the place of the number that chooses the row of a table
+ROW = (SURROUNDINGS, 1)  # place of the number that selects the row of a table
 
-Place = tuple[tuple[int, ...], int]  # a stream of uniform numbers, and the column in it
+Place = tuple[tuple[int, ...], int]  # a stream of uniform numbers and a column in it
 
 
 @dataclass(frozen=True, slots=True)
 class QuantityRule:
-    """What a quantity means and which values it may take."""
+    """Meaning, unit and allowed range of a quantity, and the place of its random number."""
 
     name: str  # key in a scenario, field of Worlds or Vehicles
     unit: str  # key of UNITS, or "" for a plain number
-    per: Literal["vehicle", "pair", "world"]
+    per: Literal["vehicle", "pair", "world"]  # what has one value each
     high: float  # largest allowed value
-    positive: bool  # 0 is refused
-    slot: int  # column inside a vehicle's block of uniform numbers
-    column: str  # name in a table of initial states
-    meaning: str
-    example: str
+    positive: bool  # whether 0 is refused
+    slot: int  # column of its uniform number inside the block of BLOCK numbers that each vehicle has
+    column: str  # column name in a table of initial states, such as ``gap_{}_m``; "": no column
+    meaning: str  # what it is, in words
+    example: str  # an example of its value in a scenario file
     low: float = 0.0  # smallest allowed value
-    block: int = 0  # vehicle (from 0) in whose block of uniform numbers entry 0 stands
-    stream: tuple[int, ...] = ()  # of uniform numbers of its own, in which its slot is the column
+    block: int = 0  # vehicle (from 0) in whose block the number of entry 0 is; entry i is in block ``block + i``
+    stream: tuple[int, ...] = ()  # stream of uniform numbers that contains the blocks; (): the main stream
 
     @property
     def symbol(self) -> str:
-        """Of its unit."""
+        """Symbol of the unit, for example ``m/s2``; empty for a plain number."""
         return {"mps": "m/s", "mps2": "m/s2", "mps3": "m/s3"}.get(self.unit, self.unit)
 
     @property
     def label(self) -> str:
-        """Its name in words, with its unit, as an axis has it: ``braking capacity (m/s²)``."""
+        """Name in words with the unit, as the label of an axis: ``braking capacity (m/s²)``."""
         return self.name.removesuffix(f"_{self.unit}").replace("_", " ") + (
             f" ({self.symbol.replace('s2', 's²').replace('s3', 's³')})" if self.unit else ""
         )
 
     @property
     def interval(self) -> str:
-        """The allowed range, with its unit, as messages write it."""
+        """Allowed range with its unit, as error messages write it: ``finite and in (0, 1000] t (tonnes)``."""
         unit = f" {self.symbol} ({UNITS[self.unit]})" if self.unit else ""
         return f"finite and in {'(' if self.positive else '['}{self.low:g}, {self.high:g}]{unit}"
 
     def allows(self, low: float, high: float) -> bool:
-        """Whether every value from ``low`` to ``high`` is in range; false for NaN."""
+        """Return whether every value from ``low`` to ``high`` is in range; False for NaN."""
         return (low > 0.0 if self.positive else low >= self.low) and high <= self.high
 
     def count(self, vehicles: int) -> int:
-        """How many values a world of ``vehicles`` vehicles has."""
+        """Return how many values a world with this number of ``vehicles`` has: one per vehicle, one per pair, or 1."""
         return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
 
     def place(self, index: int) -> Place:
-        """Which of a world's uniform numbers belongs to entry ``index`` (from 0)."""
+        """Return the place of the uniform number that draws entry ``index`` (from 0): (stream, column in it)."""
         return self.stream, BLOCK * (self.block + index) + self.slot
 
     def column_of(self, index: int) -> str:
-        """Name of the column that holds entry ``index`` (from 0) in a table of initial states."""
+        """Return the column name of entry ``index`` (from 0) in a table of initial states, such as ``gap_1_m``."""
         return self.column.format(index + 1)
 
     def owner(self, index: int) -> str:
-        """Whose value entry ``index`` (from 0) is, in words; empty for a value of the whole world."""
+        """Return the vehicle or pair of entry ``index`` (from 0): ``vehicle_1``, or ``vehicle_1 to vehicle_2``.
+
+        Empty for a value of the whole world.
+        """
         front = f"vehicle_{index + 1}"
         return {"vehicle": front, "pair": f"{front} to vehicle_{index + 2}", "world": ""}[self.per]
 
     def of(self, worlds: Worlds) -> Floats:
-        """The values that these worlds have, [n, entries]: one entry per vehicle, pair or world.
+        """Return the values of this quantity in ``worlds``, [n, entries]: one entry per vehicle, pair or world.
 
-        Capacities are those on a dry road, as a scenario declares them, where the friction of all is told beside them.
+        Capacities are those on a dry road, as a scenario declares them, if every world has a friction. A distance to an
+        obstacle is NaN in a world without one.
         """
         of_vehicles = hasattr(worlds.vehicles, self.name)
         values: Floats = getattr(worlds.vehicles if of_vehicles else worlds, self.name)
         if of_vehicles and np.isfinite(worlds.friction).all():
             values = worlds.dry(self.name)
-        if self.stream == BRAKES:  # as high as a rate can be declared: at once
+        if self.stream == BRAKES:  # an infinite rate is written as the largest declarable one
             values = np.minimum(values, self.high)
-        if self.stream == OBSTACLE:  # no number where there is none
+        if self.stream == OBSTACLE:  # NaN if there is no obstacle
             values = np.where(np.isfinite(values), values, np.nan)
         return values.reshape(worlds.n, -1)
 
 
 class Quantities(NamedTuple):
-    """All quantities by their keys."""
+    """All quantities that a scenario can declare: key, such as ``gaps_m`` -> rule, in several groups."""
 
-    usual: dict[str, QuantityRule]  # what every world has
+    usual: dict[str, QuantityRule]  # quantities that every world has
     otherwise: dict[str, QuantityRule]  # other ways to declare speeds, gaps and an obstacle
-    optional: dict[str, QuantityRule]  # what a world need not have; it has a stream of random numbers of its own
-    # A scenario has exactly one of each two, or at most one where what they declare is optional.
+    optional: dict[str, QuantityRule]  # quantities that a world may lack; drawn from streams of their own
+    # usual or optional key -> the key in ``otherwise`` that may replace it: {"gaps_m": "time_gaps_s", ...}; a scenario
+    # never declares both
     alternatives: dict[str, str]
-    of_a_type: tuple[str, ...]  # what a type of vehicles may declare
-    needed: tuple[str, ...]  # what has no default, and every vehicle needs
-    declared: dict[str, QuantityRule]  # every key that declares one
+    of_a_type: tuple[str, ...]  # keys that a vehicle type may declare
+    needed: tuple[str, ...]  # keys without a default, which every vehicle needs
+    declared: dict[str, QuantityRule]  # every key that declares a quantity
 
     def of(self, worlds: Worlds) -> dict[str, QuantityRule]:
-        """Those that these worlds have: friction only where all have such.
+        """Return key -> rule of the quantities that ``worlds`` have; friction only if all worlds have it.
 
-        The distance to an obstacle, and a rate of brakes, are told of all where some have one: the former is NaN
-        where there is no obstacle.
+        The distance to an obstacle and the brake rates are included if some world has them.
         """
         there = {"obstacle_gap_m": worlds.obstacle_ahead.any(), "friction": np.isfinite(worlds.friction).all()}
         there |= {key: np.isfinite(getattr(worlds.vehicles, key)).any() for key in self.optional if key not in there}
         return self.usual | {key: rule for key, rule in self.optional.items() if there[key]}
 
     def columns(self, worlds: Worlds) -> dict[str, Floats]:
-        """Every one of the worlds, each [n], named as in a table of initial states: ``gap_1_m``, ``mass_2_t``."""
+        """Return every quantity of the worlds, [n] each, by column name of a table of initial states (``gap_1_m``)."""
         return {
             rule.column_of(i): values for rule in self.of(worlds).values() for i, values in enumerate(rule.of(worlds).T)
         }
@@ -142,7 +146,7 @@ def _by_name(*rules: QuantityRule) -> dict[str, QuantityRule]:
 
 
 # The upper ends are far outside traffic: they catch a value in the wrong unit (kilograms, kilometres per hour).
-# The slots are fixed for ever: another order would give other worlds for the same seed.
+# The slots never change: another order would give other worlds for the same seed.
 _USUAL = _by_name(
     QuantityRule(
         "gaps_m", "m", "pair", 1e4, False, 0, "gap_{}_m",
@@ -178,8 +182,8 @@ _USUAL = _by_name(
     ),
 )  # fmt: skip
 
-# Other ways to declare speeds, gaps and an obstacle. What replaces a quantity takes over its uniform numbers; the speed
-# of the line has the one number of vehicle_2 that restitution, one per world, leaves free.
+# Other ways to declare speeds, gaps and an obstacle. Each uses the uniform numbers of the quantity that it replaces.
+# The speed of the line uses slot 7 of vehicle_2, which is free because restitution needs one number per world only.
 _OTHERWISE = _by_name(
     QuantityRule(
         "time_gaps_s", "s", "pair", 60.0, True, 0, "",
@@ -239,11 +243,7 @@ QUANTITY = Quantities(
     declared={**_USUAL, **_OTHERWISE, **_OPTIONAL},
 )  # fmt: skip
 
-ALSO = (
-    "friction",
-    "brake_rate_mps3",
-    "release_rate_mps3",
-)  # what is drawn where it is declared, and needs nothing else
+ALSO = ("friction", "brake_rate_mps3", "release_rate_mps3")  # optional quantities that are independent of all others
 
 MEANING = {key: rule.meaning for key, rule in QUANTITY.declared.items()}
 
@@ -251,13 +251,22 @@ Entry = tuple[str, int]  # quantity and index (from 0) of the vehicle or pair
 
 
 def columns_of_table(rules: Mapping[str, QuantityRule], vehicles: int) -> dict[str, Entry]:
-    """The columns of a table with these quantities, and the entry of each."""
+    """Return column name -> (quantity, index) of a table with these quantities: ``{"gap_1_m": ("gaps_m", 0), ...}``.
+
+    Args:
+        rules: the quantities, by key.
+        vehicles: number of vehicles in the line.
+
+    """
     named = {key: rule for key, rule in rules.items() if rule.column}
     return {rule.column_of(i): (key, i) for key, rule in named.items() for i in range(rule.count(vehicles))}
 
 
 def is_tabled(data: Mapping[str, Any], key: str) -> bool:
-    """Whether the table of fields of a scenario has every entry of a quantity."""
+    """Return whether a scenario's table gives the quantity ``key`` for every vehicle, pair or world.
+
+    ``data``: fields of the scenario, as far as they are checked; ``table`` and ``vehicles`` are read.
+    """
     table, rule = data.get("table"), QUANTITY.declared[key]
     if table is None or "vehicles" not in data or not rule.column:
         return False

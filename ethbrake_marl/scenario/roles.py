@@ -1,4 +1,4 @@
-"""Roles: who learns, names of scripts (``name[:argument]``), and the commands of the scripts that need no state."""
+"""Roles: which vehicle learns, names of scripts (``name[:argument]``), and commands of scripts that need no state."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ethbrake_marl.physics.state import Floats
 
 LEARNER = "learner"
 
-_PROFILE = "profile"  # a constant command in pieces
+_PROFILE = "profile"  # script with a piecewise constant command
 
 MOST_PIECES = 64
 
@@ -28,10 +28,10 @@ _SPEC = re.compile(r"(?P<name>[a-z][a-z0-9_@.-]*)(:(?P<argument>\S+))?")
 
 
 class ScriptSpec(NamedTuple):
-    """``name[:argument]``, for instance ``constant:3.5``: how a scenario, or a command, names an agent."""
+    """``name[:argument]``, for example ``constant:3.5``: the name of an agent in a scenario or on the command line."""
 
-    name: str
-    argument: str | None
+    name: str  # name of the agent, such as ``constant``
+    argument: str | None  # text after the colon, such as ``3.5``; None: no colon
 
     def __str__(self) -> str:
         return self.name if self.argument is None else f"{self.name}:{self.argument}"
@@ -39,10 +39,10 @@ class ScriptSpec(NamedTuple):
     @staticmethod
     @lru_cache(maxsize=256)
     def parse(spec: str) -> ScriptSpec:
-        """Split it.
+        """Parse ``spec``, a text ``name[:argument]``.
 
-        Raises ``InvalidInput`` unless the name matches ``[a-z][a-z0-9_@.-]*`` and the argument has no blanks, and for a
-        Python file: a scenario that somebody else wrote must not run code.
+        Raises ``InvalidInput`` unless the name matches ``[a-z][a-z0-9_@.-]*`` and the argument has no spaces. A Python
+        file is refused too: a scenario from somebody else must not run code.
         """
         match = _SPEC.fullmatch(spec) if isinstance(spec, str) else None
         if match is None:
@@ -59,9 +59,9 @@ class ScriptSpec(NamedTuple):
 
     @property
     def deceleration_mps2(self) -> float | None:
-        """The deceleration a (negative = drive) of ``constant:a``; None for any other script.
+        """Deceleration a of ``constant:a`` (negative: drive); None for any other script.
 
-        Raises ``InvalidInput`` when a is missing or not a finite number.
+        Raises ``InvalidInput`` if a is missing or not a finite number.
         """
         if self.name != "constant":
             return None
@@ -75,9 +75,10 @@ class ScriptSpec(NamedTuple):
 
     @property
     def pieces(self) -> tuple[tuple[float, float], ...]:
-        """The pieces of a ``profile``: s after the latency, m/s2 of braking; none of any other script.
+        """Pieces of a ``profile``, as (start in s after the latency, braking in m/s2); empty for any other script.
 
-        Raises ``InvalidInput`` unless times begin with 0 and rise, and no braking is negative.
+        A piece is a time interval of constant braking. Raises ``InvalidInput`` unless times start at 0 and increase,
+        and no braking is negative.
         """
         if self.name != _PROFILE:
             return ()
@@ -86,13 +87,13 @@ class ScriptSpec(NamedTuple):
 
     @property
     def hardest_mps2(self) -> float | None:
-        """The largest deceleration (m/s2) that ``constant:a`` or a ``profile`` asks for; None for any other script."""
+        """Largest deceleration (m/s2) of ``constant:a`` or a ``profile``; None for any other script."""
         return max(braking for _, braking in self.pieces) if self.name == _PROFILE else self.deceleration_mps2
 
     def is_state_free(self) -> bool:
-        """Whether the script's command never depends on the state: ``full_brake``, ``coast`` or ``constant:a``.
+        """Return whether the script needs no state: ``full_brake``, ``coast``, ``constant:a`` or a profile.
 
-        Raises ``InvalidInput`` when such a script has an argument it does not take, or lacks the one it needs.
+        Raises ``InvalidInput`` if such a script has an argument it does not take, or lacks the one it needs.
         """
         if self.name == _PROFILE:
             return len(self.pieces) > 0
@@ -105,11 +106,11 @@ class ScriptSpec(NamedTuple):
     def command(
         self, braking_capacity_mps2: ArrayLike, driving_capacity_mps2: ArrayLike | None = None
     ) -> Floats | None:
-        """Signed command (m/s2) of a state-free script, in the shape of the capacity; None for any other script.
+        """Return the command (m/s2) of a script that needs no state, in the shape of ``braking_capacity_mps2``.
 
-        ``full_brake`` -> -capacity, ``coast`` -> 0, ``constant:a`` -> -a, a ``profile`` that of its first piece.
-        Raises ``InvalidInput`` when a, or a piece, is above the braking capacity of any vehicle, or -a above its
-        driving capacity where that is given.
+        ``full_brake`` -> -capacity, ``coast`` -> 0, ``constant:a`` -> -a, ``profile`` -> its first piece; None for any
+        other script. Raises ``InvalidInput`` if a, or a piece, exceeds the braking capacity of some vehicle, or -a the
+        ``driving_capacity_mps2``, if given.
         """
         capacity = np.asarray(braking_capacity_mps2, dtype=np.float64)
         if not self.is_state_free():
@@ -127,7 +128,10 @@ class ScriptSpec(NamedTuple):
 
 
 def checked_pieces(given: object) -> tuple[tuple[float, float], ...]:
-    """The pieces of a ``profile``, [[s, m/s2], ...], as they are written in roles; raises ``InvalidInput``."""
+    """Return the pieces of a ``profile``, ``((s, m/s2), ...)``, after checking them; raise ``InvalidInput`` if invalid.
+
+    ``given``: a list ``[[s after the latency, m/s2 of braking], ...]``, from a file and so of any type.
+    """
     right = f"a profile is 1 to {MOST_PIECES} pieces [s after the latency, m/s2 of braking], such as [[0, 3], [1, 7]]"
     if not isinstance(given, list | tuple) or not 1 <= len(given) <= MOST_PIECES:
         raise InvalidInput(right)
@@ -141,7 +145,7 @@ def checked_pieces(given: object) -> tuple[tuple[float, float], ...]:
 
 
 def _role_text(role: object) -> object:
-    """A role as a script is named: ``{profile: [[0, 3], [1, 7]]}`` is ``profile:0=3,1=7``."""
+    """Convert a role from a file to the name of a script: ``{profile: [[0, 3], [1, 7]]}`` is ``profile:0=3,1=7``."""
     if not isinstance(role, dict):
         return role
     try:
@@ -155,7 +159,10 @@ def _role_text(role: object) -> object:
 
 
 def _role_content(role: str) -> str | dict[str, list[list[float]]]:
-    """A role as a file says it."""
+    """Convert a role to its form in a scenario file: ``profile:0=3`` to ``{"profile": [[0.0, 3.0]]}``.
+
+    Other roles stay as they are.
+    """
     pieces = ScriptSpec.parse(role).pieces
     return {_PROFILE: [list(piece) for piece in pieces]} if pieces else role
 
@@ -185,7 +192,7 @@ Role = Annotated[
 
 
 class Roles(dict[str, str]):
-    """Vehicle -> ``learner`` or a script; like the rest of a scenario it cannot be changed."""
+    """Vehicle -> ``learner`` or a script; immutable, like the rest of a scenario."""
 
     def _refuse(self, *args: object, **kwargs: object) -> NoReturn:
         raise InvalidInput("roles of a scenario are frozen; use scenario.replace(roles=...) or scenario.with_learners")
@@ -199,7 +206,11 @@ class Roles(dict[str, str]):
 
     @staticmethod
     def complete(given: Mapping[str, str] | None, vehicles: int) -> Roles:
-        """A role for every vehicle in order: full braking where none is given; by default vehicle_2 learns."""
+        """Return a role for each of ``vehicles`` vehicles: ``learner`` or the name of a script.
+
+        ``given`` maps names such as ``vehicle_2`` to roles; a vehicle that it leaves out brakes fully. None: vehicle_2
+        learns and the others brake fully.
+        """
         roles = {"vehicle_2": LEARNER} if given is None else given
         names = [f"vehicle_{i + 1}" for i in range(vehicles)]
         return Roles({name: roles.get(name, "full_brake") for name in names})

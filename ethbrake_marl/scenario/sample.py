@@ -1,4 +1,4 @@
-"""A part of a list of worlds: the worlds, where they stand in the list, and what they were drawn as."""
+"""A sample of a list of worlds: the worlds, their numbers in the list, and their vehicle types and scenarios."""
 
 from __future__ import annotations
 
@@ -15,34 +15,37 @@ _Texts = NDArray[np.str_]
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Worlds at the alert, and where in the list they stand.
+    """Worlds at the alert (time 0), with their numbers in the list.
 
     >>> import ethbrake_marl as eb
     >>> sample = eb.load_scenario("paper-random").sample(2, seed=7)
     >>> sample.index, sample.worlds.gaps_m.round(2)
     (array([0, 1]), array([[6.62, 8.49], [5.33, 7.79]]))
-
     """
 
     worlds: Worlds  # at t = 0
     index: Ints  # [n] number of each world in the list of its seed
-    rejected: int  # draws refused because of an early impact
-    types: _Texts | None = None  # [n, N] type of every vehicle, where a scenario has types; empty: it has none
-    scenarios: _Texts | None = None  # [n] the scenario of a mixture that each world was drawn from
+    rejected: int  # number of draws that were rejected for an early impact
+    types: _Texts | None = None  # [n, N] type of every vehicle; "": no type; None: a scenario without types
+    scenarios: _Texts | None = None  # [n] member of a mixture that each world was drawn from; None: no mixture
 
     def __repr__(self) -> str:
         numbers = f"numbers {self.index.min()} to {self.index.max()}" if len(self.index) else "no numbers"
         return f"Sample({self.worlds!r}, {numbers}, {self.rejected:,} rejected)"
 
     def take(self, rows: ArrayLike) -> Sample:
-        """Some of the worlds, by row or mask (always a copy); none of them was rejected."""
+        """Return the worlds selected by ``rows`` (indices or a mask [n]); always a copy, with ``rejected`` 0."""
         some = np.asarray(rows)
         types, scenarios = (None if each is None else each[some] for each in (self.types, self.scenarios))
         return Sample(self.worlds.take(some), self.index[some], 0, types, scenarios)
 
     @staticmethod
     def join(parts: Sequence[Sample], rejected: int) -> Sample:
-        """The worlds of all parts in the order of their numbers; all have types, or scenarios, or none has."""
+        """Join samples into one, in the order of their world numbers.
+
+        Either all parts have types (or scenarios) or none has. ``rejected``: number of rejected draws to note in the
+        result.
+        """
         index = np.concatenate([part.index for part in parts])
         order = np.argsort(index)
         joined: dict[str, _Texts] = {}
@@ -54,13 +57,16 @@ class Sample:
 
     @property
     def kinds(self) -> dict[str, _Texts]:
-        """``scenario`` of a mixture and ``vehicle_K_type``, each [n], where the worlds were drawn with such."""
+        """Columns of text, [n] each: ``scenario`` of a mixture, and ``vehicle_1_type`` and so on if there are types."""
         columns = {} if self.scenarios is None else {"scenario": self.scenarios}
         types = () if self.types is None else self.types.T
         return columns | {f"vehicle_{i + 1}_type": column for i, column in enumerate(types)}
 
     def count_kinds(self) -> str:
-        """How often each scenario of a mixture, and each type of a vehicle, is there; empty without such."""
+        """Return a text that counts the worlds of each scenario of a mixture and of each vehicle type.
+
+        For example ``"; vehicle_1_type: car 7, truck 3"``; empty without mixture and types.
+        """
         told = ""
         for kind, column in self.kinds.items():
             names, counts = np.unique(column, return_counts=True)

@@ -1,4 +1,4 @@
-"""A validated, frozen description of a family of worlds, and the catalogue of those that ship or are registered."""
+"""``Scenario``: a validated, immutable description of a family of worlds."""
 
 from __future__ import annotations
 
@@ -31,10 +31,13 @@ _DISTRIBUTION = (
 
 
 class ScenarioWording(Wording):
-    """The ``Wording`` of a scenario, or of a part of one."""
+    """Wording of the error messages about a scenario, or part of one."""
 
     def instead(self, key: str) -> str:
-        """What the model has in place of another word for friction, and of a slope."""
+        """Return a hint for an unknown key that people often try: other words for friction, and slopes.
+
+        Empty for any other key.
+        """
         if "friction" in key or key == "mu":
             return "friction is that of the road, one for the whole line, for instance friction: 0.5"
         if key in ("grade", "slope"):
@@ -42,7 +45,7 @@ class ScenarioWording(Wording):
         return ""
 
     def needed(self, path: YamlPath) -> str:
-        """What is needed at ``path``, with an example."""
+        """Return a sentence on what is needed at ``path`` (keys and indices inside the file), with an example."""
         key = path[-1]
         if path[0] == "mixture":
             return "it is needed, for instance {scenario: paper-random, weight: 2}"
@@ -66,12 +69,18 @@ class ScenarioWording(Wording):
         return f"the {rule.meaning} is needed, for instance {key}: {rule.example}{other}"
 
     def owner(self, path: YamlPath) -> str:
-        """Whose value stands at ``path``: a vehicle or a pair; empty for anything else."""
+        """Return the vehicle or pair that the value at ``path`` belongs to, such as ``vehicle_2``; else an empty text.
+
+        ``path``: keys and indices inside the file, for example ``("speeds_mps", 1)``.
+        """
         rule = QUANTITY.declared.get(str(path[0])) if len(path) > 1 else None
         return rule.owner(path[1]) if rule is not None and isinstance(path[1], int) else ""
 
     def right(self, detail: ErrorDetails) -> str:
-        """A number or a distribution, with what a misspelt one was meant to be; empty for what is no quantity."""
+        """Return what a quantity must be, with a suggestion for a misspelt distribution; empty for other values.
+
+        ``detail``: one mistake, as pydantic reports it.
+        """
         if detail["type"] == "quantity":
             return f"must be a number, {_DISTRIBUTION}{_misspelt(detail['input'])}"
         if detail["type"] == "float_type" and detail["loc"][-1] == "#number":
@@ -89,12 +98,12 @@ def _misspelt(given: Any) -> str:
 
 
 class Scenario(ScenarioFields):
-    """A line of vehicles, how each quantity is drawn, and who learns.
+    """A line of vehicles, the distribution of each quantity, and the vehicles that learn.
 
     A quantity is a number, ``{uniform: [low, high]}``, ``{loguniform: [low, high]}``, ``{normal: {mean, sd, low,
-    high}}``, ``{lognormal: {median, sigma, low, high}}`` or ``{choice: [...]}``. One entry stands for every vehicle
-    (each draws its own value); a list has one entry per vehicle, gaps one per pair. Every way to build one
-    (``Scenario(...)``, ``load_scenario``, ``replace``) raises ``InvalidInput`` with one message: where, value, what
+    high}}``, ``{lognormal: {median, sigma, low, high}}`` or ``{choice: [...]}``. One entry applies to every vehicle,
+    and each vehicle draws its own value; a list has one entry per vehicle, or per pair for gaps. Every way to build a
+    scenario (``Scenario(...)``, ``load_scenario``, ``replace``) raises the same ``InvalidInput``: where, value, what
     would be right.
 
     >>> import ethbrake_marl as eb
@@ -113,14 +122,14 @@ class Scenario(ScenarioFields):
 
     @classmethod
     def from_document(cls, document: Document) -> Scenario:
-        """Build a scenario from a parsed file; messages name its file and line."""
+        """Build a scenario from a parsed file; error messages name its file and line."""
         scenario = cls.__new__(cls)
         _build(scenario, document)
         return scenario
 
     @model_validator(mode="after")
     def _whole(self) -> Scenario:
-        if self.mixture is not None:  # its members have been checked
+        if self.mixture is not None:  # its members are checked already
             return self
         check_whole(self)
         return self
@@ -132,7 +141,7 @@ class Scenario(ScenarioFields):
     __str__ = __repr__
 
     def _repr_html_(self) -> str:
-        """What it declares, for a notebook."""
+        """Return the declared values as HTML, for a notebook."""
         told = {key: value for key, value in self.declared().items() if key not in ("name", "title")}
         if self.mixture is not None:
             told["mixture"] = ", ".join(f"{e.weight:g} x {e.scenario['name']}" for e in self.mixture)
@@ -140,15 +149,22 @@ class Scenario(ScenarioFields):
         return Sheet(f"Scenario {self.name}: {self.title or 'no title'}", ("Key", "Value"), rows).html()
 
     def sample(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
-        """Worlds ``first`` to ``first + n - 1`` of the endless list of ``seed``; ``sampling.sample`` says more."""
+        """Return worlds ``first`` to ``first + n - 1`` of the endless list of ``seed``.
+
+        World k of a seed is always the same, bit for bit. ``channel``: ``"list"`` for evaluation, ``"training"`` for
+        training; the two are independent. Raises ``InvalidInput`` for an invalid number. See ``sampling.sample``.
+        """
         return sample(self, n, seed, first=first, channel=channel)
 
     def declared(self) -> dict[str, Any]:
-        """What was given, as plain data: ``Scenario(**scenario.declared())`` is the same scenario."""
+        """Return the declared values as plain data: ``Scenario(**scenario.declared())`` equals the scenario."""
         return self.model_dump(mode="json", exclude_unset=True, exclude_none=True)
 
     def content(self, without: Collection[str]) -> dict[str, Any]:
-        """Every value, defaults too, as plain data; of a mixture also those of its members, by name, without texts."""
+        """Return every value, including defaults, as plain data, except the keys ``without``.
+
+        For a mixture this includes the values of its scenarios, without their titles, descriptions and sources.
+        """
         content = self.model_dump(mode="json", exclude=set(without))
         if self.mixture is not None and self.members:
             content["mixture"] = [
@@ -158,18 +174,17 @@ class Scenario(ScenarioFields):
         return content
 
     def replace(self, **changes: Any) -> Scenario:
-        """The same scenario with other values in some fields, checked again.
+        """Return the scenario with changed values, for example ``replace(mass_t=2.0)``, checked again.
 
-        A new way to declare gaps or speeds takes the place of the old one. In a mixture the values are new in every
-        member.
+        A new way to declare gaps or speeds replaces the old one. In a mixture the values change in every scenario.
         """
         return Scenario(**changed_content(self.declared(), changes))
 
     def with_learners(self, learners: Sequence[str | int]) -> Scenario:
-        """The same scenario with exactly these learners, by name (``vehicle_2``) or index (from 0).
+        """Return the scenario with exactly these learners, by name (``vehicle_2``) or index (from 0).
 
-        A vehicle that learned and is not listed brakes fully; other scripts stay. Raises ``InvalidInput`` for
-        an unknown vehicle or one listed twice.
+        A former learner that is not listed brakes fully; other scripts stay. Raises ``InvalidInput`` for an unknown
+        vehicle or one listed twice.
         """
         if isinstance(learners, str):
             raise InvalidInput(f"learners: {learners!r}: must be a list of vehicles, for instance [{learners!r}]")
@@ -193,14 +208,14 @@ class Scenario(ScenarioFields):
 
 
 def as_scenario(game: Game) -> Scenario:
-    """Return a game that is a scenario; raise ``InvalidInput`` for any other game."""
+    """Return ``game`` itself if it is a ``Scenario``; raise ``InvalidInput`` for any other game."""
     if not isinstance(game, Scenario):
         raise InvalidInput(f"game {game.name!r}: is a {type(game).__name__}; a Scenario is needed here")
     return game
 
 
 def scenario_json_schema() -> dict[str, Any]:
-    """JSON Schema of a scenario file, for editors that complete and check YAML."""
+    """Return the JSON Schema of a scenario file, for editors that complete and check YAML."""
     one_of_two: list[dict[str, Any]] = [
         {"not": {"required": [*pair]}}
         if pair[0] in QUANTITY.optional
@@ -226,7 +241,15 @@ def _reference(key: str) -> dict[str, Any]:
 
 
 def _range(key: str, low: float, high: float, positive: bool = False) -> dict[str, Any]:
-    """What a quantity's range is for a number, and for each that can be drawn of a distribution or of a list."""
+    """Return the JSON schema of a quantity's range, for a number and for the numbers in a distribution or list.
+
+    Args:
+        key: key of the quantity.
+        low: smallest allowed value.
+        high: largest allowed value.
+        positive: ``low`` itself is not allowed.
+
+    """
     limits = {"exclusiveMinimum" if positive else "minimum": low, "maximum": high}
     above = {"exclusiveMinimum": 0}
     inside = dict.fromkeys(("low", "high", "with_load", *DISTRIBUTIONS), _reference(key))
@@ -236,7 +259,7 @@ def _range(key: str, low: float, high: float, positive: bool = False) -> dict[st
 
 
 def _build(scenario: Scenario, document: Document) -> None:
-    """Validate the document's content into ``scenario``."""
+    """Check the content of ``document`` and fill the new, empty ``scenario`` with it."""
     if not isinstance(document.content, dict):
         raise InvalidInput(f"{document.file}: must be a mapping of keys to values, for instance name: my-scenario")
     members: tuple[Scenario, ...] = ()
@@ -250,7 +273,10 @@ def _build(scenario: Scenario, document: Document) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """Replace numpy numbers and arrays by Python's own, which the strict schema accepts; scenarios by what they say."""
+    """Convert numpy numbers and arrays in ``value`` to Python's, which the strict schema accepts.
+
+    Scenarios become their content; mappings and lists are converted inside.
+    """
     if isinstance(value, Scenario):
         return value.declared()
     if isinstance(value, np.ndarray | np.generic):

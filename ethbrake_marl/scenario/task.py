@@ -1,4 +1,4 @@
-"""The task of whoever drives: a scenario, the vehicles that are driven in it, and the harm that counts."""
+"""A task: a scenario, the vehicles to be controlled in it, and the harm to be minimised."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from ethbrake_marl.scenario.schema import Scenario
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """Drive these vehicles of a scenario; all others follow its scripts.
+    """The task of controlling some vehicles of a scenario; all others follow the scenario's scripts.
 
-    Raises ``InvalidInput`` for an index that the scenario has no vehicle for, one given twice, or an unknown count.
+    Raises ``InvalidInput`` for an index without a vehicle, a repeated index, or an unknown harm count.
     """
 
-    scenario: Scenario
-    vehicles: tuple[int, ...]  # indices (0 = front), in the order in which they are driven
-    harm_count: HarmCount = "first"  # harm that is minimised; what is told under both counts ignores it
+    scenario: Scenario  # the scenario that the worlds are drawn from
+    vehicles: tuple[int, ...]  # indices of the controlled vehicles (0 = front), in the order of their commands
+    harm_count: HarmCount = "first"  # harm to be minimised: of each pair's ``"first"`` impact, or ``"total"``
 
     def __post_init__(self) -> None:
         check_harm_count(self.harm_count)
@@ -30,12 +30,12 @@ class Task:
 
     @property
     def vehicle(self) -> int:
-        """The vehicle that is driven; raises ``InvalidInput`` if it is not exactly one."""
+        """Index of the single controlled vehicle; raises ``InvalidInput`` unless there is exactly one."""
         if len(self.vehicles) != 1:
             raise InvalidInput(f"scenario {self.scenario.name!r}: needs one driven vehicle; driven are: {self.names}")
         return self.vehicles[0]
 
     @property
     def names(self) -> str:
-        """The driven vehicles by name, with commas between them; ``none`` where nobody is driven."""
+        """Names of the controlled vehicles, separated by commas; ``none`` if there are none."""
         return ", ".join(self.scenario.vehicle_names[i] for i in self.vehicles) or "none"

@@ -1,7 +1,7 @@
-"""Types of vehicles: what a car, a van or a truck is, drawn together, and which of them may stand where.
+"""Vehicle types: the quantities of a car, a van or a truck, and which types are possible at each place of a line.
 
-A world's vehicle first gets its type, then its quantities as that type declares them. What moves with the load of a
-vehicle, ``{with_load: [empty, full]}``, moves together: a full truck is heavy *and* brakes weakly.
+A vehicle first draws its type, then its quantities as that type declares them. Quantities that depend on the load,
+``{with_load: [empty, full]}``, depend on the same load: a full truck is heavy *and* brakes weakly.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from ethbrake_marl.scenario.channel import Equipage
 from ethbrake_marl.scenario.distributions import LEAVE_OUT, Numbers, Quantity, TableColumn, Uniform, WithLoad, support
 from ethbrake_marl.scenario.fields import MEANING, QUANTITY
 
-ANY = "any"  # in ``types``: every type, by its weight
+ANY = "any"  # in ``types``: every type, in proportion to its weight
 
 TypeName = Annotated[str, Field(pattern=NAME_PATTERN)]
 
@@ -55,7 +55,7 @@ TypeQuantity = Annotated[
 
 
 class VehicleType(FileModel):
-    """One type: how likely it is, and every quantity that it declares; the rest is as beside ``vehicle_types``."""
+    """One type of vehicle: its weight and its quantities; other quantities come from outside ``vehicle_types``."""
 
     weight: Weight = Field(default=1.0, description="how likely it is, relative to the other types")
     load: Quantity = Field(
@@ -95,7 +95,7 @@ def _check_type_names(kinds: dict[str, VehicleType]) -> dict[str, VehicleType]:
 
 VehicleTypes = Annotated[dict[TypeName, VehicleType], Field(min_length=1), AfterValidator(_check_type_names)]
 
-TypesHere = str | dict[str, Weight]  # of one vehicle: a type, ``any``, or a weight for each type that may stand there
+TypesHere = str | dict[str, Weight]  # types of one vehicle: a type, ``any``, or a weight per possible type
 
 
 def _one_or_each(value: object) -> str:
@@ -110,7 +110,14 @@ Types = Annotated[
 
 
 class TypesOfLine:
-    """Which types may stand at each place of a line, and how likely each is there."""
+    """The possible vehicle types at each place of a line, and their probabilities.
+
+    Args:
+        kinds: declaration of each type, by name; their order gives the indices of the types.
+        types: types that are possible at each place; None: all, in proportion to their weights.
+        vehicles: number of vehicles in the line.
+
+    """
 
     def __init__(self, kinds: Mapping[str, VehicleType], types: Types | None, vehicles: int) -> None:
         self.names = tuple(kinds)
@@ -120,11 +127,14 @@ class TypesOfLine:
         self.weights = np.array([[_weight(kinds, name, here) for name in kinds] for here in given])
 
     def possible(self, vehicle: int) -> list[int]:
-        """Indices of the types that may stand there."""
+        """Return the indices of the types that are possible for ``vehicle`` (index from 0)."""
         return np.flatnonzero(self.weights[vehicle] > 0.0).tolist()
 
     def draw(self, u: Floats) -> tuple[Ints, Floats]:
-        """Type (index) and load of every vehicle, both [n, N], from uniform numbers ``u`` [n, N, 2]."""
+        """Return type (index) and load (0 empty to 1 full) of every vehicle, both [n, N].
+
+        ``u``: uniform numbers in [0, 1), [n, N, 2 or more]; the first draws the type, the second the load.
+        """
         n, vehicles = u.shape[:2]
         types, load = np.zeros((n, vehicles), np.int64), np.zeros((n, vehicles))
         for i in range(vehicles):
@@ -142,7 +152,7 @@ def _weight(kinds: Mapping[str, VehicleType], name: str, here: TypesHere) -> flo
     return here.get(name, 0.0)
 
 
-LEFT_OUT: Any = object()  # a key that is not given, where a check must say whether it may be
+LEFT_OUT: Any = object()  # default that marks a missing key, which a check then accepts or refuses
 
 PerVehicle = Annotated[
     Annotated[Quantity, Tag("#one")] | Annotated[tuple[Quantity, ...], Field(strict=False, min_length=1), Tag("#each")],
@@ -151,7 +161,10 @@ PerVehicle = Annotated[
 
 
 class _ObjectiveSchema:
-    """The JSON schema of an objective: what is known when it is asked for."""
+    """Annotation of a text field that holds an objective: its JSON schema lists all objectives.
+
+    Objectives that are registered before the schema is made are included.
+    """
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
@@ -163,22 +176,16 @@ class _ObjectiveSchema:
 
 ObjectiveName = Annotated[str, _ObjectiveSchema]
 
-
-class _MemberSchema:
-    """In a file also a scenario's name, or the path of its file."""
-
-    @classmethod
-    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        return {"anyOf": [{"type": "string"}, {"type": "object"}]}
-
-
-MOST_NUMBERS = 100_000  # of a table: a scenario is kept whole wherever it is used
+MOST_NUMBERS = 100_000  # largest number of values in a table, which every copy of the scenario contains
 
 Column = Annotated[str, Field(pattern=r"^[a-z_]+(_[0-9]+)?[a-z0-9_]*$", max_length=64)]
 
 
 class Table(FileModel):
-    """Rows of which every world takes one, by weight; in a scenario file read from a CSV file beside it."""
+    """Rows of measured values; every world takes one row, by weight.
+
+    In a scenario file they may come from a CSV file.
+    """
 
     file: str = Field(default="", exclude_if=not_, description="CSV file with a header, from the scenario's folder on")
     columns: Annotated[tuple[Column, ...], Field(strict=False, min_length=1)] = Field(
@@ -211,7 +218,7 @@ class Table(FileModel):
         return self
 
     def column_values(self) -> dict[str, TableColumn]:
-        """The columns by name."""
+        """Return the columns of the table by name, each with the weights of the rows."""
         rows = np.array(self.rows)
         weights = self.weights if isinstance(self.weights, tuple) else (1.0,) * len(rows)
         cumulative = np.cumsum(np.asarray(weights))
@@ -219,10 +226,3 @@ class Table(FileModel):
             name: TableColumn(name, column, cumulative / cumulative[-1])
             for name, column in zip(self.columns, rows.T, strict=True)
         }
-
-
-class Member(FileModel):
-    """One scenario of a mixture: what it says, and how likely it is, relative to the others."""
-
-    scenario: Annotated[dict[str, Any], _MemberSchema] = Field(description="a name, a path, or what its file says")
-    weight: Weight = Field(default=1.0, description="how likely it is, relative to the other scenarios")

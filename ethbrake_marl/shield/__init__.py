@@ -1,4 +1,7 @@
-"""Shields: what stands between a proposed action and the applied one. Called, it puts one around an environment."""
+"""Shields: check each proposed action and replace it where it could break a promise about harm.
+
+The folder itself can be called: ``eb.shield(env)`` puts a shield around an environment.
+"""
 
 import sys
 from types import ModuleType
@@ -30,7 +33,7 @@ else:
 
 
 class _Shielding(ModuleType):
-    """``eb.shield`` is this folder and the function of its name: whoever imports one has the other."""
+    """Class of this module: makes ``ethbrake_marl.shield`` callable, so the folder and the function share one name."""
 
     def __call__(self, *arguments: Any, **settings: Any) -> Any:
         from ethbrake_marl.shield.wrappers import shield

@@ -1,4 +1,4 @@
-"""The options of a shield around an interface, and their checks, the same for every interface."""
+"""Attach a shield to an environment: the same options and checks for every interface."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ from ethbrake_marl.shield.options import ShieldOptions
 
 
 def proposing_agent(policy: object, where: str) -> Agent:
-    """The policy as an agent; an agent is returned as it is. Raises ``InvalidInput`` for anything else."""
+    """Return ``policy`` as an agent that proposes actions: an agent unchanged, a learned policy as a ``LearnedAgent``.
+
+    Anything else raises ``InvalidInput``, whose message begins with ``where``.
+    """
     if not isinstance(policy, type):
         if isinstance(policy, Agent):
             return policy
@@ -32,9 +35,15 @@ def proposing_agent(policy: object, where: str) -> Agent:
 def proposing_agents(
     policy: Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy], vehicles: Sequence[int], where: str
 ) -> dict[int, Agent]:
-    """The agent that proposes for each shielded vehicle, from a team, policies by name of vehicle, or one for all.
+    """Return the proposing agent of each shielded vehicle: vehicle index -> agent.
 
-    Raises ``InvalidInput`` for anything else, and for a team of other vehicles.
+    Args:
+        policy: a team, a mapping from vehicle name to policy, or one policy that proposes for all vehicles.
+        vehicles: indices of the shielded vehicles.
+        where: name of the interface, for error messages.
+
+    Raises ``InvalidInput`` for anything else, and if the team or mapping does not cover exactly these vehicles.
+
     """
     if isinstance(policy, Team):
         given: dict[int, Agent] = policy.drivers
@@ -55,10 +64,16 @@ Proposing = Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy]
 
 
 def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -> ShieldGuard:
-    """The guard of these options for all learners of an engine. ``policy`` proposes where the caller does not.
+    """Return the guard that shields all learners of an engine.
 
-    Raises ``InvalidInput`` where nobody learns, for several learners in another mode than ``step``, and for what is no
-    policy.
+    Args:
+        engine: the engine, which is not changed.
+        policy: proposes the actions that the caller leaves out; None: nobody. Mode ``episode`` needs it.
+        options: settings of the shield.
+
+    Raises ``InvalidInput`` if no vehicle learns, if several learn in another mode than ``step``, and if ``policy`` is
+    not a policy.
+
     """
     where, mode, scenario, vehicles = options.where, options.mode, engine.scenario, engine.learners
     if not vehicles:
@@ -80,9 +95,19 @@ def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -
 
 
 class Attached:
-    """A guard in the engine of an environment, for the wrapper that put it there.
+    """The link between a wrapper of an environment and the guard that it puts into the environment's engine.
 
-    Raises ``InvalidInput`` for what is not one of this package's environments, or is shielded already.
+    Args:
+        env: the environment to shield.
+        interface: class of which ``env`` must be an instance, such as ``gymnasium.Env``.
+        maker: code that makes such an environment, for error messages.
+        policy: proposes the actions that the caller leaves out; None: nobody.
+        where: name of the wrapper, for error messages.
+        options: keywords of ``ShieldOptions``.
+
+    The attributes are ``engine``, ``guard`` and ``options``, besides the properties below. Raises ``InvalidInput`` if
+    ``env`` is not an environment of this package, or is shielded already.
+
     """
 
     def __init__(
@@ -108,24 +133,25 @@ class Attached:
 
     @property
     def memory(self) -> Guarded:
-        """The guard's memory now; once it was closed, its last one."""
+        """Current memory of the guard; after ``close``, its last memory."""
         memory: Guarded | None = self.engine.guarded if self.engine.guard is self.guard else self._left
         return Guarded(None, {}) if memory is None else memory
 
     @property
     def shield(self) -> Any:
-        """As it is now, to be read; None before a reset.
+        """Current state of the shield, for reading only; None before the first reset.
 
-        A ``StepShield``, or the shield of another mode; in mode ``episode`` the memory of the ``HybridAgent``.
+        A ``StepShield`` in mode ``step``, the memory of the ``HybridAgent`` in mode ``episode``, or the shield of
+        another mode.
         """
         return self.memory.shield
 
     def _reached(self) -> Any:
-        """The engine of the environment inside, as it is now."""
+        """Return the engine of the wrapped environment, looked up anew at each call; None if there is none."""
         return getattr(getattr(self._env, "unwrapped", self._env), "engine", None)
 
     def check_open(self) -> None:
-        """Raise ``InvalidInput`` where this shield bounds nothing: it was closed, or another environment is inside."""
+        """Raise ``InvalidInput`` if this shield was closed, or if the environment inside the wrapper was replaced."""
         if self._reached() is not self.engine:
             raise InvalidInput(
                 f"{self.options.where}: another environment is inside than the one that is shielded; put a shield"
@@ -135,13 +161,13 @@ class Attached:
             raise InvalidInput(f"{self.options.where}: this shield was closed; put a new one around the environment")
 
     def close(self) -> None:
-        """Take the guard out of the engine."""
+        """Remove the guard from the engine. ``memory`` and ``shield`` keep their last values."""
         if self.engine.guard is self.guard:
             self._left = self.memory
             self.engine.protect(None)
 
     def penalty(self) -> Floats:
-        """The penalty of the last step's interventions, to be taken off the rewards, [n, L]."""
+        """Return the intervention penalty of the last step, [n, L], for the wrapper to subtract from the rewards."""
         self.check_open()
         ruling = self.engine.ruling
         if ruling is None:

@@ -1,8 +1,10 @@
-"""``certify``: is there a plan behind the proposed action that keeps the budget? If not, apply the backup's action.
+"""``certify``: apply the proposed action if a plan behind it keeps the budget, else apply the backup plan's action.
 
-A plan is tried in every member of a world, one after the other, with the kernels of ``members``. After the proposal
-these plans are tried: the rest of the current plan, then the best constant action. ``step`` says why the harm of the
-episode then stays within the first bound.
+A *plan* holds one action for each decision up to the horizon. The *backup* is the plan that the shield currently holds.
+The *budget* is the largest harm that the shield accepts for the whole episode. A *member* is one of the possible worlds
+that a world stands for. Each plan is simulated in every member, with the kernels of ``members``. Two plans are tried
+after a proposal: the rest of the current plan, then the best constant action. ``step`` proves that the harm of the
+episode then never exceeds the first bound.
 """
 
 from __future__ import annotations
@@ -39,14 +41,27 @@ from ethbrake_marl.shield.reasons import (
 )
 from ethbrake_marl.shield.running import Running, put
 
-APPLIED, REASON, BOUND, MARGIN = range(4)  # columns of a decision, of each vehicle
+APPLIED, REASON, BOUND, MARGIN = range(4)  # columns of the decision of one vehicle
 
-NEARLY = 1e-9  # a constant whose harm (m2/s2) in one segment is above the limit by less is certified step by step
+# A constant action is first simulated in one segment. If its harm (m2/s2) is above the limit by at most this much, the
+# exact simulation, decision by decision, still gets its chance.
+NEARLY = 1e-9
 
 
 @compiled(apart=True)
 def best_constant(world: Members, states: Floats, ended: Bools, step: int, constants: Floats) -> tuple[int, float]:
-    """Which constant action [C, K] has the least worst harm from here on, and that harm, each in one segment."""
+    """Return the index of the constant action with the least worst-case harm, and that harm (m2/s2).
+
+    Each action is held from now to the horizon, simulated in one segment.
+
+    Args:
+        world: the M possible worlds of one world (``Members``); the worst case is over them.
+        states: [M, S] their states now, in the layout of ``Running.states``.
+        ended: [M] whether their episodes have ended.
+        step: number of the present decision.
+        constants: [C, K] actions of the K shielded vehicles.
+
+    """
     best, least, critical = 0, math.inf, 0
     for c in range(constants.shape[0]):
         worst, first = 0.0, critical
@@ -67,9 +82,23 @@ def better_plan(
     world: Members, states: Floats, ended: Bools, step: int, constants: Floats, value: float, most: float,
     plan: Floats, trial: Floats,
 ) -> tuple[float, float]:  # fmt: skip
-    """Replace the plan from ``step`` on by the best constant, if that harms less than ``value`` and at most ``most``.
+    """Replace the rest of a plan by the best constant action, if this reduces its harm.
 
-    Returns the harm that is certified now, and the least harm found, certified or not.
+    A plan holds one action for each decision. The replacement requires a harm below ``value`` and at most ``most``.
+
+    Args:
+        world: the M possible worlds of one world (``Members``).
+        states: [M, S] their states now, in the layout of ``Running.states``.
+        ended: [M] whether their episodes have ended.
+        step: number of the present decision, from which on the plan is replaced.
+        constants: [C, K] constant actions.
+        value: harm of the plan in the worst possible world, m2/s2.
+        most: largest accepted harm, m2/s2.
+        plan: [L, K] changed in place.
+        trial: [L, K] workspace.
+
+    Returns the harm of the plan afterwards, and the least harm found, certified or not.
+
     """
     so_far = worst_so_far(world, states)
     if value <= so_far or so_far > most:  # nothing can be better
@@ -89,14 +118,14 @@ def better_plan(
 
 @compiled
 def copy_action(action: Floats, to: Floats) -> None:
-    """Copy the actions of one decision, one for each vehicle, or what else is a row of numbers."""
+    """Copy the numbers of ``action`` into ``to``, which is as long; usually one action per shielded vehicle."""
     for c in range(to.shape[0]):
         to[c] = action[c]
 
 
 @compiled
 def is_planned(action: Floats, planned: Floats) -> bool:
-    """Whether all vehicles do what the plan says."""
+    """Return whether ``action`` [K] equals the ``planned`` action [K] for all shielded vehicles."""
     for c in range(planned.shape[0]):  # noqa: SIM110  # all() is not compiled
         if action[c] != planned[c]:
             return False
@@ -108,10 +137,28 @@ def try_action(
     world: Members, states: Floats, ended: Bools, step: int, action: Floats, budget: float, certified: float,
     constants: Floats, plan: Floats, room: Floats, after: Floats, over: Bools,
 ) -> tuple[float, float, int]:  # fmt: skip
-    """Take the step of an action [K], and look for a plan after it: harm certified, least harm found, and the reason.
+    """Simulate one step with an action, and search for a plan that continues it within the budget.
 
-    Where the harm is within the budget, action and plan are in ``plan`` afterwards; else that is as it was, and its
-    harm ``certified``. An action from which the physics fails is not certified.
+    A plan holds one action for each decision. Tried are the rest of the present plan, then the constant actions. An
+    action for which the physics fails is not certified.
+
+    Args:
+        world: the M possible worlds of one world (``Members``).
+        states: [M, S] their states now, in the layout of ``Running.states``.
+        ended: [M] whether their episodes have ended.
+        step: number of the present decision.
+        action: [K] action to try.
+        budget: largest accepted harm of the episode, m2/s2.
+        certified: harm of ``plan``, m2/s2.
+        constants: [C, K] constant actions.
+        plan: [L, K] present plan; on success, replaced by the action and the plan behind it.
+        room: [2, L, K] workspace.
+        after: [M, S] receives the states after the step.
+        over: [M] receives whether the episodes have ended then.
+
+    Returns the harm of the plan found, which is a success if it is at most ``budget``; the least harm found; and the
+    code of the reason (``ShieldReason``).
+
     """
     going = take_steps(world, states, ended, step, action, after, over)
     value = worst_so_far(world, after) if going >= 0 else math.inf
@@ -134,7 +181,18 @@ def try_action(
 
 @compiled
 def tell_action(out: Floats, action: Floats, bound: float, margin: float) -> None:
-    """Note in ``out`` [K, 4] what is applied, its bound, and the margin of those that did not deviate."""
+    """Write the applied action, bound and margin of each shielded vehicle into its row of ``out`` [K, 4].
+
+    ``out`` has the columns ``APPLIED``, ``REASON``, ``BOUND`` and ``MARGIN``; its reasons are filled in before. A
+    vehicle whose proposal was rejected keeps the margin that is in ``out`` already.
+
+    Args:
+        out: changed in place.
+        action: [K] applied actions.
+        bound: harm that is guaranteed from now on, m2/s2.
+        margin: budget minus the harm found, m2/s2.
+
+    """
     for c in range(action.shape[0]):
         out[c, APPLIED], out[c, BOUND] = action[c], bound
         if out[c, REASON] != NO_CERTIFICATE:
@@ -146,10 +204,29 @@ def decide_world(
     world: Members, states: Floats, ended: Bools, step: int, proposed: Floats, budget: float, certified: float,
     constants: Floats, plan: Floats, room: Floats, tried: Floats, after: Floats, over: Bools, out: Floats,
 ) -> bool:  # fmt: skip
-    """Decide in one world, see ``certify``: fills ``after``, ``over`` (by member) and ``out`` (by vehicle: applied,
-    reason, bound, margin); the plan is the one whose harm is ``out``'s bound. First all proposals [K] together; if they
-    have no certificate, one vehicle after the other, front to rear, each beside what is in the plan by then. Returns
-    whether the physics did not fail with what is applied.
+    """Decide in one world: accept the proposed actions, or replace them by those of the plan.
+
+    All proposals are tried together first. If they have no certificate, the vehicles are tried one by one, front to
+    rear, each beside the actions that the plan holds by then.
+
+    Args:
+        world: the M possible worlds of this world (``Members``).
+        states: [M, S] their states now, in the layout of ``Running.states``.
+        ended: [M] whether their episodes have ended.
+        step: number of the present decision.
+        proposed: [K] proposed actions; NaN: none.
+        budget: largest accepted harm of the episode, m2/s2.
+        certified: harm of ``plan``, m2/s2.
+        constants: [C, K] constant actions that may replace the rest of a plan.
+        plan: [L, K] one action for each decision; changed in place, so that its harm is the bound in ``out``.
+        room: [2, L, K] workspace.
+        tried: [2, K] workspace.
+        after: [M, S] receives the states after the step.
+        over: [M] receives whether the episodes have ended then.
+        out: [K, 4] receives applied action, reason, bound and margin of each vehicle.
+
+    Returns False if the physics fails with the applied actions.
+
     """
     deviating = 0
     for c in range(proposed.shape[0]):
@@ -157,7 +234,7 @@ def decide_world(
         tried[0, c] = min(max(proposed[c], -1.0), 1.0) if usable else plan[step, c]
         out[c, REASON] = SAME_AS_PLAN if usable else NOT_A_NUMBER
         if tried[0, c] != plan[step, c]:
-            out[c, REASON] = -1  # open
+            out[c, REASON] = -1  # not decided yet
             deviating += 1
     value, least, reason = try_action(
         world, states, ended, step, tried[0], budget, certified, constants, plan, room, after, over
@@ -193,7 +270,23 @@ def certify_worlds(
     running: Running, proposed: Floats, budget: Floats, certified: Floats, constants: Floats, plans: Floats,
     after: Floats, out: Floats, over: Bools, failed: Bools,
 ) -> None:  # fmt: skip
-    """``decide_world`` in every world whose episode runs; ``failed`` [n] where it did. ``plans`` change in place."""
+    """Decide in each of n worlds whose episode still runs, by ``decide_world``.
+
+    A world whose episode has ended keeps its state and its plan.
+
+    Args:
+        running: the episodes at this decision, n worlds with M possible worlds each.
+        proposed: [n, K] proposed actions; NaN: none.
+        budget: [n] largest accepted harm of each episode, m2/s2.
+        certified: [n] harm of each plan, m2/s2.
+        constants: [C, K] constant actions that may replace the rest of a plan.
+        plans: [n, L, K] one action for each decision; changed in place.
+        after: [n * M, S] receives the states after the step.
+        out: [n, K, 4] receives applied action, reason, bound and margin of each vehicle.
+        over: [n * M] receives whether the episodes have ended then.
+        failed: [n] receives whether the physics failed.
+
+    """
     n, every = running.steps.shape[0], all_members(running)
     room, tried = np.zeros((2, plans.shape[1], plans.shape[2])), np.zeros((2, plans.shape[2]))
     M = running.states.shape[0] // max(n, 1)
@@ -217,9 +310,10 @@ def certify_worlds(
 
 @compiled
 def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Floats) -> None:
-    """Fill ``value`` [n] with the worst harm of the episodes if the plans are executed from here; infinity: it failed.
+    """Write the harm of each plan, executed from now on, to ``value`` [n] m2/s2; infinity if the physics fails.
 
-    Where one of the ``constants`` is better, it replaces the plan (in place) first.
+    The harm is that of the whole episode in the worst possible world. If one of the ``constants`` [C, K] (constant
+    actions) harms less than a plan, it first replaces the rest of that plan in ``plans`` [n, L, K].
     """
     n, every = running.steps.shape[0], all_members(running)
     trial = np.zeros((plans.shape[1], plans.shape[2]))
@@ -236,10 +330,11 @@ def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Flo
 
 @compiled
 def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) -> None:
-    """How the episodes end if the plans are executed from here.
+    """Simulate the ``plans`` [n, L, K] from now on and report how the episodes end.
 
-    Fills ``rests`` [n]: every member comes to rest before the horizon, and stays so; and ``borne`` [n * M, N]: the harm
-    that each vehicle bears then, an obstacle ahead none.
+    A plan holds one action for each decision; ``running`` holds n worlds with M possible worlds each. Writes to
+    ``rests`` [n] whether every possible world of a world comes to rest before the horizon and stays at rest, and to
+    ``borne`` [n * M, N] the harm that each vehicle bears by then, m2/s2 (an obstacle ahead bears none).
     """
     n, every = running.steps.shape[0], all_members(running)
     M = running.states.shape[0] // max(n, 1)
@@ -254,9 +349,16 @@ def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) 
 
 @compiled
 def descend_constants(running: Running, grid: Floats, rounds: int, action: Floats) -> None:
-    """Replace each vehicle's constant action [n, K] in turn by the best of the grid, by harm in one segment.
+    """Improve constant actions by coordinate descent over the vehicles.
 
-    In place, one vehicle after the other; of worlds with one member each.
+    Each vehicle's action is replaced in turn by the action of ``grid`` with the least harm, simulated in one segment.
+
+    Args:
+        running: the episodes, n worlds with exactly one possible world each.
+        grid: [G] actions to try for one vehicle.
+        rounds: how often every vehicle has its turn.
+        action: [n, K] constant actions, changed in place.
+
     """
     every, states, ended, steps = all_members(running), running.states, running.ended, running.steps
     for k in range(states.shape[0]):
@@ -272,36 +374,36 @@ def descend_constants(running: Running, grid: Floats, rounds: int, action: Float
             action[k, c] = best
 
 
-CONSTANTS = tuple(-k / 10 for k in range(11))  # actions that are tried as constants: coasting to full braking
+CONSTANTS = tuple(-k / 10 for k in range(11))  # constant actions that are tried, from coasting to full braking
 
 
 class Backup(NamedTuple):
-    """The plan that is executed where nothing else is certified."""
+    """The plan that the shield executes if it certifies nothing else, for n worlds."""
 
-    plan: Floats  # [n, L] or [n, L, K] actions, column j for decision j
-    harm: Floats  # [n] of the episode, in the worst member, if the plan is executed from now on (m2/s2)
-    constants: Floats = np.array(CONSTANTS)  # [C] or [C, K] actions that may replace the rest of a plan
+    plan: Floats  # [n, L], or [n, L, K] for K shielded vehicles: actions, column j for decision j
+    harm: Floats  # [n] harm of the episode in the worst possible world if the plan is executed from now on (m2/s2)
+    constants: Floats = np.array(CONSTANTS)  # [C] or [C, K] constant actions that may replace the rest of a plan
 
 
 class Decision(NamedTuple):
-    """The applied actions, the reasons, and the bound and plan that hold from now on."""
+    """Result of ``certify`` for n worlds, with K shielded vehicles if there are several."""
 
     applied: Floats  # [n] or [n, K] actions in [-1, 1]
-    intervened: Bools  # [n] or [n, K] what is applied is not what was proposed (clipped)
-    reason: NDArray[np.int64]  # [n] or [n, K] values of ShieldReason
-    bound: Floats  # [n] harm of the episode is at most this from now on (m2/s2)
-    margin: Floats  # [n] or [n, K] budget minus the least harm found after the proposal; negative: why it was rejected
-    after: Running  # as it will be at the next decision
-    backup: Backup  # the plan that goes with the bound
+    intervened: Bools  # [n] or [n, K] whether the proposal was replaced (clipping to [-1, 1] does not count)
+    reason: NDArray[np.int64]  # [n] or [n, K] codes of ShieldReason
+    bound: Floats  # [n] largest possible harm of the episode from now on (m2/s2)
+    margin: Floats  # [n] or [n, K] accepted harm minus least harm found after the proposal (m2/s2); < 0: rejected
+    after: Running  # the predicted episodes at the next decision
+    backup: Backup  # the plan whose harm is the bound
 
     @property
     def reason_names(self) -> NDArray[np.str_]:
-        """The reasons in words, [n] or [n, K]."""
+        """Why each proposal was accepted or replaced, in words such as "no certificate", [n] or [n, K]."""
         texts = [ShieldReason(code).text for code in self.reason.ravel().tolist()]
         return np.array(texts).reshape(self.reason.shape)
 
     def put(self, rows: Ints, other: Decision, taken: Ints) -> Decision:
-        """A copy with some worlds taken from another decision: ``rows`` of this one are ``taken`` of the other."""
+        """Return a copy with world ``rows[j]`` of this decision replaced by world ``taken[j]`` of ``other``."""
         columns: dict[str, Any] = {
             name: put(getattr(self, name), rows, getattr(other, name)[taken]) for name in self._fields[:5]
         }
@@ -316,15 +418,26 @@ class Decision(NamedTuple):
 
 
 def plan_harm(running: Running, plan: Floats) -> Floats:
-    """Harm of the episodes in the worst member if the plans are executed from here, [n] m2/s2, caps aside.
+    """Return the harm of the episodes if the plans are executed from now on, [n] m2/s2.
 
-    It equals the engine's to the bit.
+    A plan holds one action for each decision: ``plan`` is [n, L], or [n, L, K] for K vehicles. The harm is that of the
+    whole episode in the worst possible world, and equals the engine's to the bit. Caps on the harm of single vehicles
+    are ignored.
     """
     return bettered_plan(running, plan, np.zeros(0))[1]
 
 
 def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Floats, Floats]:
-    """The plans, or the best constant action where it harms less in the worst member; and that harm."""
+    """Return each plan, or the best constant action from now on if that harms less, and the harm of the result.
+
+    Args:
+        running: n episodes at a decision.
+        plan: [n, L] or [n, L, K] one action for each decision.
+        constants: [C] or [C, K] constant actions to compare with.
+
+    Returns plans in the shape of ``plan``, and [n] m2/s2, the harm of the whole episode in the worst possible world.
+
+    """
     value = np.empty(running.n)
     _check_plan(running, plan)
     plans = np.array(plan, np.float64, order="C")
@@ -336,22 +449,29 @@ def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Fl
 
 
 def from_now(past: Floats, later: Floats | float, steps: Ints) -> Floats:
-    """Plans with the actions of ``past``, which were applied, before the decisions ``steps`` [n], then ``later``."""
+    """Return plans with the actions of ``past`` before the decision number ``steps`` [n], and of ``later`` from it on.
+
+    A plan holds one action for each decision: ``past`` and the result are [n, L] or [n, L, K]; ``later`` has the same
+    shape or is one action.
+    """
     made = np.arange(past.shape[1]) < steps[:, np.newaxis]
     return np.where(made if past.ndim == 2 else made[:, :, np.newaxis], past, later)
 
 
 def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) -> Decision:
-    """Decide in every world which proposed actions are applied, and where the backup's; no argument is changed.
+    """Decide in every world: apply the proposed action if it can be certified, else the action of the backup plan.
+
+    A proposal is certified if some plan behind it keeps the harm of the episode within the budget. No argument is
+    changed.
 
     Args:
-        running: the episodes, at this decision.
-        proposed: actions [n] or [n, K]. One beyond [-1, 1] is clipped first; one that is no number is replaced.
-        backup: the plan that is applied where a proposal has no certificate, and its harm.
-        budget: the harm [n] that is guaranteed, at least the backup's.
+        running: the episodes at this decision.
+        proposed: actions [n] or [n, K]; clipped to [-1, 1] first. NaN is replaced by the planned action.
+        backup: the plan to apply if a proposal has no certificate, and its harm.
+        budget: largest accepted harm of each episode, [n] m2/s2; at least the backup's harm.
 
-    Raises ``InvalidInput`` for shapes that do not fit or a budget below the backup's harm, ``PhysicsError`` naming the
-    worlds that cannot be advanced by what would be applied.
+    Raises ``InvalidInput`` for shapes that do not fit or a budget below the backup's harm, and ``PhysicsError`` naming
+    the worlds in which the physics fails with the applied action.
 
     """
     n, problem, vehicles = running.n, running.problem, len(running.problem.vehicles)

@@ -1,4 +1,4 @@
-"""A comparison of what happened with what was predicted: to the last bit, the harm so far included."""
+"""Comparison of the observed worlds with the shield's prediction: bit by bit, including the harm so far."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from ethbrake_marl.physics.state import Bools, Floats, Worlds
 from ethbrake_marl.shield.certify import ends_of_plans
 from ethbrake_marl.shield.running import Running
 
-SLACK = 1e-9  # by more than this (m, m/s) a world lies outside what several members predict; one member is exact
+SLACK = 1e-9  # tolerance (m, m/s) around the range that several possible worlds predict; one alone must match exactly
 
-GROUPS = (("gap", " m"), ("hit flag", ""), ("first-impact harm", " m2/s2"), ("total harm", " m2/s2"))  # of each pair
+# columns of each pair in a state: name and unit
+GROUPS = (("gap", " m"), ("hit flag", ""), ("first-impact harm", " m2/s2"), ("total harm", " m2/s2"))
 
 
 def seen_columns(packed: Packed) -> Floats:
-    """Running worlds and their harm so far in the columns of ``Running.states``, [n, S], to compare the two.
+    """Return an engine's running worlds as rows [n, S] in the layout of the shield's predictions.
 
-    These are speeds, gaps, hit flags and both harms, with the obstacle first in each group where there is one. Raises
-    ``InvalidInput`` where only some of the worlds have one.
+    This is the layout of ``Running.states``: speeds, gaps, hit flags, first-impact harm and total harm. If some world
+    has an obstacle ahead, its column comes first in each group.
     """
     state, column = packed.state, packed.column
     speeds, first, pairs, at = state[:, column.speed : column.command], column.gap, column.vehicles - 1, column.obstacle
@@ -32,8 +33,11 @@ def seen_columns(packed: Packed) -> Floats:
 
 
 def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
-    """The worlds with speeds, gaps and hit flags (the obstacle's too) from the states [n, S] of their problem."""
-    added = (states.shape[1] + 4) // 6 - worlds.N  # 1: columns of an obstacle, or of a post, in front of each group
+    """Return ``worlds`` with other speeds, gaps and hit flags, also those of an obstacle.
+
+    These come from ``states`` [n, S], in the layout of the shield's predictions (``Running.states``).
+    """
+    added = (states.shape[1] + 4) // 6 - worlds.N  # 1 if each group starts with the column of an obstacle, else 0
     N = worlds.N + added
     gaps, hit = states[:, N : 2 * N - 1], states[:, 2 * N - 1 : 3 * N - 2] == 1.0
     return replace(
@@ -47,7 +51,10 @@ def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
 
 
 def difference(predicted: Floats, seen: Floats) -> str:
-    """The first number in which a world as seen [S] is not as predicted [S], in words; "nothing" where all are."""
+    """Describe the first number in which an observed world differs from its prediction; "nothing" if none does.
+
+    ``predicted`` and ``seen`` are rows [S] as in ``Running.states``; ``seen`` may end earlier.
+    """
     vehicles = (len(predicted) + 4) // 6
     for column in np.flatnonzero(~(seen == predicted[: len(seen)])).tolist():
         if column < vehicles:
@@ -60,11 +67,14 @@ def difference(predicted: Floats, seen: Floats) -> str:
 
 
 def ends_under(running: Running, plan: Floats) -> tuple[Bools, Floats]:
-    """How the episodes end if the plans are executed from here.
+    """Return how the episodes end if the plans are executed from now on.
 
-    Where everything rests at the horizon, in every member, [n]; and the harm of the whole episode that each vehicle
-    bears, split by mass as in the ledger, to the same bits, [n * M, N] m2/s2. With an obstacle ahead its column comes
-    first, and is 0.
+    A plan holds one action for each decision; ``plan`` is [n, L], or [n, L, K] for K shielded vehicles. ``running``
+    holds n worlds, each with M possible worlds.
+
+    Returns two arrays: whether all vehicles rest at the horizon in every possible world, [n]; and the harm of the whole
+    episode that each vehicle bears, [n * M, N] m2/s2. Harm is split by mass with the operations of the ledger, so both
+    agree to the bit. With an obstacle ahead, its column comes first and is 0.
     """
     rests, borne = np.empty(running.n, np.bool_), np.empty(running.problem.mass.shape)
     plans = np.ascontiguousarray(plan).reshape(*plan.shape[:2], len(running.problem.vehicles))

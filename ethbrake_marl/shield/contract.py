@@ -1,22 +1,24 @@
-"""The contract of every shield.
+"""The contract of every shield: the interface between an engine and its guard.
 
-An engine asks its guard inside ``Engine.step``, once for all n worlds and L learners:
+A *guard* is the object in an engine that decides which actions are applied. The engine calls its guard inside
+``Engine.step``, once for all n worlds and L learners:
 
     decide(state, memory, proposed) -> (applied, memory, info)
 
-``state``     the engine with its running episodes; a guard reads it, and changes nothing.
+``state``     the engine with its running episodes; the guard reads it and changes nothing.
 ``memory``    what the guard remembers of these episodes: a value, never changed in place.
-``proposed``  actions [n, L] in [-1, 1]; NaN is no number, a column of NaN is no proposal at all.
-``applied``   actions [n, L]: the engine makes its step with these.
-``memory``    what the guard will remember once the step is made.
-``info``      what there is to say about the decision: it stands in the infos as ``shield_...``.
+``proposed``  actions [n, L] in [-1, 1]; NaN is an invalid action, a column of NaN means that no action was given.
+``applied``   actions [n, L] with which the engine makes its step.
+``memory``    the guard's memory after the step.
+``info``      details of the decision, shown in the infos as ``shield_...``.
 
-The answer is a ``Ruling`` (``engine.engine``), which holds all three. After the step, ``check`` compares the new state
-with the promised one. ``UncertifiedStep`` undoes the step: the engine keeps its worlds and the old memory.
+``decide`` returns all three in a ``Ruling`` (``engine.engine``). After the step, ``check`` compares the new state with
+the prediction. If ``check`` raises ``UncertifiedStep``, the engine undoes the step and keeps its old memory.
 
-``begin`` starts episodes in some rows, and ``report`` gives the infos. ``ShieldGuard`` does what is the same in every
-mode: it asks the policies that propose, keeps their memories, and lays out the infos by vehicle. A mode adds its
-decision: ``paper_hybrid.EpisodeGuard`` and ``guard.StepGuard``. ``step`` says what step mode promises, and proves it.
+``begin`` starts episodes in some rows, and ``report`` returns the infos. ``ShieldGuard`` implements what all modes
+share: it queries the proposing policies, keeps their memories, and arranges the infos by vehicle. Each mode adds its
+own decision: ``paper_hybrid.EpisodeGuard`` and ``guard.StepGuard``. The module ``step`` states and proves the promise
+of step mode.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ from ethbrake_marl.shield.rollouts import Proposer, proposed_actions
 
 
 class ShieldMode(IntEnum):
-    """The mode of a shield: the code ``shield_mode`` of the infos. Modes of extensions have codes of their own.
+    """Mode of a shield, as the code ``shield_mode`` in the infos. Modes of extensions define codes of their own.
 
     >>> import ethbrake_marl as eb
     >>> eb.ShieldMode(1).name
@@ -53,33 +55,39 @@ class ShieldMode(IntEnum):
 
 
 class Guarded(NamedTuple):
-    """The memory of a guard: its shield, and the memories of the policies that propose."""
+    """Memory of a guard (the part of an engine that certifies or replaces actions) for n episodes."""
 
-    shield: Any  # the shield of the mode, a value with ``take(rows)``; in mode ``episode`` the HybridAgent's memory
-    policies: dict[int, Memory]  # by shielded vehicle, front to rear; empty where no policy proposes
+    shield: Any  # the mode's shield, a value with ``take(rows)``; in mode ``episode`` the memory of the HybridAgent
+    policies: dict[int, Memory]  # index of a shielded vehicle -> memory of its policy; empty without policies
 
     def take(self, rows: Ints) -> Guarded:
-        """The memory of some rows; a row may be named several times."""
+        """Return the memory of the episodes in the rows with the indices ``rows``, which may be repeated."""
         is_tree = isinstance(self.shield, Mapping)
         shield = take_memory(self.shield, rows) if is_tree else self.shield.take(rows)
         return Guarded(shield, take_memory(self.policies, rows))
 
     @property
     def told(self) -> dict[str, Any]:
-        """What the shield says of each world, under the names that an agent's memory uses."""
+        """``{"predicted_harm": [n], "chosen_policy": [n]}``: the shield's values, None for a value that it lacks.
+
+        These are the harm predicted at the alert (m2/s2), and whether the policy drives.
+        """
         return {what: getattr(self.shield, what, None) for what in ("predicted_harm", "chosen_policy")}
 
 
 class ShieldGuard(ABC):
-    """What is the same in every mode. All learners are shielded, each by its place in ``vehicles``.
+    """Base class of the guards of all modes: the part of an engine that certifies or replaces the learners' actions.
+
+    A subclass implements ``decide`` (which actions are applied), ``_started`` (the shield after episodes have begun)
+    and ``tell`` (the infos). It may override ``check``, which compares a step with the prediction, and ``intervened``.
 
     Args:
-        engine: in which the guard will stand.
-        policies: propose where the caller does not, by vehicle. One that remembers its episode is asked at every
-            decision, so that its memory stays right.
-        shield: before any episode.
-        mode: the code of the infos.
-        where: the interface that the guard was made for, for messages.
+        engine: the engine that the guard will protect. All its learners are shielded, front to rear.
+        policies: vehicle index -> policy that proposes if the caller gives no action. A policy with a memory is called
+            at every decision, so that its memory stays up to date.
+        shield: the shield before any episode has begun, in the mode's own form.
+        mode: code of the mode in the infos.
+        where: name of the interface, for error messages.
 
     """
 
@@ -94,40 +102,64 @@ class ShieldGuard(ABC):
 
     @abstractmethod
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
-        """Say what is applied instead of the proposed actions [n, L]."""
+        """Return the actions to apply in the next step, with the details of the decision.
+
+        Args:
+            running: the engine before the step.
+            memory: memory of the guard.
+            proposed: [n, L] proposed actions. A column of NaN: the caller gave that learner no action, so its policy
+                proposes. A single NaN: an invalid action, which is never applied.
+
+        """
 
     @abstractmethod
     def _started(self, shield: Any, alert: Worlds, rows: Ints) -> Any:
-        """The shield once episodes start in these rows. The given one is a copy, and may be changed."""
+        """Return the mode's shield after episodes have started in the rows with the indices ``rows``.
+
+        ``alert`` holds only the worlds of these rows, at t = 0. ``shield`` is a copy and may be changed.
+        """
 
     @abstractmethod
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """What the infos say after a ruling. None: before the first decision, under the same keys.
+        """Return the infos after a decision: name (without ``shield_``) -> value.
 
-        A value is one number, one for each world [n], each learner [n, L], or each vehicle [n, N].
+        Each value is a single number, or an array by world [n], by learner [n, L] or by vehicle [n, N].
+
+        Args:
+            memory: memory of the guard.
+            ruling: the decision; None before the first one, when the names are the same.
+
         """
 
     def begin(self, memory: Guarded | None, alert: Worlds, rows: Ints) -> Guarded:
-        """The memory once episodes start in these rows."""
+        """Return the guard's memory after episodes have started in the rows with the indices ``rows``.
+
+        ``alert`` holds only the worlds of these rows, at t = 0. ``memory`` is None before the first episode.
+        """
         shield, policies = memory or Guarded(self._fresh, {})
         begun = {i: begin_script(policy, alert, i, self.scripts) for i, policy in self._policies.items()}
         policies = renew_memory(policies, rows, begun) if policies else begun
         return Guarded(self._started(copy.copy(shield), alert, rows), policies)
 
     def check(self, ruling: Ruling, after: Engine) -> Guarded:
-        """The memory to keep: by default what the ruling says, whatever the step led to."""
+        """Return the memory to keep after the step.
+
+        ``ruling`` is the decision before the step, ``after`` the engine after it. This base class accepts every step,
+        and returns the ruling's memory.
+        """
         memory: Guarded = ruling.memory
         return memory
 
     def intervened(self, ruling: Ruling) -> Bools:
-        """Where the applied action differs from the proposed one, [n, L]."""
+        """Return whether the applied action differs from the proposed one, [n, L], for the decision ``ruling``."""
         decided: Bools = ruling.decision.intervened
         return decided.reshape(ruling.applied.shape)
 
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
-        """The infos of each vehicle, [n, N]: of the last step, or of the alert in rows that have just begun.
+        """Return the infos of every vehicle: name (without ``shield_``) -> values [n, N].
 
-        In a row that has begun anew since the last step, that step belongs to the episode before.
+        They describe the last step of the engine ``running``. In a row whose episode has started since, they describe
+        the alert of the new episode.
         """
         memory: Any = running.guarded
         ruling, begun = running.ruling, running.steps == 0
@@ -140,7 +172,11 @@ class ShieldGuard(ABC):
         return last
 
     def _of_vehicles(self, infos: Mapping[str, Any], running: Engine) -> dict[str, NDArray[Any]]:
-        """The infos spread over all vehicles, [n, N]. A vehicle without a shield has reason ``NO_DECISION``, and 0."""
+        """Return the ``infos`` (name -> value) with every value expanded to all vehicles, [n, N].
+
+        ``running`` is the engine. A vehicle without a shield gets reason ``NO_DECISION``, and 0 in all other entries
+        that have a column per learner.
+        """
         shape, spread = running.wanted_mps2.shape, dict[str, NDArray[Any]]()
         for name, value in infos.items():
             each = np.asarray(value)
@@ -152,7 +188,10 @@ class ShieldGuard(ABC):
         return spread
 
     def _of_step(self, ruling: Ruling | None) -> dict[str, Any]:
-        """Mode, proposed and applied action; before the first step the actions are 0."""
+        """Return the infos that all modes have: mode, proposed and applied action, and whether they differ.
+
+        ``ruling`` is the decision in the last step; None before the first step, when the actions are 0.
+        """
         infos: dict[str, Any] = {"mode": self.mode}
         if ruling is None:
             return infos | {"proposed_action": 0.0, "applied_action": 0.0, "intervened": False}
@@ -162,7 +201,14 @@ class ShieldGuard(ABC):
     def _asked(
         self, worlds: Worlds | None, memories: dict[int, Memory], proposed: Floats
     ) -> tuple[Floats, dict[int, Memory]]:
-        """All proposals [n, L], the policies' where the caller made none, and the memories of the policies."""
+        """Return the proposals [n, L], completed by the policies, and the policies' new memories.
+
+        Args:
+            worlds: the n worlds as the policies see them; None only if no policy is called.
+            memories: vehicle index -> memory of its policy.
+            proposed: [n, L] the caller's actions; a column of NaN is filled in by that learner's policy.
+
+        """
         left_out = np.isnan(proposed).all(axis=0)
         if left_out.any() and not self._policies:
             raise InvalidInput("shield: no action was given, and there is no policy that could propose one")
@@ -174,12 +220,19 @@ class ShieldGuard(ABC):
         return proposed, memories
 
     def _proposer(self, memories: dict[int, Memory], worlds: Worlds | None) -> Proposer | None:
-        """The policies with what they see now, for rollouts; None without policies."""
+        """Return the policies with their ``memories`` and the current ``worlds``, for rollouts.
+
+        None if there are no policies, or if ``worlds`` is None.
+        """
         return Proposer(self._policies, memories, worlds) if self._policies and worlds is not None else None
 
 
 def why(ruling: Ruling | None) -> dict[str, Any]:
-    """Reason and margin of a certified decision, [n, L]."""
+    """Return the infos ``reason`` and ``margin`` of a decision of mode ``step``, each [n, L].
+
+    ``reason`` is a code of ``ShieldReason``; ``margin`` is the accepted harm minus the least harm found after the
+    proposal, m2/s2. Before the first decision (``ruling`` None) they are ``NO_DECISION`` and 0.
+    """
     if ruling is None:
         return {"reason": ShieldReason.NO_DECISION, "margin": 0.0}
     return {name: getattr(ruling.decision, name).reshape(ruling.applied.shape) for name in ("reason", "margin")}

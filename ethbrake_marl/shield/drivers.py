@@ -1,4 +1,4 @@
-"""A driver behind a shield, for evaluations: it proposes, and a guard in the engine decides."""
+"""Agents and teams behind a shield, for evaluations: the agent proposes, and a guard in the engine decides."""
 
 from __future__ import annotations
 
@@ -17,20 +17,23 @@ from ethbrake_marl.shield.paper_hybrid import HybridAgent
 
 
 class ShieldedDriver(ByPolicy):
-    """An agent, or a team, behind a shield that certifies every action: mode ``step``, or one of an extension.
+    """An agent or a team behind a shield that certifies every action: mode ``step``, or a mode of an extension.
 
-    Where an agent, rolled out at the alert, harms no more than the coupled optimum, it drives unhindered, and its harm
-    is the bound. Elsewhere each action must be certified: by the rest of the plan, by a constant, or by the policy,
-    rolled out from the state after the action. All proposals of a team are known before any action is applied.
+    At the alert the policy is simulated to the end. Where it harms no more than E-V2X-BM, it drives without
+    interventions and its harm is the bound. Elsewhere each action must be certified by the rest of the plan, by a
+    constant action, or by a rollout: a simulation of the policy from the state after the action. A team's proposals are
+    decided together.
 
     Args:
-        policy: proposes.
-        scenario: in which actions are certified.
-        later_rollouts: whether the policy itself may certify an action.
-        told: worlds at the alert as the shield takes them to be; None: as they are, which the policy sees.
+        policy: the agent or team that proposes.
+        scenario: the scenario in which actions are certified.
+        later_rollouts: whether a rollout of the policy may certify an action.
+        told: worlds at the alert as the shield assumes them; None: the true worlds. The policy always sees the true
+            worlds.
         options: keywords of ``ShieldOptions``.
 
-    Raises ``InvalidInput`` for what is no agent and what does not fit, and for a learner that a team does not drive.
+    Raises ``InvalidInput`` where ``policy`` is not an agent or team, for options that do not fit, and where a team does
+    not drive every learner.
 
     >>> import ethbrake_marl as eb
     >>> eb.make_agent("coast+step", scenario=eb.load_scenario("paper-random")).on([1]).name
@@ -68,17 +71,20 @@ class ShieldedDriver(ByPolicy):
 
     @property
     def adds(self) -> Source:
-        """What the shield knows of the line, in which it certifies, beside what the policy knows."""
+        """Knowledge (``Source``) that the shield uses to certify actions, in addition to what the policy knows."""
         return self.options.adds
 
     @property
     def knows(self) -> Knowledge:
-        """What the policy knows, and what the shield adds."""
+        """Combined knowledge of the policy and the shield."""
         return Knowledge.of(self.policy, also=self.adds)
 
     @classmethod
     def around(cls, driver: Driver, task: Task, **settings: Any) -> Team:
-        """A copy of the ``driver`` behind one shield, on the task's vehicles; settings as of the class."""
+        """Return a team that drives the vehicles of ``task`` with copies of ``driver`` behind one shield.
+
+        ``settings`` are further keywords of ``ShieldedDriver``; scenario and harm count are the task's.
+        """
         if isinstance(driver, Team) and len(task.vehicles) == 1:
             driver = Team.of(driver, task.vehicles).drivers[task.vehicle]
         elif isinstance(driver, Agent) and len(task.vehicles) > 1:
@@ -86,16 +92,27 @@ class ShieldedDriver(ByPolicy):
         return cls(driver, task.scenario, harm_count=task.harm_count, **settings).on(task.vehicles)
 
     def on(self, vehicles: Collection[int]) -> Team:
-        """The team that drives these vehicles behind one shield, each by its own copy."""
+        """Return a team behind one shield, in which each of these vehicles is driven by its own copy of the policy.
+
+        ``vehicles`` are indices (0 = front).
+        """
         return Team(Team.of(self.policy, vehicles).drivers, self.name, shield=self)
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent]) -> Guard:
-        """The guard for the engine in which they drive."""
+        """Return the guard for ``engine``, in which ``policies`` (vehicle index -> agent) propose."""
         return self.options.guard(engine, policies, several=isinstance(self.policy, Team), **self._how)
 
 
 def shielded(driver: Driver, scenario: Scenario, mode: str, **options: Any) -> Driver:
-    """An agent or a team behind a shield; an agent whose scenario has several learners drives each by a copy."""
+    """Return an agent or a team behind a shield.
+
+    Args:
+        driver: the agent or team. If the scenario has several learners, a copy of an agent drives each.
+        scenario: the scenario in which actions are certified.
+        mode: ``step``, ``episode`` or a mode of an extension.
+        options: further keywords of ``ShieldOptions``.
+
+    """
     if mode == "episode":
         settings = ShieldOptions(mode, **options)
         return HybridAgent(driver, scenario, bound=settings.bound, harm_count=settings.harm_count)  # type: ignore[arg-type]  # which refuses a team

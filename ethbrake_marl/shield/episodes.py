@@ -1,4 +1,4 @@
-"""Episodes of a driver behind a step shield: harm, bound, and replaced decisions, world by world."""
+"""Results of whole episodes behind a step shield: harm, bound and replaced decisions of every world."""
 
 from __future__ import annotations
 
@@ -15,50 +15,62 @@ from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield.drivers import ShieldedDriver
 from ethbrake_marl.shield.step import StepShield
 
-CHUNK = 500  # worlds advanced together: bounds memory, changes no result
+CHUNK = 500  # worlds advanced together; limits memory, and does not change results
 
 
 class Shielded(NamedTuple):
-    """Episodes behind a step shield: n worlds (any axes before), N vehicles, K of them shielded."""
+    """Results of whole episodes behind a step shield: n worlds, N vehicles, K of them shielded.
 
-    harm: Floats  # [n] under the guarded count (m2/s2)
-    vehicle_harm: Floats  # [n, N] the share of it that each vehicle bears
-    bound: Floats  # [n] at the alert, with the allowance
-    baseline: Floats  # [n, N] harm that each vehicle bears under the baseline plan
-    replaced: Ints  # [n, K] replaced decisions of each shielded vehicle
-    decisions: Ints  # [n] decisions of each shielded vehicle
-    moving: Bools  # [n] the horizon cut the episode off
+    The shapes below are for one driver. The result of ``stack``, for several drivers, has one more axis in front:
+    ``harm`` is then [drivers, n].
+    """
+
+    harm: Floats  # [n] harm of the episode, first-impact or total as the shield guarantees it (m2/s2)
+    vehicle_harm: Floats  # [n, N] part of that harm that each vehicle bears (m2/s2)
+    bound: Floats  # [n] harm that the shield guaranteed at the alert, allowance included (m2/s2)
+    baseline: Floats  # [n, N] harm that each vehicle bears under the constant actions of least harm (m2/s2)
+    replaced: Ints  # [n, K] number of replaced decisions of each shielded vehicle
+    decisions: Ints  # [n] number of decisions of each shielded vehicle
+    moving: Bools  # [n] whether something still moved at the horizon
 
     @staticmethod
     def of(episodes: Episodes, task: Task) -> Shielded:
-        """The episodes of a driver behind a step shield, once they have ended."""
+        """Return the results of ended episodes that a driver behind a step shield drove.
+
+        ``task`` says which harm is reported.
+        """
         shield: StepShield = episodes.guarded.shield
-        assert shield.running is not None
+        assert shield.memory.running is not None
         return Shielded(
             episodes.ledger.world_harm(task.harm_count),
             episodes.ledger.vehicle_harm(task.harm_count),
             shield.predicted_harm,
-            shield.baseline_shares,
-            shield.replaced.reshape(len(shield.replaced), -1),
-            shield.running.steps.copy(),
+            shield.memory.baseline_shares,
+            shield.memory.replaced.reshape(len(shield.memory.replaced), -1),
+            shield.memory.running.steps.copy(),
             ~episodes.at_rest,
         )
 
     @staticmethod
     def join(parts: Sequence[Shielded]) -> Shielded:
-        """The worlds of all parts, one after the other."""
+        """Return the results of all parts, one after the other along the axis of worlds."""
         return Shielded(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
     @staticmethod
     def stack(parts: Sequence[Shielded]) -> Shielded:
-        """Several drivers in the same worlds, on a new first axis."""
+        """Stack the results of several drivers in the same worlds along a new first axis."""
         return Shielded(*(np.stack(columns) for columns in zip(*parts, strict=True)))
 
 
 def drive_shielded(driver: Driver, worlds: Worlds, task: Task, **settings: Any) -> Shielded:
-    """Drive a copy of the ``driver`` behind a step shield through every world, ``CHUNK`` worlds at a time.
+    """Drive a copy of ``driver`` behind a step shield through every world, and return the results.
 
-    ``settings`` are those of ``ShieldedDriver``.
+    Args:
+        driver: an agent or a team.
+        worlds: n worlds at the alert; they are driven in chunks of ``CHUNK``.
+        task: scenario, shielded vehicles and harm count.
+        settings: further keywords of ``ShieldedDriver``.
+
     """
     parts = []
     for first in range(0, worlds.n, CHUNK):

@@ -1,4 +1,4 @@
-"""Was an intervention needed? Each one is left out, and its episode simulated again."""
+"""Check whether interventions were needed: simulate each episode again without the intervention."""
 
 from __future__ import annotations
 
@@ -19,62 +19,80 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.shield.rollouts import proposed_action
 from ethbrake_marl.shield.step import StepShield
 
-SAME_HARM = 1e-9  # harms (m2/s2) closer than this are one harm
+SAME_HARM = 1e-9  # harms (m2/s2) that differ by less than this count as equal
 
 VERDICTS = ("needed", "harmless", "costly")
 
 
 class Review(NamedTuple):
-    """What each of the m logged interventions of the running episodes was good for."""
+    """Effect of each of the m interventions (replaced actions) in the log of the running episodes."""
 
-    world: Ints  # [m] row of the batch
-    vehicle: Ints  # [m] whose action was replaced
+    world: Ints  # [m] row of the world in the batch
+    vehicle: Ints  # [m] index of the vehicle whose action was replaced
     step: Ints  # [m] number of the decision
-    realised: Floats  # [m] harm of the episode as it went (m2/s2)
-    without: Floats  # [m] had the policy, or the whole team, driven alone from that decision on
-    verdict: NDArray[np.str_]  # [m] one of VERDICTS
-    trusted: Bools  # [m] nothing seen in that world contradicted the assumptions
+    realised: Floats  # [m] harm of the episode as it was, with the intervention (m2/s2)
+    without: Floats  # [m] harm if the policy or team had driven unshielded from that decision on (m2/s2)
+    verdict: NDArray[np.str_]  # [m] "needed" (harm is higher without it), "costly" (lower) or "harmless" (the same)
+    trusted: Bools  # [m] whether the world behaved as the shield predicted
 
     def share(self, verdict: str) -> float:
-        """Share of the interventions with this verdict; 0 where there was none."""
+        """Return the share (0 to 1) of the interventions with this ``verdict``: ``needed``, ``costly`` or ``harmless``.
+
+        It is 0 if there are no interventions.
+        """
         return float((self.verdict == verdict).mean()) if self.verdict.size else 0.0
 
 
 def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
-    """Simulate each intervention's episode again without it: from that decision on the ``policy`` drives alone.
+    """Simulate each intervention's episode again without it: from that decision on, ``policy`` drives unshielded.
 
-    The verdict is *needed* where the harm would have been higher, *costly* where lower, *harmless* where the same. The
-    episode as it went is simulated again, too: so both harms are the engine's, even if the shield was told otherwise.
+    The verdict is *needed* if the harm without the intervention is higher, *costly* if it is lower, and *harmless* if
+    it is the same. The actual episode is simulated again as well, so that both harms come from the same engine, even
+    where the shield assumed other worlds (``told``).
 
     Args:
-        shield: with ``logging``, after the last episodes of ``worlds``; entries of earlier episodes are left out.
-        policy: proposed in these episodes: an agent, or of several vehicles the whole team.
-        worlds: at the alert.
+        shield: a shield with ``logging``, after the last episodes of ``worlds``. Entries of earlier episodes are
+            ignored.
+        policy: the agent, or the team of all shielded vehicles, that proposed in these episodes.
+        worlds: the worlds of these episodes at the alert.
 
-    Raises ``InvalidInput`` without a log, or for another number of worlds.
+    Raises ``InvalidInput`` without a log, or where the number of worlds differs.
 
     """
-    if shield.log is None or shield.running is None:
+    if shield.log is None or shield.memory.running is None:
         raise InvalidInput("review: nothing was logged; make the shield with logging=True, and drive behind it")
-    if worlds.n != shield.running.n:
-        raise InvalidInput(f"review: {count_of(worlds.n, 'world')}, but {shield.running.n} were driven last")
-    log = [entry for entry in shield.log if entry.world < worlds.n and entry.episode == shield.episode[entry.world]]
+    if worlds.n != shield.memory.running.n:
+        raise InvalidInput(f"review: {count_of(worlds.n, 'world')}, but {shield.memory.running.n} were driven last")
+    log = [
+        entry for entry in shield.log if entry.world < worlds.n and entry.episode == shield.memory.episode[entry.world]
+    ]
     world = np.array([entry.world for entry in log], np.int64)
     step = np.array([entry.step for entry in log], np.int64)
     realised, without = np.zeros(0), np.zeros(0)
     if world.size:
-        never = np.full(worlds.n, shield.backup.plan.shape[1])
+        never = np.full(worlds.n, shield.memory.backup.plan.shape[1])
         realised = _released_harm(shield, policy, worlds, np.arange(worlds.n), never)[world]
         without = _released_harm(shield, policy, worlds, world, step)
     verdict = np.where(without > realised + SAME_HARM, "needed", "harmless")
     verdict = np.where(without < realised - SAME_HARM, "costly", verdict)
     whose = np.array([entry.vehicle for entry in log], np.int64)
-    return Review(world, whose, step, realised, without, verdict, ~shield.distrusted[world])
+    return Review(world, whose, step, realised, without, verdict, ~shield.memory.distrusted[world])
 
 
 def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: Ints, step: Ints) -> Floats:
-    """Harm in some worlds [m] if the applied actions are repeated before decision ``step`` [m], then the policy."""
-    scenario, plan = shield.scenario, shield.backup.plan[world]
+    """Return the harm of m episodes in which ``policy`` drives unshielded from some decision on, [m] m2/s2.
+
+    Before that decision, the actions that the shield applied are repeated.
+
+    Args:
+        shield: the shield after the episodes; its plans hold the applied actions.
+        policy: the agent or team.
+        worlds: the worlds at the alert.
+        world: [m] rows of the worlds to simulate.
+        step: [m] number of the decision from which on the policy drives.
+
+    """
+    scenario, plan = shield.scenario, shield.memory.backup.plan[world]
     actions = plan.reshape(*plan.shape[:2], len(shield.vehicles))
     again = {
         i: _Released(agent, actions[:, :, c], step, shield.vehicles, scenario.time_step_s)
@@ -85,14 +103,23 @@ def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: In
 
 
 class _Released(AgentAround):
-    """Given actions [m, L] up to a step, and from that step on a policy."""
+    """Agent that repeats recorded actions up to a given decision, and follows a policy from then on.
+
+    Args:
+        policy: the policy.
+        actions: [m, L] action of each decision.
+        release: [m] number of the first decision of the policy.
+        deciding: indices of the vehicles that decide at the same moments.
+        time_step_s: time between two decisions, s.
+
+    """
 
     def __init__(
         self, policy: Agent, actions: Floats, release: Ints, deciding: tuple[int, ...], time_step_s: float
     ) -> None:
         super().__init__(policy, "released")
         self._actions, self._release, self._time_step_s = actions, release, time_step_s
-        self._deciding = deciding  # vehicles that decide together
+        self._deciding = deciding  # indices of the vehicles that decide at the same moments
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         return {"policy": super().begin(alert, vehicle, scripts), "first_s": alert.first_decision_s(self._deciding)}

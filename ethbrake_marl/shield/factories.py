@@ -1,9 +1,9 @@
-"""The shields behind an agent's ``+``: their entries in the registry."""
+"""Registry entries of the core shields: the names behind an agent's ``+``."""
 
 from __future__ import annotations
 
 from ethbrake_marl.agents.protocol import Agent, Driver, Source
-from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shield.drivers import shielded
 from ethbrake_marl.shield.options import ShieldOptions
@@ -11,13 +11,20 @@ from ethbrake_marl.shield.paper_hybrid import Bound, HybridAgent
 
 
 def shield_episodes(policy: Agent, argument: str | None, settings: AgentSettings) -> HybridAgent:
-    """``+episode`` or ``+episode:pairwise`` around an agent."""
+    """Return ``policy`` behind the paper's Algorithm 1 (``+episode``).
+
+    At the alert the better of policy and E-V2X-BM is chosen for the whole episode. ``argument`` is None, or
+    ``pairwise`` for the paper's closed form of E-V2X-BM. ``settings`` must have a scenario.
+    """
     bound: Bound = "coupled" if argument is None else "pairwise"
     return HybridAgent(policy, settings.needed_scenario(), bound=bound, harm_count=settings.harm_count)
 
 
 def shield_steps(policy: Driver, argument: str | None, settings: AgentSettings) -> Driver:
-    """``+step`` around an agent or a team; where several vehicles learn, around a copy of the agent for each."""
+    """Return the agent or team ``policy`` behind a shield of mode ``step`` (``+step``).
+
+    ``argument`` is ignored; ``settings`` must have a scenario. Each of several learners gets a copy of the agent.
+    """
     return shielded(policy, settings.needed_scenario(), "step", harm_count=settings.harm_count)
 
 

@@ -1,8 +1,9 @@
-"""The plan that a step shield starts with at the alert: the constant actions of least harm.
+"""The plan with which a step shield starts at the alert: the constant actions of least harm.
 
-For one shielded vehicle the constant is the coupled optimum. For several it is the best of these: all brake fully; one
-takes its coupled optimum while the others brake fully; and what a descent finds from the best of those, one vehicle
-after the other.
+A plan holds one action for each decision. For one shielded vehicle, the constant action is E-V2X-BM's (the coupled
+optimum). For several vehicles, the plan is the best of these candidates: all brake fully; one vehicle takes its coupled
+optimum while the others brake fully; and the result of a coordinate descent, vehicle by vehicle, from the best of
+those.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.certify import CONSTANTS, bettered_plan, descend_constants, plan_harm
 from ethbrake_marl.shield.running import Running
 
-LOOKED_AT = np.linspace(0.0, -1.0, 101)  # constant actions, for the bound at the alert where there are several members
+LOOKED_AT = np.linspace(0.0, -1.0, 101)  # constant actions tried at the alert if a world has several possible worlds
 
-GRID = np.linspace(0.0, -1.0, 21)  # ... of the descent of several vehicles
+GRID = np.linspace(0.0, -1.0, 21)  # constant actions tried in the coordinate descent of several vehicles
 
-ROUNDS = 2  # of that descent
+ROUNDS = 2  # rounds of the coordinate descent
 
-LADDER = np.linspace(0.0, -1.0, 5)  # actions of the first and of the last vehicle in the constants of several
+LADDER = np.linspace(0.0, -1.0, 5)  # possible actions of the first and of the last vehicle in ``joint_constants``
 
 
 def best_constants(
@@ -34,15 +35,15 @@ def best_constants(
     scenario: Scenario,
     harm_count: HarmCount,
 ) -> Floats:
-    """Plans [n, width], of several vehicles [n, width, K], that hold the best constant actions found.
+    """Return plans that hold the best constant actions found: [n, width], or [n, width, K] for several vehicles.
 
     Args:
-        worlds: at the alert, [n].
-        running: the same worlds, with all their members.
-        vehicle: the shielded one, or several of them.
-        width: decisions of a plan.
-        scenario: of these worlds.
-        harm_count: the harm that is least.
+        worlds: n worlds at the alert.
+        running: the episodes of these worlds, with all their possible worlds.
+        vehicle: index of the shielded vehicle (0 = front), or indices of several.
+        width: number of decisions of a plan.
+        scenario: the scenario of these worlds.
+        harm_count: impacts whose harm is minimised: ``first`` (each pair's first) or ``total`` (all).
 
     """
     vehicles = [vehicle] if isinstance(vehicle, int) else list(vehicle)
@@ -50,7 +51,7 @@ def best_constants(
     others[:, vehicles] = -worlds.vehicles.braking_capacity_mps2[:, vehicles]
 
     def optimum(i: int) -> Floats:
-        """The coupled optimum of one vehicle, the other shielded ones braking fully, as an action [n]."""
+        """Return E-V2X-BM's deceleration of vehicle ``i`` as an action [n]; other shielded vehicles brake fully."""
         best = optimise_coupled(worlds, i, harm_count=harm_count, horizon_s=scenario.horizon_s, others_mps2=others)
         return command_to_action(-best.deceleration_mps2, worlds.vehicles, i)
 
@@ -64,7 +65,14 @@ def best_constants(
 
 
 def _best_joint_action(running: Running, optima: list[Floats], width: int) -> Floats:
-    """The best constant actions [n, K] of several vehicles: see the top of this file."""
+    """Return the best constant actions of K vehicles, [n, K] in [-1, 1].
+
+    Args:
+        running: n episodes at the alert.
+        optima: for each of the K vehicles, the action [n] that is best while the others brake fully.
+        width: number of decisions of a plan.
+
+    """
     best = np.full((running.n, len(optima)), -1.0)
     least = plan_harm(running, held(best, width))
     for c in range(len(optima) + 1):
@@ -80,7 +88,11 @@ def _best_joint_action(running: Running, optima: list[Floats], width: int) -> Fl
 
 
 def joint_constants(vehicles: int) -> Floats:
-    """Constant actions [C, K] of several vehicles, front to rear: all alike, or evenly from one action to another."""
+    """Return constant actions to try for several vehicles together, [C, K] in [-1, 0], front to rear.
+
+    ``vehicles`` is their number K. The actions of one row are either all equal, or change linearly from the first to
+    the last vehicle.
+    """
     alike = np.repeat(np.array(CONSTANTS)[:, np.newaxis], vehicles, axis=1)
     share = np.linspace(0.0, 1.0, vehicles)
     ladders = [first + share * (last - first) for first in LADDER for last in LADDER if first != last]
@@ -88,5 +100,5 @@ def joint_constants(vehicles: int) -> Floats:
 
 
 def held(action: Floats, width: int) -> Floats:
-    """Plans [n, width, K] that hold these actions [n, K]."""
+    """Return plans [n, width, K] that hold the actions ``action`` [n, K] at each of ``width`` decisions."""
     return np.repeat(action[:, np.newaxis], width, axis=1)

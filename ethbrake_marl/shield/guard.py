@@ -1,4 +1,4 @@
-"""Mode ``step`` in an engine: a ``StepShield`` decides, and each step is compared with its forecast."""
+"""The guard of mode ``step``: a ``StepShield`` decides, and each step is compared with the shield's prediction."""
 
 from __future__ import annotations
 
@@ -20,22 +20,24 @@ from ethbrake_marl.shield.step import StepShield
 
 
 class MovingAtHorizon(UserWarning):
-    """A shield's bound ends at the horizon, and something may still be moving then."""
+    """Warning: some vehicle may still be moving at the horizon; the shield guarantees nothing after it."""
 
 
 class StepGuard(ShieldGuard):
-    """Certify every action, or replace it.
+    """Guard of mode ``step``: certify every proposed action, or replace it.
 
     Args:
-        engine: in which the guard will stand.
-        policies: are rolled out at each alert, and propose where the caller does not.
-        shield: before any episode, of the engine's learners.
-        mode: the code of the infos.
-        where: the interface, for messages.
-        shares: the infos say what each vehicle bears; with a cap they always do.
-        later_rollouts: a policy's own rollout may certify an action.
-        told: the worlds at the alert as the shield takes them to be; None: as they are, which the policies see anyway.
-        warns: with ``MovingAtHorizon``, once, where the plan at an alert leaves something moving at the horizon.
+        engine: the engine that the guard will protect.
+        policies: vehicle index -> policy that is rolled out (simulated) from each alert, and that proposes if the
+            caller gives no action.
+        shield: the shield of the engine's learners, before any episode.
+        mode: code of the mode in the infos.
+        where: name of the interface, for error messages.
+        shares: add to the infos the harm that each vehicle bears; always added with a cap.
+        later_rollouts: whether a rollout of the policy from a later decision on may certify an action.
+        told: worlds at the alert as the shield assumes them; None: the true worlds. Policies always see the true
+            worlds.
+        warns: warn with ``MovingAtHorizon``, once, if the first plan leaves something moving at the horizon.
 
     """
 
@@ -61,7 +63,7 @@ class StepGuard(ShieldGuard):
         if self._told is not None and not (rows < self._told.n).all():
             raise InvalidInput(f"shield: told of {count_of(self._told.n, 'world')}, but row {rows.max()} begins")
         shield.begin(alert if self._told is None else self._told.take(rows), rows, self._policies or None)
-        moving = int((~shield.settles[rows]).sum())
+        moving = int((~shield.memory.settles[rows]).sum())
         if moving and self._to_warn:
             self._to_warn = False
             warnings.warn(
@@ -74,10 +76,18 @@ class StepGuard(ShieldGuard):
         return shield
 
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
-        """Apply what the shield certifies, in the worlds whose episodes run."""
+        """Let the shield certify or replace the proposals in all worlds whose episodes still run.
+
+        Args:
+            running: the engine before the step.
+            memory: memory of the guard.
+            proposed: [n, L] proposed actions. A column of NaN: the caller gave that learner no action, so its policy
+                proposes. A single NaN: an invalid action, which is never applied.
+
+        """
         shield: StepShield = memory.shield
-        goes_on, finished = ~running.ended, shield.running.finished  # type: ignore[union-attr]  # it has begun
-        worlds = running.worlds if self._policies or self._told is not None else None  # made anew each time
+        goes_on, finished = ~running.ended, shield.memory.running.finished  # type: ignore[union-attr]  # it has begun
+        worlds = running.worlds if self._policies or self._told is not None else None  # computed at each access
         proposed, memories = self._asked(worlds, memory.policies, proposed)
         seen = seen_columns(running.packed)
         after = copy.copy(shield)
@@ -92,15 +102,17 @@ class StepGuard(ShieldGuard):
         return Ruling(proposed, applied, stepped_in, goes_on & ~finished, decision, Guarded(after, memories))
 
     def check(self, ruling: Ruling, after: Engine) -> Guarded:
-        """Compare the worlds after the step with what was certified, the last step included.
+        """Compare the worlds after the step with the shield's prediction; return the guard's memory.
 
-        Raises ``UncertifiedStep`` where they differ. Where the shield was ``told`` something else than is, the world
-        becomes distrusted instead. Worlds that the physics could not advance are cut off, and not compared.
+        ``ruling`` is the decision before the step, ``after`` the engine after it. Raises ``UncertifiedStep`` if a world
+        differs from the prediction. If the shield assumes other worlds than the true ones (``told``), a differing world
+        becomes distrusted instead. Worlds in which the physics failed are not compared.
         """
         memory: Guarded = ruling.memory
         shield: StepShield = memory.shield
-        running, wanted = shield.running, ruling.asked & ~shield.distrusted
+        running, distrusted = shield.memory.running, shield.memory.distrusted
         assert running is not None
+        wanted = ruling.asked & ~distrusted
         wanted[list(after.roster.failed)] = False
         if (wrong := np.flatnonzero(wanted & (after.steps != running.steps))).size:
             k = int(wrong[0])
@@ -117,15 +129,18 @@ class StepGuard(ShieldGuard):
                 f"shield: after this step {difference(running.nominal().states[k], seen[k])} (world {k})"
             )
         shield = copy.copy(shield)
-        shield.distrusted = shield.distrusted | surprising
+        shield.memory = shield.memory._replace(distrusted=distrusted | surprising)
         return memory._replace(shield=shield)
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """What the infos say of a certified step."""
+        """Return the infos of a step by name: action, reason, bound, trust in the world, and the harm of each vehicle.
+
+        ``memory`` is the guard's memory, ``ruling`` the decision in the step, None before the first one. Each value is
+        a number or an array [n], [n, L] or [n, N].
+        """
         shield: StepShield = memory.shield
-        assert shield.running is not None
         infos = self._of_step(ruling) | why(ruling)
-        infos |= {"bound_harm": shield.bound, "trusted": ~shield.distrusted, "settles": shield.settles}
+        infos |= {"bound_harm": shield.bound, "trusted": ~shield.memory.distrusted, "settles": shield.memory.settles}
         if self._shares:
-            infos |= {"own_harm": shield.shares(), "baseline_own_harm": shield.baseline_shares}
+            infos |= {"own_harm": shield.shares(), "baseline_own_harm": shield.memory.baseline_shares}
         return infos

@@ -1,4 +1,4 @@
-"""The log of a step shield: every decision in which it replaced a proposed action."""
+"""Log of a step shield: every decision in which it replaced a proposed action."""
 
 from __future__ import annotations
 
@@ -13,26 +13,36 @@ from ethbrake_marl.shield.running import Running
 
 
 class Intervention(NamedTuple):
-    """One replaced action."""
+    """Log entry: one proposed action that the shield replaced."""
 
-    world: int  # row of the batch
+    world: int  # row of the world in the batch
     vehicle: int  # index of the shielded vehicle, 0 = front
-    episode: int  # of that row, from 0
-    step: int  # number of the decision
-    time_s: float
-    proposed: float  # action, as it was given
-    applied: float  # action
-    reason: int  # value of ShieldReason
-    bound: float  # m2/s2, from now on
-    margin: float  # m2/s2; negative: what the proposal would have cost beyond the budget at least
-    state: Floats  # [S] at the decision
-    plan: Floats  # [L] the plan at the decision, of several vehicles [L, K]; before ``step`` the applied actions
+    episode: int  # number of the episode in that row, from 0
+    step: int  # number of the decision in the episode, from 0
+    time_s: float  # time of the decision since the alert (s)
+    proposed: float  # proposed action, before clipping to [-1, 1]
+    applied: float  # applied action, in [-1, 1]
+    reason: int  # code of ShieldReason
+    bound: float  # harm of the episode that the shield guarantees from now on (m2/s2)
+    margin: float  # accepted harm minus least harm found after the proposal (m2/s2); negative: the proposal exceeds it
+    state: Floats  # [S] speeds, gaps, hit flags and harm at the decision, in the layout of ``Running.states``
+    plan: Floats  # [L], or [L, K] for K vehicles: plan at the decision; entries before ``step`` are the applied actions
 
 
 def interventions(
     now: Running, episode: Ints, vehicles: Sequence[int], proposed: Floats, decision: Decision, held: Backup
 ) -> list[Intervention]:
-    """The actions that a decision replaced. ``now``: the episodes before it; ``episode`` [n]: their numbers."""
+    """Return one log entry for each action that a decision replaced.
+
+    Args:
+        now: the n episodes before the decision.
+        episode: [n] number of the episode in each row.
+        vehicles: indices of the K shielded vehicles.
+        proposed: [n] or [n, K] proposed actions.
+        decision: the decision.
+        held: the plan that the shield held before the decision.
+
+    """
     times, states, shape = now.time_s, now.nominal().states, (now.n, len(vehicles))
     columns = (proposed, decision.applied, decision.reason, decision.margin, decision.intervened)
     given, applied, reason, margin, replaced = (np.reshape(column, shape) for column in columns)

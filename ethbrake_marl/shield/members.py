@@ -1,7 +1,8 @@
-"""One member of a world, advanced decision by decision with the operations of the engine's step, in their order.
+"""Simulation of the possible worlds of a world, decision by decision, with exactly the operations of the engine's step.
 
-A world has M members, possible worlds that must all keep the bound; usually it is its only one, and then nothing here
-costs more. K of its vehicles are shielded. An action is a row [K]; a plan [L, K] holds one for each decision.
+A world has M *members*: possible worlds that must all keep the bound. Usually the world itself is its only member, and
+then nothing here costs more. K of the vehicles are shielded. An action is a row [K]; a plan [L, K] holds one action for
+each decision.
 """
 
 from __future__ import annotations
@@ -19,27 +20,31 @@ from ethbrake_marl.physics.rows import ROW, place_rates, rows_for
 from ethbrake_marl.physics.state import Bools, Floats, Ints
 from ethbrake_marl.shield.running import Running
 
-# Rows of the lines: command of the vehicles without a shield (m/s2), latency (s), mass (t), speed limit (m/s), rates at
-# which brakes build up and are released (m/s3), and the most harm that each vehicle may bear (m2/s2). Without such a
-# limit the last row is missing.
+# Rows of ``Members.lines``: command of the unshielded vehicles (m/s2), latency (s), mass (t), speed limit (m/s), rates
+# at which brakes build up and are released (m/s3), and the largest harm that each vehicle may bear (m2/s2). The last
+# row is missing if there are no such caps.
 OF_COMMAND, OF_LATENCY, OF_MASS, OF_LIMIT, OF_BRAKE_RATE, OF_RELEASE_RATE, OF_CAP = range(7)
 
 
 class Members(NamedTuple):
-    """The members of one world, or of all of a batch, and room to work in."""
+    """Parameters of M possible worlds, and workspace, as input for the compiled functions of this package.
 
-    table: Floats  # of physics.kernel
-    clock: Floats  # [M, CLOCK_WIDTH]
-    bounds: Floats  # [M, K, 2] m/s2
-    lines: Floats  # [M, rows, N] of its vehicles; one array for all, because each is counted at every call
-    pieces: Floats  # [M, N, 2 P] of the vehicles that brake in pieces
-    vehicles: Ints  # [K] that are shielded, front to rear
-    critical: Ints  # [1] the member that broke a limit last: it is tried first; no result depends on it
+    The possible worlds of a world are the variants of it in all of which the shield's bound must hold; usually there is
+    one, the world itself. ``all_members`` returns those of a whole batch, ``members_from`` those of one world.
+    """
+
+    table: Floats  # workspace in which one possible world is simulated, see ``physics.rows``
+    clock: Floats  # [M, CLOCK.WIDTH] times of the decisions, and settings of the episode, see ``physics.episode``
+    bounds: Floats  # [M, K, 2] smallest and largest command of the shielded vehicles (m/s2)
+    lines: Floats  # [M, rows, N] parameters of the vehicles, in the rows ``OF_COMMAND`` to ``OF_CAP``
+    pieces: Floats  # [M, N, 2 P] braking profiles with P intervals of constant command, as in ``Vehicles``
+    vehicles: Ints  # [K] indices of the shielded vehicles, front to rear
+    critical: Ints  # [1] possible world that last exceeded a limit; it is simulated first, which only saves time
 
 
 @compiled
 def all_members(running: Running) -> Members:
-    """The members of every world."""
+    """Return the possible worlds of every world in ``running``, as input for the compiled functions here."""
     problem = running.problem
     rows, N = problem.mass.shape
     lines = np.empty((rows, OF_CAP + 1 if running.caps.shape[1] > 0 else OF_CAP, N))
@@ -59,14 +64,14 @@ def all_members(running: Running) -> Members:
 
 @compiled
 def members_from(every: Members, a: int, b: int) -> Members:
-    """Those in the rows a to b - 1."""
+    """Return the possible worlds in rows ``a`` to ``b - 1`` of ``every``, usually those of one world, as views."""
     clock, bounds, lines, pieces = every.clock[a:b], every.bounds[a:b], every.lines[a:b], every.pieces[a:b]
     return Members(every.table, clock, bounds, lines, pieces, every.vehicles, every.critical)
 
 
 @compiled
 def enter(world: Members, m: int, state: Floats) -> None:
-    """Member ``m`` in a saved state."""
+    """Load possible world number ``m`` of ``world``, in the saved ``state`` [S], into ``world.table``."""
     table, lines = world.table, world.lines
     for i in range(table.shape[1]):
         table[ROW.COMMAND, i], table[ROW.LATENCY, i] = lines[m, OF_COMMAND, i], lines[m, OF_LATENCY, i]
@@ -77,7 +82,19 @@ def enter(world: Members, m: int, state: Floats) -> None:
 
 @compiled(apart=True)
 def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, after: Floats) -> int:
-    """The step of one action from ``state``; fills ``after``. Returns as ``step_episode``."""
+    """Advance one possible world by one decision, and save its new state.
+
+    Args:
+        world: the M possible worlds of one world (``Members``).
+        m: number of the one to advance.
+        state: [S] its state now.
+        step: number of the present decision.
+        action: [K] actions of the shielded vehicles.
+        after: [S] receives the new state.
+
+    Returns ``GOES_ON``, another code for the end of the episode, or a negative code if the physics failed.
+
+    """
     enter(world, m, state)
     for c in range(world.vehicles.shape[0]):
         braking, driving = -world.bounds[m, c, 0], world.bounds[m, c, 1]
@@ -93,12 +110,25 @@ def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, 
 def take_steps(
     world: Members, states: Floats, ended: Bools, step: int, action: Floats, after: Floats, over: Bools
 ) -> int:
-    """The step of one action in every member; how many episodes go on, or -1 if the physics failed."""
+    """Advance every possible world of one world by one decision with the same action.
+
+    Args:
+        world: the M possible worlds of one world (``Members``).
+        states: [M, S] their states now, in the layout of ``Running.states``.
+        ended: [M] whether their episodes have ended; these keep their states.
+        step: number of the present decision.
+        action: [K] actions of the shielded vehicles.
+        after: [M, S] receives the new states.
+        over: [M] receives whether the episodes have ended then.
+
+    Returns in how many of them the episode continues, or -1 if the physics failed.
+
+    """
     going = 0
     for m in range(ended.shape[0]):
         if ended[m]:
             over[m] = True
-            for c in range(states.shape[1]):  # not by rows: see ``put`` in limits.lower_bound
+            for c in range(states.shape[1]):  # by element: numba compiles row copies with an error text, which is slow
                 after[m, c] = states[m, c]
             continue
         outcome = take_step(world, m, states[m], step, action, after[m])
@@ -111,9 +141,11 @@ def take_steps(
 
 @compiled
 def borne_by(table: Floats, total: float, i: int) -> float:
-    """Harm that vehicle i has borne since the episode began, under one count, to the bits of the ledger (m2/s2).
+    """Return the harm that vehicle ``i`` has borne since the episode began, m2/s2.
 
-    An obstacle ahead, the vehicle 0 of infinite mass, bears none; who hits it bears it all.
+    ``table`` is the table of one world (``physics.rows``). ``total`` is 1 for total harm, 0 for first-impact harm. The
+    result equals the ledger's to the bit. An obstacle ahead (vehicle 0, infinite mass) bears no harm; the vehicle that
+    hits it bears all of it.
     """
     row, value = ROW.SUM_TOTAL_HARM if total == 1.0 else ROW.SUM_FIRST_HARM, 0.0
     if table[ROW.MASS, i] == math.inf:
@@ -128,7 +160,10 @@ def borne_by(table: Floats, total: float, i: int) -> float:
 
 @compiled
 def within_caps(world: Members, m: int) -> bool:
-    """Whether no vehicle of member ``m``, as it is in the table, has borne more than it may."""
+    """Return whether no vehicle bears more than its cap in the possible world ``m``, which ``world.table`` holds.
+
+    A cap is the largest harm that a vehicle may bear. Without caps the result is True.
+    """
     if world.lines.shape[1] > OF_CAP:
         for i in range(world.lines.shape[2]):
             if borne_by(world.table, world.clock[m, CLOCK.HARM_IS_TOTAL], i) > world.lines[m, OF_CAP, i]:
@@ -138,7 +173,10 @@ def within_caps(world: Members, m: int) -> bool:
 
 @compiled
 def worst_so_far(world: Members, states: Floats) -> float:
-    """Largest harm so far over the members; infinity where a vehicle has borne more than it may."""
+    """Return the largest harm so far over the possible worlds ``world``, whose states are ``states`` [M, S], m2/s2.
+
+    It is infinite if a vehicle bears more than its cap.
+    """
     worst = 0.0
     for m in range(states.shape[0]):
         enter(world, m, states[m])
@@ -150,10 +188,21 @@ def worst_so_far(world: Members, states: Floats) -> float:
 
 @compiled(apart=True)
 def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, plan: Floats, most: float) -> float:
-    """Harm of the episode if the plan's actions are executed from ``state`` at ``step`` on, as the engine does.
+    """Return the harm of the whole episode if a plan is executed in one possible world from now on, m2/s2.
 
-    Gives up with infinity as soon as it is above ``most`` (harm never falls), where a vehicle bears more than it may,
-    or where the physics fails.
+    It is computed with the engine's operations, so it equals the engine's harm to the bit.
+
+    Args:
+        world: the M possible worlds of one world (``Members``).
+        m: number of the one to simulate.
+        state: [S] its state now.
+        ended: whether its episode has ended.
+        step: number of the present decision.
+        plan: [L, K] one action for each decision.
+        most: harm beyond which the simulation stops, since harm never falls, m2/s2.
+
+    Returns infinity if the harm exceeds ``most``, if a vehicle bears more than its cap, or if the physics fails.
+
     """
     table, no_rows, total = world.table, world.table[:0], world.clock[m, CLOCK.HARM_IS_TOTAL]
     restitution, grid = world.clock[m, CLOCK.RESTITUTION], grid_of(world.clock[m])
@@ -174,7 +223,20 @@ def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, p
 
 @compiled
 def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan: Floats, most: float) -> float:
-    """Largest harm of a plan over the members; infinity as soon as one of them is above ``most``."""
+    """Return the largest harm of a plan over the possible worlds of one world, m2/s2.
+
+    Args:
+        world: the M possible worlds of one world (``Members``).
+        states: [M, S] their states now, in the layout of ``Running.states``.
+        ended: [M] whether their episodes have ended.
+        step: number of the present decision.
+        plan: [L, K] one action for each decision, executed from now on.
+        most: largest harm of interest, m2/s2.
+
+    Returns infinity if the harm exceeds ``most`` in one of them, if a vehicle bears more than its cap, or if the
+    physics fails.
+
+    """
     worst, first = 0.0, world.critical[0]
     for j in range(ended.shape[0]):
         m = (first + j) % ended.shape[0]
@@ -187,7 +249,20 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
 
 @compiled
 def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int, constants: Floats, c: int) -> float:
-    """Harm of the episode under constant ``c`` of [C, K] from here, in one segment; infinity: the physics fails."""
+    """Return the harm of one possible world if a constant action is held to the horizon, m2/s2.
+
+    It is simulated in one segment. Returns infinity if the physics fails.
+
+    Args:
+        world: the M possible worlds of one world (``Members``).
+        m: number of the one to simulate.
+        state: [S] its state now.
+        ended: whether its episode has ended.
+        step: number of the present decision.
+        constants: [C, K] constant actions.
+        c: row of the one to hold.
+
+    """
     table, clock, vehicles, bounds = world.table, world.clock[m], world.vehicles, world.bounds
     enter(world, m, state)
     for i in range(vehicles.shape[0]):

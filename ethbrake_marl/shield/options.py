@@ -1,8 +1,8 @@
-"""The settings of a shield around an environment, checked; and the guard that they make.
+"""Settings of a shield: their checks, and the guard that they build.
 
-Every interface takes the same keywords. A mode is a name of the registry behind an agent's ``+`` (entry-point group
-``ethbrake_marl.shields``) whose entry gives a class of settings: ``ShieldOptions`` itself for ``step`` and ``episode``.
-A mode with settings of its own gives a subclass, which adds their fields, checks them, and makes its guard.
+Every interface takes the same keywords. A shield's mode is a registered name behind an agent's ``+`` (entry-point group
+``ethbrake_marl.shields``). Its registry entry names a class of settings: ``ShieldOptions`` itself for ``step`` and
+``episode``. A mode with settings of its own has a subclass, which adds and checks these fields and builds its guard.
 """
 
 from __future__ import annotations
@@ -27,23 +27,25 @@ from ethbrake_marl.shield.step import Cap, StepShield
 
 @dataclass(frozen=True)
 class ShieldOptions:
-    """The keywords of ``eb.shield``, ``HybridShield`` and the other wrappers. A mode of an extension adds its own.
+    """Keywords of ``eb.shield``, ``HybridShield`` and the other wrappers. A mode of an extension adds its own.
 
     Args:
-        mode: ``step``: each action is certified or replaced. ``episode``: the paper's Algorithm 1, policy or E-V2X-BM
-            for a whole episode. None: ``step``, unless another setting belongs to one mode alone.
-        bound: the ``H*`` of mode ``episode``, ``coupled`` or the paper's ``pairwise``.
-        harm_count: the harm that is guaranteed, ``first`` or ``total``.
-        allowance: loosens the bound by that much (m2/s2), for fewer interventions; not in mode ``episode``.
-        cap: ``baseline``: no vehicle ever bears more harm than under the constants of least harm, whose sum is the
-            bound at the alert. None: only the sum is bounded. Mode ``step`` alone.
-        intervention_penalty: taken off the reward of a step in which the shield replaced the proposed action.
-        logging: keep every intervention in ``shield.log``; not in mode ``episode``.
-        shares: say in ``infos`` what each vehicle bears under the current plan, and under the baseline plan; with a
-            ``cap`` the infos always do. Costs a few percent of a step; not in mode ``episode``.
-        where: the interface, for messages.
+        mode: ``step``: each action is certified (some plan after it keeps the harm within the bound) or replaced.
+            ``episode``: the paper's Algorithm 1, policy or E-V2X-BM for a whole episode. None: ``step``, unless another
+            setting belongs to one mode alone.
+        bound: source of ``H*``, the harm of E-V2X-BM, in mode ``episode``: ``coupled``, the engine's physics, or
+            ``pairwise``, the paper's closed form.
+        harm_count: impacts whose harm is guaranteed: ``first`` (each pair's first) or ``total`` (all).
+        allowance: loosens the bound by that much (m2/s2), for fewer replaced actions; not in mode ``episode``.
+        cap: ``baseline``: no vehicle ever bears more harm than under the constant actions of least harm. None: only the
+            sum over the vehicles is bounded. Mode ``step`` alone.
+        intervention_penalty: subtracted from the reward of a step in which the shield replaced the proposed action.
+        logging: keep every replaced action in ``shield.log``; not in mode ``episode``.
+        shares: add to ``infos`` the harm that each vehicle bears under the current plan and under the constant actions
+            of least harm; always added with a ``cap``. Costs a few percent of a step; not in mode ``episode``.
+        where: name of the interface, for error messages.
 
-    Raises ``InvalidInput`` naming the setting that does not fit, ``UnknownName`` for a mode.
+    Raises ``InvalidInput`` naming a setting that does not fit, ``UnknownName`` for an unknown mode.
 
     >>> import ethbrake_marl as eb
     >>> eb.ShieldOptions(allowance=1.0).mode
@@ -63,7 +65,11 @@ class ShieldOptions:
     where: str = field(default="shield", compare=False)
 
     def __new__(cls, mode: str | None = None, **settings: Any) -> ShieldOptions:
-        """Make one of the class that has these settings, as ``pathlib.Path`` makes a path of the system it runs on."""
+        """Create an instance of the class for these settings: the mode's own class, or a subclass of another mode.
+
+        ``ShieldOptions(mode, setting=...)`` thus also accepts settings that only the subclass of an extension's mode
+        has.
+        """
         if cls is ShieldOptions:
             cls = _class_with("step" if mode is None else check_mode(mode), settings)
         return object.__new__(cls)
@@ -85,27 +91,31 @@ class ShieldOptions:
         object.__setattr__(self, "mode", mode)
 
     def check_switches(self, *names: str) -> None:
-        """Raise ``InvalidInput`` for a setting of these that is neither True nor False."""
+        """Raise ``InvalidInput`` unless each setting named in ``names`` is True or False."""
         for name in names:
             if not isinstance(getattr(self, name), bool):
                 raise InvalidInput(f"{self.where}: {name} = {getattr(self, name)!r}: must be True or False")
 
     @property
     def written(self) -> str:
-        """The mode as it stands behind an agent's ``+``."""
+        """The mode as it is written behind an agent's ``+``, such as ``step``."""
         return str(self.mode)
 
     @property
     def adds(self) -> Source:
-        """What the shield knows of the line beside what a policy knows."""
+        """Knowledge that the shield uses in addition to what a policy knows."""
         return Source.MODEL
 
     def shield(
         self, scenario: Scenario, vehicle: int | tuple[int, ...], others: Mapping[int, Script] | None = None
     ) -> Any:
-        """The shield of one vehicle, or of several, before any episode; not of mode ``episode``.
+        """Return a shield with these settings, before any episode. Not for mode ``episode``.
 
-        ``others``: scripts of the other vehicles, by index; None: the scenario's.
+        Args:
+            scenario: the scenario of all episodes.
+            vehicle: index of the shielded vehicle (0 = front), or indices of several.
+            others: index of each other vehicle -> its script; None: the scripts of the scenario.
+
         """
         return StepShield(
             scenario, vehicle, harm_count=self.harm_count, allowance=self.allowance, others=others, cap=self.cap,
@@ -113,20 +123,20 @@ class ShieldOptions:
         )  # fmt: skip
 
     def check_in(self, scenario: Scenario, *, several: bool) -> None:
-        """Raise ``InvalidInput`` at once where the shield of a driver refuses the scenario; of a team it is seen later.
+        """Raise ``InvalidInput`` if a shield with these settings cannot be used in the scenario.
 
-        ``several``: the driver is a team.
+        With ``several`` (a team is shielded) nothing is checked here; that happens when the guard is made.
         """
         if not several:
             self.shield(scenario, one_learner(scenario) or 0)
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent], *, several: bool = False, **how: Any) -> ShieldGuard:
-        """The guard of these settings, for all learners of an engine.
+        """Return the guard (the part of an engine that certifies or replaces actions) for all learners of an engine.
 
         Args:
-            engine: in which it will stand.
-            policies: who proposes, by vehicle.
-            several: one learner alone is a team, too.
+            engine: the engine that the guard will protect.
+            policies: vehicle index -> policy that proposes its actions; may be empty except in mode ``episode``.
+            several: treat a single learner as a team of one.
             how: further keywords of ``StepGuard``.
 
         """
@@ -139,31 +149,43 @@ class ShieldOptions:
 
 
 def check_mode(mode: object) -> str:
-    """The name of a mode; raises ``UnknownName`` for anything else."""
+    """Return ``mode`` if it is the name of a shield mode; otherwise raise ``UnknownName``."""
     if shield_settings(mode) is None:
         raise unknown_name("shield mode", mode, shield_modes())
     return str(mode)
 
 
 def misplaced(name: str, value: object, mode: str, takers: list[str], where: str) -> InvalidInput:
-    """The error for a setting that a mode does not take; ``takers`` are the modes that do."""
+    """Return the error to raise for a setting that a mode does not accept.
+
+    Args:
+        name: name of the setting.
+        value: its value.
+        mode: the mode.
+        takers: modes that accept the setting.
+        where: name of the interface, with which the message begins.
+
+    """
     do = "does" if len(takers) == 1 else "do"
     return InvalidInput(f"{where}: {name} = {value!r}: mode {mode} takes none; {' and '.join(takers)} {do}")
 
 
 def shielded_vehicle(engine: Engine, several: bool) -> int | tuple[int, ...]:
-    """The learner of an engine, or all of them, as ``StepShield`` takes them."""
+    """Return the learners of an engine as ``StepShield`` takes them: one index, or a tuple of indices.
+
+    With ``several``, a single learner is also returned as a tuple.
+    """
     vehicles = tuple(engine.learners)
     return vehicles if several or len(vehicles) > 1 else vehicles[0]
 
 
 def one_learner(scenario: Scenario) -> int | None:
-    """The index of the vehicle that learns; None where not exactly one does."""
+    """Return the index of the scenario's learner; None unless exactly one vehicle learns."""
     return scenario.learners[0] if len(scenario.learners) == 1 else None
 
 
 def _class_with(mode: str, settings: Mapping[str, Any]) -> type[ShieldOptions]:
-    """The class of settings of a mode, or else the first of another mode, that has all these settings.
+    """Return the settings class that has all these settings: the mode's own, or else the first of the other modes'.
 
     Raises ``UnknownName`` for a setting that no mode has.
     """

@@ -1,4 +1,4 @@
-"""The shield as a Stable-Baselines3 ``VecEnvWrapper``: training under the shield. Importing this file imports torch."""
+"""The shield as a Stable-Baselines3 ``VecEnvWrapper``, for training under the shield. Imports torch."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from ethbrake_marl.shield.attach import Attached, Proposing
 
 
 class ShieldedVecEnv(SeededInside, VecEnvWrapper):
-    """``make_sb3_vec_env`` behind a shield, by default in mode ``step``, in which the rows of a world decide together.
+    """``make_sb3_vec_env`` behind a shield, by default in mode ``step``. The rows of one world are decided together.
 
-    The ``options`` are those of ``ShieldOptions``; the penalty is not taken off the return in
-    ``infos[row]["episode"]``. Without a ``policy`` the bound is the coupled optimum's harm. Each row's infos hold
-    ``shield_bound_harm`` and its like in every step, and ``reset_infos`` those of the alert. Raises ``InvalidInput``
-    for another environment, or several learners in another mode.
+    ``options`` are keywords of ``ShieldOptions``. ``policy`` is simulated from each alert: its harm is the bound where
+    it is lower than E-V2X-BM's; None: the bound is always the latter. The intervention penalty does not enter the
+    return in ``infos[row]["episode"]``. Each row's infos contain ``shield_bound_harm`` and the other shield entries at
+    every step; ``reset_infos`` contains them at the alert. Raises ``InvalidInput`` for another environment, or for
+    several learners in another mode than ``step``.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -39,18 +40,22 @@ class ShieldedVecEnv(SeededInside, VecEnvWrapper):
         super().__init__(venv)
 
     def reset(self) -> Observations:
-        """As the environment's own reset."""
+        """Start an episode in every world; return the observations, [rows, F] float32."""
         self.attached.check_open()
         observation: Observations = self.venv.reset()  # type: ignore[assignment]
         return observation
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Pass the actions [rows, 1] on."""
+        """Take the proposed actions [rows, 1] for the next ``step_wait``."""
         self.attached.check_open()
         self.venv.step_async(actions)
 
     def step_wait(self) -> tuple[Observations, NDArray[np.float32], Bools, list[dict[str, Any]]]:
-        """Advance every world by one step with the actions certified or replaced."""
+        """Advance every world by one step with the certified or replaced actions.
+
+        Returns observations [rows, F], rewards [rows] with the intervention penalty subtracted, whether each episode
+        ended [rows], and the infos, one dictionary per row.
+        """
         self.attached.check_open()
         observation, reward, done, infos = self.venv.step_wait()
         paid = reward - self.attached.penalty().reshape(-1).astype(np.float32)
@@ -58,24 +63,24 @@ class ShieldedVecEnv(SeededInside, VecEnvWrapper):
 
     @property
     def reset_infos(self) -> list[dict[str, Any]]:
-        """The infos with which the running episodes began, row by row; wrappers inside keep none of their own."""
+        """Infos at the start of the running episodes, one dictionary per row."""
         infos: list[dict[str, Any]] = self.unwrapped.reset_infos
         return infos
 
     @reset_infos.setter
     def reset_infos(self, infos: list[dict[str, Any]]) -> None:
-        """Nothing: SB3's constructor assigns empty ones."""
+        """Ignore the empty infos that SB3's constructor assigns."""
 
     def __getstate__(self) -> dict[str, Any]:
-        """State for a copy, without the table of the class that SB3 keeps in every wrapper and nobody can pickle."""
+        """Return the state for pickling, without ``class_attributes``, which SB3 sets and pickle cannot handle."""
         return {name: value for name, value in self.__dict__.items() if name != "class_attributes"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Become that copy."""
+        """Restore the pickled state, and set ``class_attributes`` again."""
         self.__dict__.update(state)
         self.class_attributes = dict(inspect.getmembers(self.__class__))
 
     def close(self) -> None:
-        """Take the shield off the environment, and close that."""
+        """Remove the shield from the environment, and close the environment."""
         self.attached.close()
         super().close()

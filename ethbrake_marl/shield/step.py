@@ -1,34 +1,36 @@
 """Step mode of the shield: a guaranteed harm that holds at every step, whoever proposes the actions.
 
 **Claim.** Let ``B`` be the bound at the first decision: the harm of the backup plan, executed in the engine. If every
-step applies what ``certify`` says, the harm realised at the end of the episode is at most ``B``, whatever is proposed,
-and the bound never rises on the way. The end is rest or the scenario's horizon. Of what still moves then, and of what
-happens afterwards, nothing is claimed.
+step applies the action that ``certify`` returns, then the harm at the end of the episode is at most ``B``, whatever is
+proposed, and the bound never rises during the episode. An episode ends at rest or at the scenario's horizon. The claim
+does not cover anything that happens after the horizon.
 
 **Induction.** Between two decisions the shield holds a *plan*, an action for every decision up to the horizon, and its
-harm ``c``: the harm of the whole episode if that plan is executed from the present state, with the harm so far, and
-with the pairs that were hit before. Both come from one function, ``members.follow_plan``. It advances decision by
-decision with the operations of the engine's step in their order, and adds harm in its order. So:
+harm ``c``: the harm of the whole episode if that plan is executed from the present state, including the harm so far and
+the pairs that were already hit. One function computes it, ``members.follow_plan``. It advances decision by decision
+with the operations of the engine's step in the same order, and adds harm in the same order. So:
 
 1. *Start.* ``c = B``.
-2. *The proposal is applied* only with a plan from the next state whose harm, computed by ``follow_plan`` from that very
-   state, is at most the budget. That plan is held from now on, and ``c`` is its harm. If the proposal is the plan's own
-   action, the rest of the plan is that plan, with the same ``c``: the same operations on the same numbers.
-3. *The plan's action is applied* otherwise. The rest of the plan is executed from a state that ``follow_plan`` passed
-   through when it found ``c``: the harm remains ``c`` to the last bit. A plan that harms less may replace it.
-4. *End.* When the episode ends nothing is left to execute, and ``c`` is the harm realised.
+2. *The proposal is applied* only with a plan from the next state whose harm, computed by ``follow_plan`` from exactly
+   that state, is at most the budget. The shield then holds that plan, and ``c`` is its harm. If the proposal is the
+   plan's own action, the shield keeps the rest of the plan with the same ``c``, since the same operations act on the
+   same numbers.
+3. *The plan's action is applied* otherwise. ``follow_plan`` passed through the resulting state when it computed ``c``,
+   so the harm of the plan's rest is ``c`` to the last bit. A plan that harms less may replace it.
+4. *End.* When the episode ends, nothing is left to execute, and ``c`` is the harm of the episode.
 
-The budget is ``c``, or anything between ``c`` and ``B``, so ``c <= B`` always. ∎ No tolerance enters: where the engine
-does what it is said to do, realised harm and the last bound are the same double.
+The *budget* is the largest harm that a certificate may have: ``c``, or any value between ``c`` and ``B``. Hence
+``c <= B`` always. ∎ The proof needs no tolerance: as long as the engine behaves as predicted, the harm of the episode
+and the last bound are the same double.
 
-**Several vehicles.** Where several are shielded, an action above is a row of actions, one for each vehicle, and so is
-each entry of the plan; the proof is the same. All proposals together are tried first. If they have no certificate, the
-vehicles are taken from front to rear: each proposal replaces that vehicle's action in the joint plan, and is accepted
-with a plan behind it whose harm is at most the budget; otherwise that vehicle's planned action stays. Each attempt
-begins with a certified plan, and ends with one.
+**Several vehicles.** With several shielded vehicles, an action above is a row of actions, one for each vehicle, and so
+is each entry of the plan; the proof is the same. All proposals together are tried first. If they have no certificate,
+the vehicles are tried one by one, front to rear: the vehicle's proposal replaces its action in the joint plan, and is
+accepted if a plan behind it has a harm within the budget; otherwise the vehicle keeps its planned action. Each attempt
+starts from a certified plan, and ends with one.
 
-**Several members.** A world may stand for several possible ones, its members. Then every harm above is the largest over
-them, and all are advanced by the same actions: the realised harm of *every* member is at most ``B``.
+**Several members.** A world may stand for several possible worlds, its *members*. Then every harm above is the largest
+over the members, and all members are advanced by the same actions: the harm of *every* member is at most ``B``.
 """
 
 from __future__ import annotations
@@ -38,7 +40,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Self, cast, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ethbrake_marl.agents.driving import script_agents
 from ethbrake_marl.agents.protocol import Agent, fixed_commands
@@ -56,37 +57,41 @@ from ethbrake_marl.shield.first_plan import best_constants, joint_constants
 from ethbrake_marl.shield.log import Intervention, interventions
 from ethbrake_marl.shield.reasons import ShieldReason
 from ethbrake_marl.shield.rollouts import Proposer, certify_by_policy, rolled_out
-from ethbrake_marl.shield.running import Running, begin_running, put
+from ethbrake_marl.shield.running import Running, begin_running
+from ethbrake_marl.shield.step_memory import StepMemory
 
-Cap = Literal["baseline"]  # whose plan a vehicle's harm is the most that it may bear
+Cap = Literal["baseline"]  # plan under which a vehicle's harm is its cap, the largest harm that it may bear
 
 
 class StepShield:
-    """Guarantee the harm of a batch: ``begin`` when episodes start, ``decide`` in every step.
+    """Guarantee the harm of a batch of episodes: call ``begin`` when episodes start and ``decide`` in every step.
 
-    Both replace everything it holds in one assignment, and change nothing in place. So what fails, or is interrupted,
-    leaves bound, plan and trust as they were, and a ``copy.copy`` goes on apart.
+    Both methods replace the whole state in one assignment and change no array in place. So an error or an interrupt
+    leaves bound, plan and trust as they were, and a ``copy.copy`` is independent.
 
-    The bound starts as the harm of the coupled optimum, realised decision by decision, or of a ``policy`` rolled out
-    from the alert where that harms less; and it only falls. It bounds the harm up to the scenario's horizon, and says
-    nothing of what still moves then, or of what happens afterwards. ``settles`` [n] says where the plan at the alert
-    leaves nothing moving.
+    The bound starts as the harm of the coupled optimum (E-V2X-BM's constant deceleration), executed decision by
+    decision, or as the harm of ``policy``, simulated from the alert, where that is lower. It never rises. It covers the
+    time up to the scenario's horizon. ``memory.settles`` [n] is true where nothing moves any more at the horizon under
+    the first plan.
 
-    What happens is compared with what was predicted, bit by bit. Where it differs (a vehicle brakes beyond its
-    capacity, a number is none, a message never came) ``distrusted`` [n] is set, and nothing is guaranteed any more. For
-    the rest of the episode the fallback ``best constant`` drives: the better one of the plan's rest and the constants,
-    chosen again after every surprise. A world that is asked ``only`` after its episode was to be over brakes fully.
+    At each decision the observed worlds are compared with the prediction, bit by bit. Where they differ (a vehicle
+    brakes beyond its capacity, a number is NaN, a message is missing), ``memory.distrusted`` [n] is set and the
+    guarantee is lost. For the rest of the episode the *fallback* drives: the rest of the plan or the best constant
+    action, whichever harms less, chosen again after every surprise. If a world continues (``only``) after its episode
+    should have ended, it brakes fully.
 
-    With several ``possible`` worlds for each one, all of this holds for the worst of them, and what is seen must lie
-    within the range of their predictions.
+    If each world has several ``possible`` worlds, all of this holds for the worst of them, and the observed world must
+    lie within the range of their predictions.
 
     Args:
-        scenario: of all worlds.
-        vehicle: index of the shielded vehicle, or of several, front to rear.
-        harm_count: the harm that is guaranteed.
-        allowance: what the budget grants above the bound, m2/s2; the bound is then that budget until the episode ends.
-        others: scripts of the other vehicles, whose commands must be fixed at the alert; None: the scenario's.
-        cap: ``baseline``: no vehicle bears more than under the plan of least harm.
+        scenario: the scenario of all worlds.
+        vehicle: index of the shielded vehicle (0 = front), or indices of several, front to rear.
+        harm_count: impacts whose harm is guaranteed: ``first`` (each pair's first) or ``total`` (all).
+        allowance: loosens the bound by that much (m2/s2), until the episode ends.
+        others: index of each other vehicle -> its script, whose command must be fixed at the alert; None: the
+            scenario's scripts.
+        cap: ``baseline``: no vehicle bears more harm than under the constant actions of least harm; None: only the sum
+            over the vehicles is bounded.
         logging: keep every intervention in ``log``.
 
     Raises ``InvalidInput`` for an unknown count or vehicle, a negative allowance, or others whose commands are not
@@ -94,7 +99,7 @@ class StepShield:
 
     """
 
-    possible_are = "possible worlds"  # what messages say of a world's members
+    possible_are = "possible worlds"  # what error messages call the possible worlds; a subclass may set another name
 
     def __init__(
         self,
@@ -123,66 +128,58 @@ class StepShield:
         self.vehicle = self.vehicles if several else self.vehicles[0]
         self.scenario, self.harm_count, self.allowance, self.cap = scenario, harm_count, allowance, cap
         self.logging = logging
-        self._entries: list[Intervention] = []  # shared with copies; the first ``_logged`` of them are of this one
-        self._logged = 0
-        self.running: Running | None = None
-        self.backup = Backup(np.zeros((0, 0)), np.zeros(0))
-        self.first_bound: Floats = np.zeros(0)  # [n] harm of the backup at the first decision
-        self.alone_harm: Floats = np.zeros(0)  # [n] of the policy rolled out; infinity without one
-        self.settles: Bools = np.zeros(0, np.bool_)  # [n] under the plan of the first decision all rest at the horizon
-        self.replaced: Ints = np.zeros(0, np.int64)  # [n] or [n, K] actions so far in the running episodes
-        self.episode: Ints = np.zeros(0, np.int64)  # [n] number of each row's running episode
-        self.distrusted: Bools = np.zeros(0, np.bool_)
-        self.baseline_shares: Floats = np.zeros((0, 0))  # [n, N] what each vehicle bears under the best constants
+        self._entries: list[Intervention] = []  # shared with copies; the first ``memory.logged`` belong to this shield
+        self.memory = StepMemory()
         scripts = script_agents(scenario, except_for=self.vehicles) if others is None else others
         self._others = {i: script for i, script in scripts.items() if i not in self.vehicles}
         self._width = int(Decisions(np.zeros(1), scenario.time_step_s).before(scenario.horizon_s)[0]) + 1
 
     @property
     def bound(self) -> Floats:
-        """Harm of each running episode is at most this, [n] m2/s2: what certificates may reach."""
-        if self.running is None or self.allowance == 0.0:
-            return self.backup.harm
-        granted = np.where(self.running.finished, 0.0, self.first_bound + self.allowance)
-        return np.maximum(self.backup.harm, granted)
+        """Harm of each running episode that the shield guarantees not to exceed, [n] m2/s2."""
+        return self._bound_of(self.memory)
+
+    def _bound_of(self, memory: StepMemory) -> Floats:
+        running, harm = memory.running, memory.backup.harm
+        if running is None or self.allowance == 0.0:
+            return harm
+        return np.maximum(harm, np.where(running.finished, 0.0, memory.first_bound + self.allowance))
 
     @property
     def predicted_harm(self) -> Floats:
-        """What was told at the alert, [n] m2/s2."""
-        return self.first_bound + self.allowance
+        """Harm that the shield guaranteed at the alert, allowance included, [n] m2/s2."""
+        return self.memory.first_bound + self.allowance
 
     @property
     def chosen_policy(self) -> Bools:
-        """Where everything proposed was applied so far, [n]."""
+        """Whether no proposed action of the episode has been replaced so far, [n]."""
         return np.asarray(self.interventions == 0, np.bool_)
 
     @property
     def log(self) -> list[Intervention] | None:
-        """Every decision so far in which something else than the proposal was applied; None without ``logging``."""
-        return self._entries[: self._logged] if self.logging else None
+        """All interventions (replaced actions) since the last ``clear_log``; None without ``logging``."""
+        return self._entries[: self.memory.logged] if self.logging else None
 
     def clear_log(self) -> None:
-        """Forget what was logged so far: it grows until then."""
-        self._entries, self._logged = [], 0
+        """Delete all log entries. The log grows until this is called."""
+        self._entries, self.memory = [], self.memory._replace(logged=0)
 
     @property
     def interventions(self) -> Ints:
-        """Actions that were replaced so far in each running episode, of all vehicles together, [n]."""
-        return np.asarray(self.replaced.reshape(len(self.replaced), -1).sum(axis=1), np.int64)
+        """Number of actions replaced so far in each running episode, summed over the vehicles, [n]."""
+        return np.asarray(self.memory.replaced.reshape(len(self.memory.replaced), -1).sum(axis=1), np.int64)
 
     def shares(self) -> Floats:
-        """What each vehicle bears of the harm if the plan that is held now is executed, [n, N] m2/s2."""
-        if self.running is None:
+        """Return the harm that each vehicle bears if the current plan is executed, [n, N] m2/s2."""
+        running, backup = self.memory.running, self.memory.backup
+        if running is None:
             raise InvalidInput("shield: shares, but no episode has begun; call begin first")
-        return ends_under(self.running.nominal(), self.backup.plan)[1][:, -self.scenario.vehicles :]
+        return ends_under(running.nominal(), backup.plan)[1][:, -self.scenario.vehicles :]
 
     def take(self, rows: Ints) -> Self:
-        """The shield of some rows, which goes on apart."""
-        part, held = copy.copy(self), self.backup
-        part.running = None if self.running is None else self.running.take(rows)
-        part.backup = held._replace(plan=held.plan[rows], harm=held.harm[rows])
-        for name in ("first_bound", "alone_harm", "settles", "replaced", "distrusted", "baseline_shares", "episode"):
-            setattr(part, name, getattr(self, name)[rows])
+        """Return an independent shield for the episodes in the rows with the indices ``rows``."""
+        part = copy.copy(self)
+        part.memory = self.memory.take(rows)
         return part
 
     def begin(
@@ -193,33 +190,48 @@ class StepShield:
         *,
         possible: Worlds | None = None,
     ) -> None:
-        """Start new episodes in these rows.
+        """Start new episodes in some rows of the batch.
 
-        Rows 0 to k - 1 together may also begin a larger batch. Raises ``InvalidInput`` for rows that are not there.
+        To start a larger batch, pass all of its rows, 0 to k - 1, at once. Raises ``InvalidInput`` for other rows that
+        do not exist.
 
         Args:
-            worlds: of these rows alone, at the alert, as the shield takes them to be.
-            rows: where they start.
-            policy: proposes, and is rolled out from the alert; of several vehicles, one for each by its index.
-            possible: the members of each world [n * M], the world itself first; None: ``members_of(worlds)``.
+            worlds: the worlds of these rows at the alert, as the shield assumes them.
+            rows: indices of the rows in which the episodes start.
+            policy: the policy that proposes, which is simulated from the alert; for several vehicles, vehicle index ->
+                policy; None: only the constant actions of least harm give the bound.
+            possible: the possible worlds of each world, [len(rows) * M], the world itself first; None:
+                ``members_of(worlds)``.
 
         """
-        running_rows = len(self.first_bound)
+        running_rows = len(self.memory.first_bound)
         if not (rows < running_rows).all() and sorted(rows.tolist()) != list(range(len(rows))):
             raise InvalidInput(
                 f"shield: begin in row {rows.max()} of a batch of {running_rows}: a larger batch begins with all of its"
                 " rows at once"
             )
-        new = copy.copy(self)
-        new._begin(worlds, rows, policy, self.members_of(worlds) if possible is None else possible)
-        self.__dict__.update(new.__dict__)
+        possible = self.members_of(worlds) if possible is None else possible
+        self.memory = self.memory.put(rows, self._begun(worlds, rows, policy, possible))
 
     def members_of(self, worlds: Worlds) -> Worlds:
-        """The members of worlds at the alert, [n * M]: here each world alone."""
+        """Return the possible worlds of worlds at the alert, M for each of n worlds: n * M worlds.
+
+        Here each world is its only possible world; a subclass may return more.
+        """
         return worlds
 
-    def _begin(self, worlds: Worlds, rows: Ints, policy: Agent | Mapping[int, Agent] | None, possible: Worlds) -> None:
-        """Find the plan to start with in each of these worlds, and keep it in their rows."""
+    def _begun(
+        self, worlds: Worlds, rows: Ints, policy: Agent | Mapping[int, Agent] | None, possible: Worlds
+    ) -> StepMemory:
+        """Return the memory of new episodes, with the first plan and its bound in each world.
+
+        Args:
+            worlds: n worlds at the alert.
+            rows: [n] rows of the batch in which the episodes start.
+            policy: the policy that proposes; for several vehicles, vehicle index -> policy; None: none.
+            possible: the possible worlds, M for each world, [n * M].
+
+        """
         members, vehicles = possible.n // worlds.n, self.vehicles
         problem = self._problem(possible, members)
         running = begin_running(problem, members)
@@ -241,19 +253,20 @@ class StepShield:
             plan[better] = actions[better]
             harm = np.where(better, alone, harm)
         settles = ends_under(running, plan)[0]
-        harm = self._bound_at_alert(possible, problem, rows, plan, harm)
-        new: dict[str, NDArray[Any]] = {
-            "first_bound": harm, "alone_harm": alone, "settles": settles,
-            "replaced": np.zeros((worlds.n, *plan.shape[2:]), np.int64), "distrusted": np.zeros(worlds.n, np.bool_),
-            "baseline_shares": borne[::members, borne.shape[1] - worlds.N :],
-        }  # fmt: skip
+        harm, enclosure = self._bound_at_alert(possible, problem, rows, plan, harm)
         constants = joint_constants(len(vehicles)) if len(vehicles) > 1 else np.array(CONSTANTS)
-        self._keep(rows, running, Backup(plan, harm, constants), new)
+        return StepMemory(
+            running, Backup(plan, harm, constants), first_bound=harm, alone_harm=alone, settles=settles,
+            replaced=np.zeros((worlds.n, *plan.shape[2:]), np.int64), distrusted=np.zeros(worlds.n, np.bool_),
+            baseline_shares=borne[::members, borne.shape[1] - worlds.N :], episode=np.zeros(worlds.n, np.int64),
+            enclosure=enclosure,
+        )  # fmt: skip
 
     def _problem(self, possible: Worlds, members: int) -> ProfileProblem:
-        """All possible worlds with the commands of the vehicles that are not shielded; refused if these are not known.
+        """Return the possible worlds and the commands of the unshielded vehicles, as a problem of ``engine.profiles``.
 
-        Where there are several members, each must also leave the shielded vehicles a decision before the horizon.
+        Raises ``InvalidInput`` if these commands are not fixed at the alert. If each world has several possible worlds
+        (``members``), each of them must also leave the shielded vehicles at least one decision before the horizon.
         """
         vehicles, horizon_s = self.vehicles, self.scenario.horizon_s
         if members > 1 and self.cap is not None:
@@ -276,30 +289,21 @@ class StepShield:
 
     def _bound_at_alert(
         self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
-    ) -> Floats:
-        """The bound [n] of the first plans, whose harm is ``harm`` in the worst member: here that harm."""
-        return harm
+    ) -> tuple[Floats, Any]:
+        """Return the bound of the first plans, [n] m2/s2, and the shield's further memory (``StepMemory.enclosure``).
 
-    def _keep(self, rows: Ints, running: Running, backup: Backup, new: dict[str, NDArray[Any]]) -> None:
-        """Put what has begun into its rows, or begin a larger batch with it."""
-        old, order = self.running, np.argsort(rows)
-        if old is None or running.n >= old.n:
-            self.running = running.take(order)
-            self.backup = backup._replace(plan=backup.plan[order], harm=backup.harm[order])
-            new = {name: values[order] for name, values in new.items()}
-            new["episode"] = np.full(running.n, self.episode.max(initial=-1) + 1)
-        else:
-            at = old.rows_of(rows)
-            self.running = Running(
-                old.problem.put(at, running.problem), put(old.states, at, running.states),
-                put(old.steps, rows, running.steps), put(old.ended, at, running.ended),
-                put(old.caps, at, running.caps) if old.caps.size else old.caps,
-            )  # fmt: skip
-            plan, harm = put(self.backup.plan, rows, backup.plan), put(self.backup.harm, rows, backup.harm)
-            self.backup = backup._replace(plan=plan, harm=harm)
-            new["episode"] = self.episode[rows] + 1
-            new = {name: put(getattr(self, name), rows, values) for name, values in new.items()}
-        self.__dict__.update(new)
+        Here the bound is ``harm``, and the further memory is None. A subclass may compute another bound, and use the
+        memory.
+
+        Args:
+            possible: the possible worlds at the alert, M for each world.
+            problem: the same worlds as a problem of ``engine.profiles``.
+            rows: rows of the batch in which the episodes start.
+            plan: [n, L] or [n, L, K] first plans.
+            harm: [n] their harm in the worst possible world, m2/s2.
+
+        """
+        return harm, None
 
     def decide(
         self,
@@ -309,70 +313,103 @@ class StepShield:
         only: Bools | None = None,
         proposer: Proposer | None = None,
     ) -> Decision:
-        """Decide in every running episode, or ``only`` in some; the others stay as they are.
+        """Decide on the proposed actions in every running episode.
 
-        ``seen`` [n, columns]: the worlds as they are now, in the first columns of ``Running.states``. Where nothing
-        else certifies a proposal, the ``proposer`` (if given) is rolled out from the state after it.
+        Args:
+            proposed: [n], or [n, K] for several vehicles: proposed actions; clipped to [-1, 1]. Where it is NaN,
+                nothing is proposed, and the plan's action is applied.
+            seen: [n, columns] the observed worlds, as the first columns of ``Running.states``; None: they are not
+                compared with the prediction.
+            only: [n] worlds in which to decide; the others stay unchanged. None: all whose episode has not ended.
+            proposer: the policies. Where nothing else certifies a proposal, they are simulated from this decision on,
+                and their actions are tried as a plan. None: this is not tried.
+
+        Returns the decision, with the actions to apply. Afterwards ``memory`` holds the predicted next state.
+
         """
-        if self.running is None:
+        memory = self.memory
+        if memory.running is None:
             raise InvalidInput("shield: decide, but no episode has begun; call begin first")
-        if np.shape(proposed) != (shape := (*self.distrusted.shape, *self.backup.plan.shape[2:])):
+        if np.shape(proposed) != (shape := (*memory.distrusted.shape, *memory.backup.plan.shape[2:])):
             raise InvalidInput(f"shield: proposed {np.shape(proposed)}; {shape} is needed")
-        after = copy.copy(self)
-        decision = after._decided(proposed, seen, ~self.running.finished if only is None else only, proposer)
-        self.__dict__.update(after.__dict__)  # in one piece: not even an interrupt comes between
+        asked = ~memory.running.finished if only is None else only
+        if seen is not None:
+            memory = self._compared(memory, seen, asked)
+        decision, self.memory = self._decided(memory, proposed, asked, proposer)
         return decision
 
-    def _decided(self, proposed: Floats, seen: Floats | None, asked: Bools, proposer: Proposer | None) -> Decision:
-        """Decide, and become the shield as it will be once that was carried out."""
-        assert self.running is not None
-        if seen is not None:
-            self._compare(seen, asked)
-        before = self.running
+    def _decided(
+        self, memory: StepMemory, proposed: Floats, asked: Bools, proposer: Proposer | None
+    ) -> tuple[Decision, StepMemory]:
+        """Return the decision on ``proposed`` [n] or [n, K] in the worlds ``asked`` [n], and the memory after it.
+
+        ``memory`` is the memory before. ``proposer`` holds the policies to simulate, or None.
+        """
+        before, held, budget = memory.running, memory.backup, self._bound_of(memory)
+        assert before is not None
         goes_on, asked = asked & before.finished, asked & ~before.finished
         each = np.repeat(asked, before.members)
         now = before._replace(ended=before.ended | ~each)
         given = np.array(proposed, np.float64)
-        given[self.distrusted] = np.nan
-        held, budget = self.backup, self.bound
+        given[memory.distrusted] = np.nan
         decision = certify(now, given, held, budget)
         if proposer is not None:
             decision = certify_by_policy(decision, now, given, budget, held.plan, proposer)
-        decision = self._also_certified(now, held, budget, decision, asked & ~self.distrusted)
-        decision.reason[asked & self.distrusted] = ShieldReason.ASSUMPTION_BROKEN
-        decision.applied[goes_on] = -1.0  # its episode was to be over: it holds the brakes
-        self.replaced = self.replaced + (decision.intervened.T & asked).T
-        self.running = decision.after._replace(ended=np.where(each, decision.after.ended, before.ended))
-        self.backup = decision.backup
-        decision = decision._replace(bound=self.bound)
+        decision = self._also_certified(now, memory, budget, decision, asked & ~memory.distrusted)
+        decision.reason[asked & memory.distrusted] = ShieldReason.ASSUMPTION_BROKEN
+        decision.applied[goes_on] = -1.0  # full braking where the episode should have ended
+        after = memory._replace(
+            replaced=memory.replaced + (decision.intervened.T & asked).T,
+            running=decision.after._replace(ended=np.where(each, decision.after.ended, before.ended)),
+            backup=decision.backup,
+        )
+        decision = decision._replace(bound=self._bound_of(after))
         if self.logging:
-            if len(self._entries) > self._logged:  # of a step that was not made, or of a copy
-                self._entries = self._entries[: self._logged]
-            self._entries.extend(interventions(now, self.episode, self.vehicles, proposed, decision, held))
-            self._logged = len(self._entries)
-        return decision
+            if len(self._entries) > memory.logged:  # entries of a step that was rolled back, or of a copy
+                self._entries = self._entries[: memory.logged]
+            self._entries.extend(interventions(now, memory.episode, self.vehicles, proposed, decision, held))
+            after = after._replace(logged=len(self._entries))
+        return decision, after
 
-    def _also_certified(self, now: Running, held: Backup, budget: Floats, decision: Decision, asked: Bools) -> Decision:
-        """What is left of a decision that all members allow: here all of it. ``held``: the backup before it."""
+    def _also_certified(
+        self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
+    ) -> Decision:
+        """Return the decision to apply, given a decision that keeps the budget in every possible world.
+
+        Here it is returned unchanged; a subclass may replace more actions.
+
+        Args:
+            now: the episodes before the decision.
+            memory: memory before the decision, with the plan held so far.
+            budget: [n] largest accepted harm, m2/s2.
+            decision: the decision.
+            asked: [n] worlds in which to decide.
+
+        """
         return decision
 
     def as_seen(self, seen: Floats) -> Floats:
-        """What is seen, with a post ahead where it was predicted: nothing stands there."""
-        assert self.running is not None
-        N = self.running.problem.mass.shape[1]
+        """Return ``seen`` [n, columns], the observed worlds, in a form that can be compared with the prediction.
+
+        If the prediction has a column for the gap to an obstacle ahead, worlds without obstacle (an infinite gap) get
+        the predicted gap there. Otherwise ``seen`` is returned unchanged.
+        """
+        running = self.memory.running
+        assert running is not None
+        N = running.problem.mass.shape[1]
         if self.scenario.vehicles == N:
             return seen
         seen = seen.copy()
-        seen[:, N] = np.where(np.isposinf(seen[:, N]), self.running.states[:: self.running.members, N], seen[:, N])
+        seen[:, N] = np.where(np.isposinf(seen[:, N]), running.states[:: running.members, N], seen[:, N])
         return seen
 
     def expects(self, seen: Floats) -> Bools:
-        """Where what is seen now [n, columns] does not contradict what was predicted, [n].
+        """Return whether each observed world in ``seen`` [n, columns] agrees with the prediction, [n].
 
-        One member: where the two are equal to the bit. Several: where each column lies within the range of their
-        predictions, or, in a world that may leave that range, is a finite number.
+        With one possible world, both must be equal to the bit. With several, each column must lie within the range of
+        their predictions, or, after an impact in one of them, be a finite number.
         """
-        running = self.running
+        running = self.memory.running
         assert running is not None
         seen = self.as_seen(seen)
         columns = seen.shape[1]
@@ -384,32 +421,40 @@ class StepShield:
         return np.asarray(within | (self._leaves_range(running) & np.isfinite(seen).all(axis=1)), np.bool_)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Worlds [n] that may leave the range of their members: one of them has had an impact."""
+        """Return whether an impact has happened in one of a world's possible worlds, [n].
+
+        From then on the world itself may lie outside their range. ``running`` are the predicted episodes.
+        """
         N = running.problem.mass.shape[1]
         predicted = running.states.reshape(running.n, running.members, -1)
         return np.asarray((predicted[:, :, 2 * N - 1 : 3 * N - 2] == 1.0).any(axis=(1, 2)), np.bool_)
 
-    def _compare(self, seen: Floats, asked: Bools) -> None:
-        """Find the worlds that did not do what was predicted, and choose anew there from what is seen."""
-        assert self.running is not None
-        running, seen = self.running, self.as_seen(seen)
+    def _compared(self, memory: StepMemory, seen: Floats, asked: Bools) -> StepMemory:
+        """Return the shield's memory after it has compared the observed worlds with the prediction in ``memory``.
+
+        ``seen`` [n, columns] holds the observed worlds, as the first columns of ``Running.states``. Only the worlds
+        ``asked`` [n] are compared. Worlds that contradict the prediction are distrusted, and get a new plan from the
+        observed state.
+        """
+        running, backup, seen = memory.running, memory.backup, self.as_seen(seen)
+        assert running is not None
         columns, surprising = seen.shape[1], asked & ~self.expects(seen)
         if not surprising.any():
-            return
-        self.distrusted = self.distrusted | surprising
-        known = np.isfinite(seen).all(axis=1) & ~running.finished  # others: what was predicted goes on, or the brakes
+            return memory
+        known = np.isfinite(seen).all(axis=1) & ~running.finished  # other worlds keep their prediction, or brake fully
         rows = np.flatnonzero(surprising & known)
         states, ended, at = running.states.copy(), running.ended.copy(), running.rows_of(rows)
         states[at, :columns] = np.repeat(seen[rows], running.members, axis=0)
         ended[at] = np.repeat(running.steps[rows], running.members) >= running.problem.last_step[at]
-        self.running = running._replace(states=states, ended=ended)
-        plan, harm, held = self.backup.plan.copy(), self.backup.harm.copy(), self.backup.plan
+        running = running._replace(states=states, ended=ended)
+        plan, harm = backup.plan.copy(), backup.harm.copy()
         harm[rows] = np.inf
-        for constant in (None, *self.backup.constants):
-            trial = held if constant is None else from_now(held, constant, running.steps)
+        for constant in (None, *backup.constants):
+            trial = backup.plan if constant is None else from_now(backup.plan, constant, running.steps)
             with renumbered(rows):
-                found = plan_harm(self.running.take(rows), trial[rows])
+                found = plan_harm(running.take(rows), trial[rows])
             better = rows[found < harm[rows]]
             harm[rows] = np.minimum(found, harm[rows])
             plan[better] = trial[better]
-        self.backup = self.backup._replace(plan=plan, harm=harm)
+        distrusted, backup = memory.distrusted | surprising, backup._replace(plan=plan, harm=harm)
+        return memory._replace(running=running, backup=backup, distrusted=distrusted)

@@ -1,4 +1,4 @@
-"""The shield as a wrapper of each interface: it puts a guard into the engine, and the guard reports in the infos."""
+"""The shield as a wrapper for each interface: it puts a guard into the engine, which reports in the infos."""
 
 from __future__ import annotations
 
@@ -25,34 +25,36 @@ from ethbrake_marl.shield.attach import Attached, Proposing
 from ethbrake_marl.shield.drivers import ShieldedDriver, shielded
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
 
-Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # what a step of the environment returns
+Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # observations, rewards, terminated, truncated, infos
 
 
 class _Closing:
-    """A wrapper that lets go of the engine before it closes the environment inside."""
+    """Mixin for wrappers, with a ``close`` that removes the guard from the engine and then closes the environment."""
 
-    attached: Attached
+    attached: Attached  # the link to the engine and its guard
 
     def close(self, **settings: Any) -> None:
-        """Take the shield off the environment, and close that."""
+        """Remove the shield from the environment, then close the environment with its keywords ``settings``."""
         self.attached.close()
         super().close(**settings)  # type: ignore[misc]  # of the wrapper's own library
 
 
 class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
-    """Shield the learners of a parallel environment, who are driven by the caller's actions or by a policy.
+    """Shield the learners of a parallel environment; the caller's actions or a policy propose.
 
     Mode ``step``, the default, certifies every action of all learners together, or replaces it. Mode ``episode`` is the
-    paper's Algorithm 1: policy or E-V2X-BM drives a whole episode, whatever is proposed. Bounds hold where the other
-    vehicles follow their scripts. ``shield_reason`` and other ``shield_...`` keys of ``infos[agent]`` say what was
-    done. See docs/shield.md.
+    paper's Algorithm 1: policy or E-V2X-BM drives the whole episode, whatever is proposed. Bounds hold where the other
+    vehicles follow their scripts. ``infos[agent]`` reports each decision under ``shield_reason`` and other
+    ``shield_...`` keys. See docs/shield.md.
 
     Args:
-        env: ``eb.parallel_env(...)`` with one learner (mode ``step``: or more), or what wraps it.
-        policy: an agent or a policy, a ``Team``, or one for each learner by its name; mode ``episode`` needs one, the
-            others take its harm as bound where that is lower.
-        agents: the learners that are shielded, as a list of names: all there are, which None also says.
-        options: keywords of ``ShieldOptions``, ``mode`` among them; raises ``InvalidInput`` for what does not fit it.
+        env: ``eb.parallel_env(...)`` with one learner (mode ``step``: one or more), or a wrapper around it.
+        policy: an agent or a policy, a ``Team``, or a mapping from learner name to policy. Mode ``episode`` needs one.
+            In the other modes, its harm is the bound (the guaranteed harm) where it is lower than that of E-V2X-BM.
+        agents: names of the shielded learners; must be all learners, which is also the meaning of None.
+        options: keywords of ``ShieldOptions``, including ``mode``.
+
+    Raises ``InvalidInput`` for arguments that do not fit.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.HybridShield(eb.parallel_env(scenario="paper-random"))
@@ -91,14 +93,22 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observations], dict[str, dict[str, Any]]]:
-        """Start an episode; the bound stands in ``infos[agent]["shield_bound_harm"]`` already."""
+        """Start an episode; return the observations and infos of the agents.
+
+        ``seed`` and ``options`` are the environment's. ``infos[agent]["shield_bound_harm"]`` already holds the bound.
+        """
         self.attached.check_open()
         begun: tuple[dict[str, Observations], dict[str, dict[str, Any]]] = super().reset(seed=seed, options=options)
         self.attached.check_open()
         return begun
 
     def step(self, actions: Mapping[str, Any]) -> Told:
-        """Advance by one step with the shielded agents' actions certified or replaced; they may also be left out."""
+        """Advance by one step with the learners' actions certified or replaced.
+
+        ``actions`` maps agent names to actions [1]; the policy proposes for agents that are left out. Returns
+        observations, rewards (with the intervention penalty subtracted), terminations, truncations and infos, each by
+        agent name.
+        """
         self.attached.check_open()
         found: Told = super().step(actions)
         for agent, penalty in zip(self.shielded, self.attached.penalty()[0].tolist(), strict=True):
@@ -107,9 +117,10 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
 
 
 def shielded_aec(env: ParallelEnv[str, Observations, NDArray[Any]], *args: Any, **settings: Any) -> Any:
-    """``HybridShield`` with agents acting in turn (AEC), front to rear; arguments as ``HybridShield``.
+    """Return a shielded environment with agents acting in turn (AEC), front to rear.
 
-    ``env`` is the parallel environment: in AEC all actions of a step are known only when the last agent has acted.
+    ``env`` is the parallel environment: in AEC, the actions of a step are complete only after the last agent has acted.
+    ``args`` and ``settings`` are the further arguments of ``HybridShield``.
     """
     return InTurns.around(HybridShield(env, *args, **settings))
 
@@ -119,9 +130,9 @@ class ShieldedEnv(
 ):
     """``EthBrake-v0`` behind a shield, by default in mode ``step``: each action is certified, or replaced.
 
-    The ``options`` are those of ``ShieldOptions``. ``shield_reason`` and its like in the info say what was done.
-    ``policy`` (needed in mode ``episode`` alone) is rolled out at each alert: where it harms no more than the coupled
-    optimum, its harm is the bound.
+    ``options`` are keywords of ``ShieldOptions``. The info reports each decision under ``shield_reason`` and other
+    ``shield_...`` keys. ``policy``, required only in mode ``episode``, is simulated from each alert: where it harms no
+    more than E-V2X-BM, its harm is the bound.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.ShieldedEnv(eb.EthBrakeEnv("paper-random"))
@@ -145,14 +156,21 @@ class ShieldedEnv(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode; the bound stands in ``info["shield_bound_harm"]`` already."""
+        """Start an episode; return observation and info.
+
+        ``seed`` and ``options`` are the environment's. ``info["shield_bound_harm"]`` already holds the bound.
+        """
         self.attached.check_open()
         begun = self.env.reset(seed=seed, options=options)
         self.attached.check_open()  # a wrapper inside may have put another environment there
         return begun
 
     def step(self, action: NDArray[Any]) -> Any:
-        """Advance by one time step with the action certified or replaced; around ``CostEnv`` with a cost, as there."""
+        """Advance by one time step with the action [1] certified or replaced.
+
+        Returns what the wrapped environment returns, with the intervention penalty subtracted from the reward; around
+        ``CostEnv`` that includes the cost.
+        """
         self.attached.check_open()
         observation, reward, *others = self.env.step(action)
         return observation, float(reward) - self.attached.penalty().item(), *others
@@ -161,11 +179,10 @@ class ShieldedEnv(
 class ShieldedVectorEnv(_Closing, VectorWrapper):
     """``EthBrakeVectorEnv`` behind a shield, by default in mode ``step``: each row's action is certified, or replaced.
 
-    The ``options`` are those of ``ShieldOptions``.
-
-    ``infos["shield_bound_harm"]`` and its like belong to the same moment as the other infos: in a row that has begun
-    anew they tell of the alert, and ``infos["final_info"]`` of the last step. Raises ``InvalidInput`` for another
-    environment.
+    ``options`` are keywords of ``ShieldOptions``. ``policy``, required only in mode ``episode``, is simulated from each
+    alert: where it harms no more than E-V2X-BM, its harm is the bound. ``infos["shield_bound_harm"]`` and the other
+    shield entries describe the same moment as the other infos: in a restarted row the new alert, while
+    ``infos["final_info"]`` describes the last step. Raises ``InvalidInput`` for another environment.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -187,33 +204,43 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode in every row; the bounds stand in ``infos["shield_bound_harm"]`` already."""
+        """Start an episode in every row; return observations [rows, F] and infos.
+
+        ``seed`` and ``options`` are the environment's. ``infos["shield_bound_harm"]`` already holds the bounds.
+        """
         self.attached.check_open()
         begun = self.env.reset(seed=seed, options=options)
         self.attached.check_open()  # a wrapper inside may have put another environment there
         return begun
 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
-        """Advance every world by one time step with the actions [rows, 1] certified or replaced."""
+        """Advance every world by one time step with the actions [rows, 1] certified or replaced.
+
+        Returns observations, rewards with the intervention penalty subtracted, terminated, truncated (each [rows]) and
+        infos.
+        """
         self.attached.check_open()
         observation, reward, terminated, truncated, infos = self.env.step(actions)
         return observation, reward - self.attached.penalty()[:, 0], terminated, truncated, infos
 
 
 def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, **options: Any) -> Any:
-    """An environment behind a shield: the action wrapper for whatever interface it has. Or an agent behind one.
+    """Put a shield around an environment, with the wrapper for its interface, or around an agent.
 
     Args:
-        env: of this package, whatever wraps it: PettingZoo parallel or AEC, Gymnasium, its vector interface, or
-            Stable-Baselines3's ``VecEnv``. A wrapper inside may change actions: what reaches the engine is certified.
-            Or an agent or team, for tables; then ``scenario`` says in which its actions are certified.
-        policy: proposes where nobody else does, and bounds the harm where its own is lower; mode ``episode`` needs it.
-        mode: ``step``, ``episode``, or one of an extension. None: ``step``, unless the options belong to another one.
+        env: an environment of this package, possibly wrapped: PettingZoo parallel or AEC, Gymnasium, its vector
+            interface, or Stable-Baselines3's ``VecEnv``. Inner wrappers may change actions: the action that reaches the
+            engine is certified. Or an agent or a team, which needs ``scenario``, the scenario in which actions are
+            certified.
+        policy: proposes where the caller gives no action, and lowers the bound (the harm that the shield guarantees) to
+            its own harm where that is lower. Mode ``episode`` needs it. None: nobody.
+        mode: ``step``, ``episode``, or a mode of an extension. None: ``step``, unless the options belong to another
+            mode.
         options: further keywords of ``ShieldOptions``.
 
-    Returns ``HybridShield``, that with agents acting in turn, ``ShieldedEnv``, ``ShieldedVectorEnv`` or
+    Returns ``HybridShield``, the same with agents acting in turn, ``ShieldedEnv``, ``ShieldedVectorEnv`` or
     ``ShieldedVecEnv``; an agent or a team for an agent or a team. Raises ``InvalidInput`` for anything else, and for
-    what those raise.
+    arguments that these refuse.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.shield(eb.parallel_env(scenario="paper-random"))

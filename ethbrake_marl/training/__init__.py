@@ -1,4 +1,4 @@
-"""Training, and the policies that come out of it. torch is imported only by the modules that train."""
+"""Training of policies, and the loading of trained ones. Only the modules that train import torch."""
 
 from typing import TYPE_CHECKING
 

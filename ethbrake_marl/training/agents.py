@@ -1,6 +1,6 @@
-"""Trained policies as agents: ``ppo@PATH``, ``policy@PATH``, whatever trained it, ``universal@shipped``, ``team@RUN``.
+"""Trained policies as agents: ``ppo@PATH``, ``sac@PATH``, ``policy@PATH``, ``universal@shipped`` and ``team@RUN``.
 
-Needs no torch.
+This module needs no torch.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Any
 
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Driver, Source, Team
-from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.shipped import SHIPPED, load_named_policy, shipped_name
@@ -21,11 +21,14 @@ from ethbrake_marl.training.team import has_policy_each, load_team
 
 
 def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
-    """The policy of a run or a bundle, or the team of a run in which each learner has its own.
+    """Return the agent of a spec such as ``ppo@PATH``: the policy of a run or of a policy bundle.
 
-    ``PATH`` may be ``shipped``, the policy that comes with the package for this scenario and harm count, or
-    ``shipped/NAME``; ``universal@shipped`` is for all scenarios, ``team@shipped`` is ``policy@shipped``. Raises
-    ``InvalidInput`` for a policy of another algorithm, and what loading it raises.
+    It is a team if each learner of the run has its own policy. ``argument`` is unused; ``settings`` holds the spec with
+    the path, the scenario and the harm count.
+
+    ``PATH`` may also be ``shipped``, the policy that comes with the package for this scenario and harm count, or
+    ``shipped/NAME``. ``universal@shipped`` is for all scenarios; ``team@shipped`` is the same as ``policy@shipped``.
+    Raises ``InvalidInput`` for a policy of another algorithm, and whatever loading the policy raises.
     """
     spec, path = settings.spec, settings.policy
     name = spec.partition("@")[0]

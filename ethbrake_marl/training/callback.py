@@ -1,4 +1,4 @@
-"""Between two updates of a training: measure, log, write checkpoints, stop."""
+"""Callback of a training: between two updates it measures the policies, logs, writes checkpoints, and may stop."""
 
 from __future__ import annotations
 
@@ -25,37 +25,46 @@ from ethbrake_marl.training.models import Learner, Model, make_policies
 from ethbrake_marl.training.progress import RETURN, Course, objective_in_words
 from ethbrake_marl.training.run_folder import RunDirectory
 
-# Column of the log -> info at the end of an episode. The log has the mean over the episodes since its last row.
+# Column of the log -> key of the info at the end of an episode. A row holds the mean over episodes since the last row.
 EPISODE_COLUMNS = {
     "rollout/first_impact_harm": "world_first_impact_harm",
     "rollout/total_harm": "world_total_harm",
     "rollout/collision_rate": "collided",
 }
 
-StopAt = Callable[[Mapping[str, float]], str | None]  # an evaluation -> a reason to stop there, or None
+StopAt = Callable[[Mapping[str, float]], str | None]  # takes the metrics of an evaluation; returns why to stop, or None
 
 
 class StopRequested(Exception):
-    """Raised with its reason inside the training loop, to leave it between two updates; never seen outside."""
+    """Internal exception that leaves the training loop between two updates.
+
+    Its argument is the reason that ``StopAt`` returned, or None after Ctrl-C.
+    """
 
 
 class Watchers(NamedTuple):
-    """Who follows a training, and may end it."""
+    """Functions that follow a training: they measure its policies, may stop it, and receive its progress."""
 
-    evaluate: Evaluate | None  # measures the policies
-    stop_at: StopAt | None
-    on_progress: OnProgress | None
-    stop: Callable[[], bool]  # asked before every rollout
+    evaluate: Evaluate | None  # takes the current policies and returns their metrics; None: no measurements
+    stop_at: StopAt | None  # takes the metrics of an evaluation and returns a reason to stop, or None to go on
+    on_progress: OnProgress | None  # takes a ``Progress``; None: nobody is informed
+    stop: Callable[[], bool]  # called before every rollout; returns True to stop the training (Ctrl-C)
 
 
 class RunCallback(BaseCallback):
-    """Measure, log and write checkpoints between two updates, and stop the training if asked.
+    """Callback that measures, logs and writes checkpoints between two updates, and stops the training on request.
 
-    ``_between_updates`` is the list of what is due. It runs before the first rollout, after each update, and at the
+    ``_between_updates`` lists what happens and when. It runs before the first rollout, after each update, and at the
     end. To stop, the callback writes a checkpoint and raises ``StopRequested``.
+
+    Args:
+        run: folder of the run.
+        learner: the model that learns, with its algorithm and training.
+        watchers: functions that measure, stop and report.
+
     """
 
-    model: Model
+    model: Model  # the model that learns
 
     def __init__(self, run: RunDirectory, learner: Learner, watchers: Watchers) -> None:
         super().__init__()
@@ -64,11 +73,11 @@ class RunCallback(BaseCallback):
         self.model.set_logger(Logger(str(run.path), []))
         self.updates = 0
         self.course = Course(self.recipe.reward.harm_count)
-        self.notes: list[str] = []  # for ``on_progress``, when the training begins
+        self.notes: list[str] = []  # notes that are passed to ``on_progress`` when the training begins
         self._stop_reason: str | None = None
         self._objective = objective_in_words(learner.training)
         self._ended: dict[str, list[float]] = {column: [] for column in EPISODE_COLUMNS}
-        self._is_done_here = False  # after ``restore``: what is due was done before the checkpoint was written
+        self._is_done_here = False  # True after ``restore``: this update was handled before the checkpoint was written
 
     def _on_rollout_start(self) -> None:
         while self.notes:
@@ -107,7 +116,10 @@ class RunCallback(BaseCallback):
             self._write_checkpoint()
 
     def _take_policies(self) -> None:
-        """Copy the present weights, once per update; raises ``TrainingDiverged`` if one is not finite."""
+        """Copy the current weights as policies into ``course``, at most once per update.
+
+        Raises ``TrainingDiverged`` if a weight is not finite.
+        """
         course, steps = self.course, self.model.num_timesteps
         if course.policy is None or (course.steps, course.updates) != (steps, self.updates):
             if not weights_are_finite(self.model, self.learner.algorithm):
@@ -143,30 +155,30 @@ class RunCallback(BaseCallback):
         return sum(float(e["r"]) for e in episodes) / len(episodes) if episodes else None
 
     def tell(self, note: str = "") -> None:
-        """Tell ``on_progress`` how far the training is."""
+        """Report the progress of the training to ``on_progress``, with ``note`` as a message to print once."""
         if self._watchers.on_progress is None:
             return
         course = self.course
         metrics = dict(course.evaluations[-1]) if course.evaluations else {}
-        if metrics and self.recipe.reward.harm_count == "total":  # the harm that is trained for stands first
+        if metrics and self.recipe.reward.harm_count == "total":  # the harm of the training's reward comes first
             metrics = {"total_harm": metrics["total_harm"], **metrics}
         recent = self._recent_return()
         if recent is not None:
             metrics[RETURN] = recent
         rollout = self.model.n_envs * self.recipe.rounds
-        planned = -(-self.recipe.total_steps // rollout) * rollout  # whole rollouts
+        planned = -(-self.recipe.total_steps // rollout) * rollout  # rounded up to whole rollouts
         self._watchers.on_progress(
             Progress("training", course.steps, planned, metrics, note, course.updates, course.wall_s, self._objective)
         )
 
     def _write_checkpoint(self) -> None:
-        """Write a checkpoint of this moment, unless there is one."""
+        """Write a checkpoint of the current state, unless it exists already."""
         folder = self.run.checkpoint(self.course.steps)
         if not folder.exists():
             write_checkpoint(folder, self._state())
 
     def _state(self) -> TrainingState:
-        """Everything that ``restore`` needs."""
+        """Return the state of model, environment, random generators and logs, from which ``restore`` continues."""
         course = self.course
         numbers, arrays = capture_model(self.model, self.learner.algorithm)
         best: tuple[Policy, ...] = ()
@@ -186,7 +198,10 @@ class RunCallback(BaseCallback):
         return TrainingState(numbers, arrays)
 
     def restore(self, state: TrainingState) -> None:
-        """Bring model and course to ``state``; raises ``CorruptBundle`` if the state belongs to another model."""
+        """Restore model and progress from the checkpoint ``state``, so that the training continues there.
+
+        Raises ``CorruptBundle`` if the state belongs to another model.
+        """
         numbers, course = state.numbers, self.course
         try:
             restore_model(self.model, self.learner.algorithm, state)

@@ -1,4 +1,4 @@
-"""Stop a training whose numbers are no longer finite: an observation, a reward, a loss, a gradient or a weight."""
+"""Checks that stop a training when an observation, a reward, a loss, a gradient or a weight is not finite."""
 
 from __future__ import annotations
 
@@ -16,11 +16,14 @@ LOSSES = ("loss", "policy_loss", "value_loss", "policy_gradient_loss", "actor_lo
 
 
 class TrainingDiverged(EthBrakeError, ArithmeticError):
-    """A reward, a loss or a weight is no longer a finite number; the last good policy was kept."""
+    """A reward, a loss, a gradient or a weight is no longer finite; the last good policy was kept."""
 
 
 def refuse_gradients(model: BaseAlgorithm, algorithm: Algorithm) -> None:
-    """Let every optimiser of the model raise ``TrainingDiverged`` before a step along a gradient that is not finite."""
+    """Make every optimiser of the model raise ``TrainingDiverged`` before a step with a gradient that is not finite.
+
+    ``algorithm`` is the algorithm of the model, which knows its optimisers.
+    """
     hint = "learning_rate or max_grad_norm" if hasattr(model, "max_grad_norm") else "learning_rate"
 
     def check(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
@@ -35,7 +38,10 @@ def refuse_gradients(model: BaseAlgorithm, algorithm: Algorithm) -> None:
 
 
 def weights_are_finite(model: BaseAlgorithm, algorithm: Algorithm) -> bool:
-    """Whether every weight is finite, and the exploration noise a usable number."""
+    """Return whether every weight of the model is finite, and the exploration noise finite and positive.
+
+    ``algorithm`` is the algorithm of the model, which knows its exploration noise.
+    """
     logarithm = algorithm.log_noise(model)
     noise = torch.ones(1) if logarithm is None else torch.exp(logarithm)
     usable = torch.isfinite(noise) & (noise > 0.0)
@@ -43,7 +49,7 @@ def weights_are_finite(model: BaseAlgorithm, algorithm: Algorithm) -> bool:
 
 
 class FiniteNumbers(BaseCallback):
-    """Raise ``TrainingDiverged`` at the first observation, reward or loss that is not finite."""
+    """Callback that raises ``TrainingDiverged`` at the first observation, reward or loss that is not finite."""
 
     def _on_step(self) -> bool:
         for name, entries in (("observations", self.locals["new_obs"]), ("rewards", self.locals["rewards"])):
@@ -65,7 +71,7 @@ class FiniteNumbers(BaseCallback):
     def _check_losses(self) -> None:
         logged = self.logger.name_to_value  # train/loss, or vehicle_2/loss if learners are independent
         for name in (name for loss in LOSSES for name in logged if name.rpartition("/")[2] == loss):
-            if not np.isfinite(logged[name]):  # it may well leave finite weights
+            if not np.isfinite(logged[name]):  # the weights may still be finite
                 raise TrainingDiverged(
                     f"training: {name} = {float(logged[name])} after step {self.model.num_timesteps}: must be finite;"
                     " try a smaller learning_rate, or smaller weights of the reward"

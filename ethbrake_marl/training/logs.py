@@ -1,4 +1,4 @@
-"""The logs of a training: ``progress.csv`` and TensorBoard's events."""
+"""Logs of a training: ``progress.csv`` and TensorBoard events."""
 
 from __future__ import annotations
 
@@ -12,7 +12,15 @@ from ethbrake_marl.training.run_folder import RunDirectory
 
 
 def open_logs(run: RunDirectory, state: TrainingState | None) -> list[KVWriter]:
-    """Open both logs, to go on after the rows of a checkpoint, or from the beginning without one."""
+    """Open ``progress.csv`` and the TensorBoard events of a run for writing.
+
+    Args:
+        run: folder of the run.
+        state: checkpoint after whose rows to continue; rows after it are dropped. None: begin with empty logs.
+
+    Returns the two writers, for ``output_formats`` of Stable-Baselines3's logger.
+
+    """
     run.progress.unlink(missing_ok=True)  # it may be a link
     if state is None:
         for left in run.tensorboard.glob("events.out.tfevents.*"):
@@ -24,5 +32,5 @@ def open_logs(run: RunDirectory, state: TrainingState | None) -> list[KVWriter]:
         table.file.flush()
         table.keys = [name for name in state.numbers["progress"].partition("\n")[0].split(",") if name]
         restart = Event(step=state.steps + 1, session_log=SessionLog(status=SessionLog.START))
-        events.writer.file_writer.add_event(restart)  # TensorBoard forgets what was written from this step on
+        events.writer.file_writer.add_event(restart)  # makes TensorBoard drop all events from this step on
     return [table, events]

@@ -1,4 +1,4 @@
-"""Build the environment and the model of a training, and make policies of the model's weights."""
+"""Build the environment and the model of a training, and turn the model's weights into policies."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from ethbrake_marl.training.finite import refuse_gradients
 from ethbrake_marl.training.recipe import Scheme
 from ethbrake_marl.training.training import Training
 
-Model = BaseAlgorithm  # of Stable-Baselines3
+Model = BaseAlgorithm  # a model of Stable-Baselines3
 
 
 class Learner(NamedTuple):
-    """A model that learns, the algorithm that built it, and the training that it is built for."""
+    """A model that learns, with its algorithm and the training that it is for."""
 
-    training: Training
-    algorithm: Algorithm
-    model: Model
+    training: Training  # recipe and scenario
+    algorithm: Algorithm  # how to read the model's policies, optimisers and other learned tensors
+    model: Model  # the model of Stable-Baselines3
 
     def policies(self) -> Trained:
-        """Copy the present weights into one policy for all learners, or into one for each."""
+        """Return a copy of the current policy, or one policy for each learner in the scheme ``independent``."""
         actors = self.algorithm.actors(self.model)
         return make_policies(
             self.training, self.model.num_timesteps, lambda k, network: self.algorithm.tensors(actors[k], network)
@@ -37,7 +37,7 @@ class Learner(NamedTuple):
 
 
 def make_environment(training: Training) -> EthBrakeVecEnv:
-    """Build the worlds of a training. Each learner of each world is a row."""
+    """Build the vectorised environment of a training, with one row for each learner of each world."""
     recipe = training.recipe
     appended: dict[Scheme, Appended] = {"independent": "number", "centralised": "state"}
     return make_sb3_vec_env(
@@ -52,7 +52,16 @@ def make_environment(training: Training) -> EthBrakeVecEnv:
 
 
 def make_model(algorithm: Algorithm, training: Training, environment: EthBrakeVecEnv) -> Model:
-    """Build the model of a training. Its optimisers refuse gradients that are not finite."""
+    """Build the model of a training, with optimisers that refuse gradients which are not finite.
+
+    Args:
+        algorithm: the algorithm of the training's recipe.
+        training: recipe and scenario.
+        environment: the environment to learn in, from ``make_environment``.
+
+    Raises ``InvalidInput`` for a model that normalises observations by ``VecNormalize``.
+
+    """
     model = algorithm.build(training, environment)
     if getattr(model, "get_vec_normalize_env", lambda: None)() is not None:
         raise InvalidInput(
@@ -66,7 +75,14 @@ def make_model(algorithm: Algorithm, training: Training, environment: EthBrakeVe
 def make_policies(
     training: Training, steps: int, tensors: Callable[[int, NetworkSpec], Mapping[str, Float32s]]
 ) -> Trained:
-    """One policy for all learners, or one for each; ``tensors(k, network)`` gives the weights of the k-th."""
+    """Return one policy for all learners, or one for each learner in the scheme ``independent``.
+
+    Args:
+        training: recipe and scenario.
+        steps: number of decisions after which these weights were learned, which is recorded.
+        tensors: function that returns the weights of the k-th policy (0 = foremost learner), by name, for a network.
+
+    """
     recipe, scenario = training.recipe, training.scenario
     names = tuple(training.drivers)
     apart = training.scheme == "independent"
@@ -75,7 +91,7 @@ def make_policies(
         observation = training.observations[learners[0]]
         network = recipe.network_spec(observation.size)
         if training.scheme == "centralised":
-            network = network.model_copy(update={"value_hidden": ()})  # its critic sees what no vehicle sees
+            network = network.model_copy(update={"value_hidden": ()})  # a vehicle cannot use the central critic
         policy = Policy.make(
             tensors(k, network),
             algorithm=recipe.algorithm,

@@ -1,4 +1,4 @@
-"""``TrainingRecipe``: a training set-up as one YAML file, whatever the algorithm."""
+"""``TrainingRecipe``: the settings of a training as one YAML file, for any algorithm."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ from ethbrake_marl.files.json_schema import FileSchema, schema_lines
 from ethbrake_marl.files.model import NAME_PATTERN, FileModel, Wording, read_model, refuse
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 from ethbrake_marl.game.features import ListedFeatures, listed_features
+from ethbrake_marl.game.measures import MEASURES
 from ethbrake_marl.game.rewards import RewardParams, setting_names
 from ethbrake_marl.policies.network_spec import Activation, NetworkSpec
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.scenario.catalogue import check_file_name, shipped_folder
 from ethbrake_marl.scenario.schema import Scenario
 
-WORDS = ("title", "description", "source")  # fields that tell about a recipe and change nothing
+WORDS = ("title", "description", "source")  # descriptive fields that do not affect a training
 
 Scheme = Literal["single", "shared", "independent", "centralised"]
 
@@ -42,32 +43,45 @@ Layers = Annotated[tuple[Annotated[int, Field(ge=1, le=4096)], ...], Field(stric
 
 
 class LearningRate(FileModel):
-    """A learning rate that falls from ``start`` to ``end`` over the training."""
+    """Learning rate of the optimiser, which falls from ``start`` to ``end`` over the training."""
 
-    start: Rate
-    end: Rate
+    start: Rate  # learning rate at the beginning
+    end: Rate  # learning rate at the end
     schedule: Literal["cosine"] = Field(
         "cosine", description="end + (start - end) (1 + cos(pi p)) / 2, where p is the share of steps done"
     )
 
     def at(self, remaining: float) -> float:
-        """``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``, the share of steps done."""
+        """Return the learning rate when the share ``remaining`` (1 to 0) of the training's steps is still to be done.
+
+        It is ``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``.
+        """
         done = min(max(1.0 - remaining, 0.0), 1.0)
         return self.end + (self.start - self.end) * 0.5 * (1.0 + math.cos(math.pi * done))
 
 
 class Shape(FileModel):
-    """Sizes of an algorithm's networks; a subclass lists them as keys."""
+    """Base class of the value of the key ``network`` in a recipe: the sizes of the networks.
+
+    A subclass declares the keys as fields. It needs ``policy`` (sizes of the actor's hidden layers, ``[64, 64]``) and
+    ``activation``, or its own ``spec``.
+    """
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """The network of a policy bundle, for one action in [-1, 1]: the actor, and whatever ``more`` adds."""
-        shape: Any = self  # its fields stand in an order of their own
+        """Return the description of the network in a policy bundle: an actor with one action in [-1, 1].
+
+        Args:
+            observation_size: number of features of an observation.
+            more: fields of ``NetworkSpec`` that differ from those of a plain actor.
+
+        """
+        shape: Any = self  # subclasses declare the fields
         fields = {"policy_hidden": shape.policy, "value_hidden": (), "activation": shape.activation, "output": "clip"}
         return NetworkSpec(observation_size=observation_size, action_size=1, **(fields | more))
 
 
 class NetworkShape(Shape):
-    """Hidden layers of actor and critic, and the exploration noise they start with."""
+    """Hidden layers of actor and critic, and the initial exploration noise."""
 
     policy: Layers = Field(description=ACTOR_LAYERS)
     value: Layers = Field(description="hidden layers of the critic")
@@ -77,23 +91,26 @@ class NetworkShape(Shape):
     )
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """Actor and critic."""
+        """Return the description of the network in a policy bundle: an actor and a critic.
+
+        ``observation_size`` is the number of features of an observation; ``more`` are other fields of ``NetworkSpec``.
+        """
         return super().spec(observation_size, value_hidden=self.value, **more)
 
 
 class EvaluationPlan(FileModel):
-    """The fixed list on which the policy is measured while it learns."""
+    """The fixed list of worlds on which the policy is measured during training, and how often."""
 
-    every_updates: Annotated[int, Field(ge=1)]
-    worlds: Annotated[int, Field(ge=1, le=1_000_000)]
-    seed: Annotated[int, Field(ge=0)]
+    every_updates: Annotated[int, Field(ge=1)]  # number of updates between two measurements
+    worlds: Annotated[int, Field(ge=1, le=1_000_000)]  # number of worlds of the list
+    seed: Annotated[int, Field(ge=0)]  # seed from which the worlds are drawn
 
 
 class TrainingRecipe(FileModel):
-    """How to train, whatever the algorithm: its name, reward, seed, and what is saved and measured on the way.
+    """How to train, with any algorithm: algorithm, reward, seed, checkpoints and measurements.
 
-    An update is one round of collecting and learning. The recipes of an algorithm are a class made from this one. Each
-    key says what it means in ``Field(description=...)``: new files, the JSON Schema and the documentation show it.
+    An update is one round of collecting and learning. The recipes of an algorithm are a subclass. Each key is explained
+    in ``Field(description=...)``: new files, the JSON Schema and the documentation show this text.
 
     >>> import ethbrake_marl as eb
     >>> recipe = eb.load_recipe("ppo").replace(seed=3, total_steps=100_000)
@@ -102,8 +119,8 @@ class TrainingRecipe(FileModel):
 
     """
 
-    schemes: ClassVar[tuple[Scheme, ...]] = ("single", "shared")  # under which the algorithm can learn
-    most_decisions: ClassVar[float] = math.inf  # held in memory between two updates
+    schemes: ClassVar[tuple[Scheme, ...]] = ("single", "shared")  # schemes that the algorithm supports
+    most_decisions: ClassVar[float] = math.inf  # largest number of decisions held in memory between two updates
 
     name: str = Field(pattern=NAME_PATTERN, description="equal to the file's name without .yaml")
     title: str = Field("", description="one line for lists")
@@ -153,35 +170,39 @@ class TrainingRecipe(FileModel):
         return self
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """The network of the policy's bundle: that of the recipe's ``network``."""
+        """Return the description of the network in the policy's bundle, from the recipe's key ``network``.
+
+        ``observation_size`` is the number of features of an observation.
+        """
         shape: Shape = vars(self)["network"]
         return shape.spec(observation_size)
 
     @property
     def rounds(self) -> int:
-        """Decisions of each learner between two updates: the recipe's ``n_steps``."""
+        """Decisions of each learner in each world between two updates: the recipe's ``n_steps``."""
         return int(vars(self)["n_steps"])
 
     @property
     def updates_per_row(self) -> int:
-        """Updates between two rows of the progress table."""
+        """Number of updates between two rows of ``progress.csv``."""
         return 1
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` if the recipe does not fit a line with that many learners."""
+        """Raise ``InvalidInput`` if the recipe does not fit this number of learners; a subclass may override it."""
 
     def begins(self, scenario: Scenario) -> str | None:
-        """What the weights begin as on a scenario, in words; None where the algorithm only knows random weights."""
+        """Return a description of the initial weights for a scenario; None if the algorithm has random ones."""
         return None
 
     def derived(self) -> dict[str, float]:
-        """Figures that follow from the keys, for ``config.json``."""
+        """Return numbers that follow from the keys, by name, to be recorded in ``config.json``."""
         return {}
 
     def scheme_for(self, scenario: Scenario) -> Scheme:
-        """The recipe's scheme; where it names none, ``single`` for one learner and ``shared`` for several.
+        """Return the scheme in which the scenario's learners train: ``single``, ``shared``, ``independent``, ...
 
-        Raises ``InvalidInput`` where nobody learns, or where the scheme or else the recipe does not fit the learners.
+        This is the recipe's scheme; if it names none, ``single`` for one learner and ``shared`` for several. Raises
+        ``InvalidInput`` if no vehicle learns, or if the scheme or the recipe does not fit the learners.
         """
         learners, where = len(scenario.learners), f"scenario {scenario.name!r}"
         if not learners:
@@ -202,36 +223,56 @@ class TrainingRecipe(FileModel):
         return scheme
 
     def make_algorithm(self) -> Any:
-        """Its algorithm, new."""
+        """Return a new instance of the class of the recipe's algorithm, a ``training.algorithm.Algorithm``."""
         algorithm = ALGORITHMS[self.algorithm][1]
         return (resolve_name(algorithm) if isinstance(algorithm, str) else algorithm)()
 
     @staticmethod
     def shipped() -> dict[str, Path]:
-        """Name -> file of every recipe that comes with the package: of the checkout's ``train/``, or installed."""
-        return {file.stem: file for file in sorted(shipped_folder("train").glob("*.yaml"))}
+        """Return the file of every recipe that comes with the package, by name.
+
+        A recipe for an algorithm of an extension is in a folder with the name of the extension.
+        """
+        files = sorted(shipped_folder("train").rglob("*.yaml"), key=lambda file: file.name)
+        return {file.stem: file for file in files}
+
+    @staticmethod
+    def usable() -> dict[str, Path]:
+        """Return the file of every shipped recipe whose algorithm is installed, by name; others need an extension."""
+        return {
+            name: file
+            for name, file in TrainingRecipe.shipped().items()
+            if _algorithm_in(read_yaml(file)) in ALGORITHMS
+        }
 
     @staticmethod
     def file(name_or_path: str | Path) -> Path:
-        """Where a recipe stands, a shipped name or any path; it need not exist. Raises ``UnknownName``."""
+        """Return the path of a recipe's file, from a shipped recipe's name or a path.
+
+        A text with a separator or the ending ``.yaml`` is a path; the file need not exist. Raises ``UnknownName`` for
+        another text that is no shipped recipe.
+        """
         text = str(name_or_path)
         if Path(text).suffix in (".yaml", ".yml") or "/" in text or "\\" in text:
             return Path(text)
         shipped = TrainingRecipe.shipped()
         if text not in shipped:
-            raise unknown_name("recipe", text, shipped)
+            raise unknown_name("recipe", text, TrainingRecipe.usable())
         return shipped[text]
 
     @staticmethod
     def of(content: Any) -> TrainingRecipe:
-        """The recipe, of its algorithm's class, that ``model_dump(mode="json")`` wrote; raises ``InvalidInput``."""
+        """Return the recipe with this content, a mapping from keys to values as in a YAML file.
+
+        Raises ``InvalidInput``, naming the key, if the content is invalid.
+        """
         return _checked(Document("recipe", content, {}))
 
     def new_text(self, name: str) -> str:
-        """Text of a commented YAML file for a new recipe ``name`` with the values of this one, all keys written out.
+        """Return the text of a commented YAML file for a new recipe ``name`` that starts from this recipe.
 
-        A key that this one leaves out stands in a comment. Save it as ``<name>.yaml``. Raises ``InvalidInput`` for a
-        name that cannot be one.
+        All keys are written; a key without a value stands in a comment. Save the text as ``<name>.yaml``. Raises
+        ``InvalidInput`` for an invalid name.
         """
         check_file_name("recipe", name)
         words = {
@@ -243,7 +284,10 @@ class TrainingRecipe(FileModel):
         return self.replace(name=name, **words).text(head)
 
     def text(self, head: str) -> str:
-        """A commented YAML file below ``head``: all keys written out, one that the recipe leaves out in a comment."""
+        """Return the text of a commented YAML file with all keys of this recipe, below the comment ``head``.
+
+        A key without a value stands in a comment.
+        """
         lines = [head, schema_lines("recipe", "train --schema")]
         values, meanings = self.model_dump(mode="json"), key_meanings(type(self))
         for key in type(self).model_fields:
@@ -259,17 +303,17 @@ class TrainingRecipe(FileModel):
         return "".join(lines)
 
     def replace(self, **changes: Any) -> Self:
-        """The same recipe with other values in some fields, checked again; raises ``InvalidInput``."""
+        """Return the recipe with other values for some keys, ``seed=3``; raise ``InvalidInput`` if one is invalid."""
         content = {**self.model_dump(mode="json"), **changes}
         changed = _checked(Document(f"recipe {self.name!r}", content, {}))
         assert isinstance(changed, type(self)) or "algorithm" in changes
-        return changed  # type: ignore[return-value]  # of another class only if another algorithm was asked for
+        return changed  # type: ignore[return-value]  # another class only with another algorithm
 
     @staticmethod
     def json_schema() -> dict[str, Any]:
-        """JSON Schema of a recipe file, for editors that complete and check YAML.
+        """Return the JSON Schema of a recipe file, for editors that complete and check YAML.
 
-        Which keys there are depends on ``algorithm``. Registered algorithms and reward terms are known, too.
+        The allowed keys depend on ``algorithm``. Registered algorithms and measures are included.
         """
         classes = {name: recipe for name, (recipe, _) in ALGORITHMS.usable().items()}
         places, whole = models_json_schema(
@@ -279,9 +323,9 @@ class TrainingRecipe(FileModel):
         for name, recipe in classes.items():
             keys = parts[str(places[recipe, "validation"]["$ref"]).rpartition("/")[2]]["properties"]
             keys["algorithm"] |= {"description": key_meanings(recipe)["algorithm"], "const": name}
-        weight = {"type": "number", "minimum": 0, "description": "weight of a registered term"}
+        weight = {"type": "number", "description": "weight of a registered measure"}
         properties = parts["RewardParams"]["properties"]
-        properties |= {name: weight for name in setting_names() if name not in properties}
+        properties |= {name: weight for name in MEASURES.usable() if name not in properties}
         ways = [
             {
                 "if": {"properties": {"algorithm": {"const": name}}, "required": ["algorithm"]},
@@ -305,7 +349,10 @@ class TrainingRecipe(FileModel):
 
 
 def key_meanings(recipe: type[TrainingRecipe]) -> dict[str, str]:
-    """Key -> what it means, for the recipes of one algorithm; a key without a meaning of its own has its parent's."""
+    """Return key -> meaning of the key in recipes of this class.
+
+    A key that the class declares without a description has the description of its base class.
+    """
     found: dict[str, str] = {}
     for each in reversed(recipe.__mro__):
         for key, field in each.model_fields.items() if issubclass(each, TrainingRecipe) else ():
@@ -317,18 +364,18 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
 
 
 def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[Any] | str) -> None:
-    """Make ``algorithm: name`` a recipe that can be read, trained, stopped and resumed.
+    """Register an algorithm, so that recipes with ``algorithm: name`` can be read, trained, stopped and resumed.
 
     An installed package does the same with an entry point of the group ``ethbrake_marl.algorithms``: a ``Part`` of
-    both.
+    recipe and algorithm.
 
     Args:
         name: 1 to 64 of ``a-z``, digits, ``-`` and ``_``.
-        recipe: the class of its recipes, made from ``TrainingRecipe``; it checks the YAML file.
-        algorithm: the class of the algorithm, made from ``training.algorithm.Algorithm``; or ``"module:class"``, so
-            that recipes are read without importing it, since torch takes seconds.
+        recipe: the class of its recipes, a subclass of ``TrainingRecipe``; it checks the YAML file.
+        algorithm: the class of the algorithm, a subclass of ``training.algorithm.Algorithm``; or ``"module:class"``, so
+            that recipes can be read without importing it, since torch takes seconds.
 
-    Raises ``InvalidInput`` for a name that is taken or is no such name, or a class that lacks what is needed.
+    Raises ``InvalidInput`` for an invalid or taken name, or a class that lacks a required method.
 
     """
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
@@ -347,26 +394,33 @@ ALGORITHMS: Registry[tuple[type[TrainingRecipe], type[Any] | str]] = Registry(
 
 
 def algorithm_names() -> tuple[str, ...]:
-    """Every name, the package's own first."""
+    """Return the names of all algorithms, the package's own first."""
     return tuple(ALGORITHMS)
 
 
 def load_recipe(name_or_path: str | Path) -> TrainingRecipe:
-    """Read a shipped recipe by name (``ppo``) or a file by path (anything with a separator or ``.yaml``).
+    """Read and check a recipe: a shipped one by name (``ppo``), or a file by path.
 
-    Raises ``UnknownName`` with a suggestion, or ``InvalidInput`` with file, line, key, value and what would be right.
+    A text with a separator or the ending ``.yaml`` is a path. Raises ``UnknownName`` with a suggestion, or
+    ``InvalidInput`` with file, line, key, value and what would be right.
     """
     return _checked(TrainingRecipe.file(name_or_path))
 
 
+def _algorithm_in(document: Document) -> object:
+    """Return the value of ``algorithm`` in a recipe file; ``ppo`` if the key is missing."""
+    return document.content.get("algorithm", "ppo") if isinstance(document.content, dict) else "ppo"
+
+
 def _checked(source: Path | Document) -> TrainingRecipe:
     document = source if isinstance(source, Document) else read_yaml(source)
-    name = document.content.get("algorithm", "ppo") if isinstance(document.content, dict) else "ppo"
+    name = _algorithm_in(document)
     if not isinstance(name, str) or name not in ALGORITHMS:
         where, right = document.where(("algorithm",)), f"one of {', '.join(ALGORITHMS)}"
-        absent = "; the package or extension that gives it is not installed"
-        ships = isinstance(source, Path) and source in TrainingRecipe.shipped().values()
-        raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: must be {right}{absent if ships else ''}")
+        absent = ""
+        if isinstance(source, Path) and source in TrainingRecipe.shipped().values():
+            absent = f"; the extension {source.parent.name}, which gives it, is not installed"
+        raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: must be {right}{absent}")
     shipped = f"; every key is in the shipped recipe {name}" if name in TrainingRecipe.shipped() else ""
     model = ALGORITHMS[name][0]
     wording = _RecipeWording(model, f"it is needed{shipped}")
@@ -375,5 +429,9 @@ def _checked(source: Path | Document) -> TrainingRecipe:
 
 class _RecipeWording(Wording):
     def known(self, path: YamlPath) -> list[str]:
-        """Registered terms have their weights beside the others."""
+        """Return the keys that are allowed beside a key, from which an error message suggests one.
+
+        ``path`` holds the keys that lead to it in the file, such as ``("reward", "harm")``. Below ``reward``, the
+        weights of registered measures are included.
+        """
         return setting_names() if path[:-1] == ("reward",) else super().known(path)

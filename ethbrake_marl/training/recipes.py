@@ -30,7 +30,7 @@ NETWORK = "hidden layers of the actor, and of the critic if there is one, and th
 
 
 class PpoRecipe(TrainingRecipe):
-    """PPO: collect ``n_steps`` decisions of every learner, then go through them ``n_epochs`` times."""
+    """PPO recipe: collect ``n_steps`` decisions of every learner, then learn from them in ``n_epochs`` passes."""
 
     schemes = get_args(Scheme)
     most_decisions = 2**24
@@ -60,7 +60,7 @@ class PpoRecipe(TrainingRecipe):
         return self
 
     def check_learners(self, learners: int) -> None:
-        """Every turn needs an update of its own."""
+        """Raise ``InvalidInput`` if the training has fewer updates than turns of this number of learners."""
         updates = -(-self.total_steps // (self.n_envs * learners * self.n_steps))
         if self.turns is not None and self.turns * learners > updates:
             raise InvalidInput(
@@ -70,19 +70,22 @@ class PpoRecipe(TrainingRecipe):
 
 
 class SquashedShape(Shape):
-    """Hidden layers of the actor and of each of the two critics; the actor's noise depends on what it sees."""
+    """Hidden layers of SAC's actor and of each of its two critics; the actor's noise depends on the observation."""
 
     policy: Layers = Field(description=ACTOR_LAYERS)
     value: Layers = Field(description="hidden layers of each of the two critics")
     activation: Activation = "relu"
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """The actor, whose squashed mean is the action. Critics stay in the checkpoints."""
+        """Return the description of the network in a policy bundle: the actor only, whose action is tanh of its mean.
+
+        ``observation_size`` is the number of features of an observation; ``more`` are other fields of ``NetworkSpec``.
+        """
         return super().spec(observation_size, output="tanh", **more)
 
 
 class SacRecipe(TrainingRecipe):
-    """SAC: collect ``steps_per_update`` decisions of every learner, then ``gradient_steps`` steps from the memory."""
+    """SAC recipe: collect ``steps_per_update`` decisions of every learner, then take ``gradient_steps`` steps."""
 
     algorithm: Literal["sac"]
     batch_size: int = Field(ge=2, description=BATCH_SIZE)
@@ -117,21 +120,21 @@ class SacRecipe(TrainingRecipe):
 
     @property
     def rounds(self) -> int:
-        """Decisions of each learner between two updates."""
+        """Decisions of each learner in each world between two updates: ``steps_per_update``."""
         return self.steps_per_update
 
     @property
     def updates_per_row(self) -> int:
-        """Updates between two rows of the progress table."""
+        """Number of updates between two rows of ``progress.csv``: ``log_every_updates``."""
         return self.log_every_updates
 
     @property
     def update_ratio(self) -> float:
-        """Gradient steps per decision of one learner in each world."""
+        """Number of gradient steps per decision: ``gradient_steps / (n_envs * steps_per_update)``."""
         return self.gradient_steps / (self.n_envs * self.steps_per_update)
 
     def derived(self) -> dict[str, float]:
-        """The update ratio."""
+        """Return ``{"update_ratio": ...}``, gradient steps per decision, to be recorded in ``config.json``."""
         return {"update_ratio": self.update_ratio}
 
 

@@ -1,4 +1,4 @@
-"""The folder of a run: the names of its files, and how they are written and read."""
+"""The folder of a run (a training and its results): the names of its files, and how they are written and read."""
 
 from __future__ import annotations
 
@@ -22,36 +22,44 @@ RunStatus = Literal["running", "finished", "interrupted", "failed"]
 
 
 class RunDirectory:
-    """A run's folder: the names inside, and what its files say."""
+    """The folder of a run: paths of its files as attributes, and methods that read and write them.
 
-    # Columns of progress.csv, and keys of evaluations (with ``eval/`` before them in progress.csv)
+    ``path`` is the folder, which need not exist yet.
+    """
+
+    # Columns of progress.csv, where keys of evaluations have the prefix ``eval/``.
     RETURN = "rollout/ep_rew_mean"  # mean over the last episodes, exploration included
     OBJECTIVE = "objective"  # mean of the learners' objectives, if one of them is not total harm
     HARM: ClassVar[dict[HarmCount, str]] = {"first": "first_impact_harm", "total": "total_harm"}
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.config = path / "config.json"  # what was asked for: recipe, scenario, seeds, versions
-        self.status = path / "run.json"  # how far it came: a ``RunStatus``, steps, updates, wall time
+        self.config = path / "config.json"  # recipe, scenario, seeds and versions of the run
+        self.status = path / "run.json"  # progress of the run: a ``RunStatus``, steps, updates, wall time
         self.progress = path / "progress.csv"  # one row per update
         self.tensorboard = path / "tensorboard"  # the same numbers as TensorBoard events
-        self.policy = path / "policy"  # the bundle of least harm on the fixed list, or the last where none is measured
-        self.last_policy = path / "policy-last"  # the bundle at the end of the run
+        self.policy = path / "policy"  # bundle with the least harm on the fixed list, or the last one without a list
+        self.last_policy = path / "policy-last"  # bundle at the end of the run
         self.team = path / "team.json"  # which bundle drives which vehicle
-        self.checkpoints = path / "checkpoints"  # where the training can go on; empty once it has finished
-        self.lock = path / "run.lock"  # held while a process trains here
+        self.checkpoints = path / "checkpoints"  # checkpoints for ``resume``; deleted when the training has finished
+        self.lock = path / "run.lock"  # lock of the process that trains here
 
     def checkpoint(self, steps: int) -> Path:
-        """Folder of the checkpoint after ``steps`` decisions."""
+        """Return the path of the checkpoint's folder after ``steps`` decisions of all learners."""
         return self.checkpoints / f"step_{steps:012d}"
 
     def create(
         self, config: Mapping[str, Any], *, team: Mapping[str, Any] | None = None, force: bool = False
     ) -> RunDirectory:
-        """Make the folder with ``config.json`` and ``run.json`` in one step. From then on the run can be resumed.
+        """Create the folder with ``config.json`` and ``run.json``, atomically. From then on the run can be resumed.
 
-        ``team`` is the content of ``team.json``. Raises ``AlreadyExists`` when there is something; with ``force`` an
-        earlier run (a folder with a ``run.json``) or an empty folder is replaced, and anything else is still refused.
+        Args:
+            config: content of ``config.json``.
+            team: content of ``team.json``; None: no such file.
+            force: replace an earlier run (a folder with a ``run.json``) or an empty folder.
+
+        Returns this object. Raises ``AlreadyExists`` if the path exists and is not replaced.
+
         """
         path, is_run = self.path, self.status.is_file()
         replace = force and path.is_dir() and not path.is_symlink() and (is_run or not any(path.iterdir()))
@@ -71,11 +79,14 @@ class RunDirectory:
         return self
 
     def write_json(self, file: Path, content: Mapping[str, Any]) -> None:
-        """Replace ``file`` in one step."""
+        """Write ``content`` as JSON to ``file``, a path in this folder, replacing the file completely or not at all."""
         write_file(file, json.dumps(content, indent=2, allow_nan=False).encode() + b"\n")
 
     def write_status(self, status: RunStatus, **more: Any) -> None:
-        """Replace ``run.json``. The time of the start stays; a status other than running gets the time of its end."""
+        """Replace ``run.json`` by this status.
+
+        The start time is kept; a status other than ``running`` also records the end time. ``more`` are other entries.
+        """
         now = datetime.now(UTC).isoformat(timespec="seconds")
         before = read_object(self.status) if self.status.exists() else {}
         times = {"started_utc": before.get("started_utc") or now}
@@ -84,7 +95,10 @@ class RunDirectory:
         self.write_json(self.status, {"format": "ethbrake-run", "format_version": 1, "status": status, **times, **more})
 
     def read_config(self) -> dict[str, Any]:
-        """The configuration; raises ``InvalidInput`` where there is no run, or naming the file that is damaged."""
+        """Return the content of ``config.json``: recipe, scenario, seeds and versions.
+
+        Raises ``InvalidInput`` if the folder holds no run, or if a file or folder in it is damaged.
+        """
         if not (os.path.lexists(self.status) or os.path.lexists(self.config)):
             raise InvalidInput(f"{self.path}: holds no training; give the folder of a run, for instance runs/my-run")
         for folder in (self.checkpoints, self.tensorboard, self.policy, self.last_policy):
@@ -98,31 +112,43 @@ class RunDirectory:
 
     @property
     def is_finished(self) -> bool:
-        """Whether the training here has finished."""
+        """Whether the training in this folder has finished."""
         return self.status.is_file() and read_object(self.status).get("status") == "finished"
 
     def wait_for_others(self, longest_s: float) -> None:
-        """Wait until no other process trains here, at most ``longest_s``."""
+        """Wait until no other process trains in this folder, at most ``longest_s`` seconds; never raise."""
         with suppress(Timeout, OSError), FileLock(self.lock, timeout=longest_s, mode=0o666):
             pass
 
     @classmethod
     def chosen_by(cls, evaluations: Sequence[Mapping[str, Any]], harm_count: HarmCount, prefix: str = "") -> str:
-        """Metric by which the best policy is chosen: the objective, or the line's harm where there is no objective."""
+        """Return the name of the metric whose least value chooses the best policy.
+
+        It is ``objective`` if every evaluation has one, else the harm of the line under ``harm_count``.
+
+        Args:
+            evaluations: evaluations, or rows of ``progress.csv``.
+            harm_count: harm that the training minimises.
+            prefix: text before the names of metrics in ``evaluations`` and in the result: ``eval/`` for rows.
+
+        """
         found = evaluations and all(entry.get(prefix + cls.OBJECTIVE) not in (None, "") for entry in evaluations)
         return prefix + (cls.OBJECTIVE if found else cls.HARM[harm_count])
 
     def rows(self) -> list[dict[str, str]]:
-        """Rows of ``progress.csv``, one per update."""
+        """Return the rows of ``progress.csv``, each as column -> text."""
         return list(csv.DictReader(self.progress.read_text("utf-8").splitlines()))
 
     def cpu_s(self) -> dict[int, float]:
-        """Processor seconds of learning until each evaluation, by step; raises ``InvalidInput`` where none are kept."""
+        """Return number of decisions at each evaluation -> processor time of learning until then (s).
+
+        Raises ``InvalidInput`` if none is recorded.
+        """
         kept = read_object(self.status).get("cpu_s") or {}
         if not kept:
             raise InvalidInput(f"{self.path}: tells no processor time; train again with this version")
         return {int(steps): float(spent) for steps, spent in kept.items()}
 
     def column(self, name: str) -> dict[int, float]:
-        """A column of ``progress.csv``: step -> value, without empty cells."""
+        """Return the column ``name`` of ``progress.csv`` as number of decisions -> value, without empty cells."""
         return {int(row["steps"]): float(row[name]) for row in self.rows() if row.get(name)}

@@ -36,7 +36,7 @@ _BUSY = "another process is training here"
 
 @dataclass(frozen=True, slots=True)
 class TrainResult:
-    """Policies of a training, and how it went.
+    """Result of ``train`` or ``resume``: the policies, and how the training went.
 
     ``trained`` is the policy with the least harm on the fixed list, or the last policy if nothing was measured.
 
@@ -52,16 +52,16 @@ class TrainResult:
     directory: Path  # the run's folder
     training: Training  # recipe and scenario
     trained: Trained  # one policy for all learners, or one for each; also saved as directory/policy
-    last: Trained  # at the end; also saved as directory/policy-last
+    last: Trained  # policy or policies at the end; also saved as directory/policy-last
     status: Ended  # finished or interrupted
-    steps: int  # decisions of all learners, a multiple of rows x rounds
+    steps: int  # decisions of all learners together, whole updates
     updates: int  # rounds of collecting and learning
-    wall_s: float  # s, of all processes that trained here
-    evaluations: tuple[Mapping[str, float], ...]  # in order
+    wall_s: float  # time that all processes spent on this training (s)
+    evaluations: tuple[Mapping[str, float], ...]  # steps, updates and metrics of each evaluation, in order
 
     @property
     def policies(self) -> dict[str, Policy]:
-        """Vehicle -> the policy that drives it."""
+        """The policy of each learner, by the vehicle's name."""
         return dict(self.trained.drivers)
 
     @property
@@ -71,7 +71,7 @@ class TrainResult:
 
     @property
     def last_policy(self) -> Policy:
-        """The last policy; raises ``InvalidInput`` if each learner has its own."""
+        """The policy at the end of the training; raises ``InvalidInput`` if each learner has its own."""
         return _only(self.last)
 
 
@@ -98,36 +98,36 @@ def train(
 ) -> TrainResult:
     """Train the learners of ``scenario`` and write the run's folder: build, learn, evaluate, save.
 
-    Ctrl-C stops after the update in progress (status ``interrupted``); a second one raises ``KeyboardInterrupt``.
-    Unless the process is killed, ``policy/`` holds the best policy so far and ``policy-last/`` the last good one.
-    ``resume`` goes on. The same recipe, scenario, seed and machine give the same policy, bit for bit. The global
-    random generators are left as they were.
+    Ctrl-C stops after the current update (status ``interrupted``); a second Ctrl-C raises ``KeyboardInterrupt``. Unless
+    the process is killed, ``policy/`` then holds the best policy so far and ``policy-last/`` the last good one.
+    ``resume`` continues the training. The same recipe, scenario, seed and machine give the same policy, bit for bit.
+    The global random generators are not changed.
 
     Args:
         recipe: a recipe, its name, or the path of its file.
-        scenario: a scenario, its name, or the path of its file. Its roles say who learns.
+        scenario: a scenario, its name, or the path of its file. Its roles determine the learners.
         directory: the new folder of the run.
         scheme: overrides the recipe's scheme. By default one learner is ``single``, several are ``shared``.
         turns: overrides the recipe's turns of independent learners (docs/training-schemes.md).
         seed: overrides the recipe's seed.
-        steps: overrides the recipe's decisions of learners. The last update may go beyond them.
+        steps: overrides the recipe's number of decisions. The last update may exceed it.
         force: replace an earlier run.
-        settings: how recipe and scenario differ from their files, ``KEY=VALUE`` each; written to ``config.json``.
+        settings: how recipe and scenario differ from their files, ``KEY=VALUE`` each; recorded in ``config.json``.
         measure: called with the training; returns the function that measures its policies before the first update,
             every few updates (a key of the recipe), and at the end. By default the recipe's fixed list. None: no
             measurements.
-        stop_at: called with every evaluation (an entry of ``TrainResult.evaluations``); returns a reason to stop
-            there with status ``interrupted``, or None.
-        on_progress: called with the progress. By default stderr shows it; None: silent.
+        stop_at: called with every evaluation (an entry of ``TrainResult.evaluations``); returns a reason to stop there
+            with status ``interrupted``, or None.
+        on_progress: called with the progress. By default it is shown on stderr; None: silent.
 
-    Raises ``AlreadyExists`` for an existing directory without ``force``, ``InvalidInput`` if recipe and scenario do
-    not fit each other, ``TrainingDiverged`` for numbers that are not finite.
+    Raises ``AlreadyExists`` for an existing directory without ``force``, ``InvalidInput`` if recipe and scenario do not
+    fit each other, ``TrainingDiverged`` for numbers that are not finite.
 
     """
     changes = {"scheme": scheme, "turns": turns, "seed": seed, "total_steps": steps}
     training = Training.of(recipe, scenario, **{name: value for name, value in changes.items() if value is not None})
     run = RunDirectory(Path(directory))
-    with build(training, run, measure, stop_at, on_progress) as callback:  # may refuse, before there is a folder
+    with build(training, run, measure, stop_at, on_progress) as callback:  # may raise before the folder is created
         run.create(training.config(settings), team=training.team(), force=force)
         with hold_lock(run.lock, _BUSY):
             return learn(callback, None)
@@ -141,20 +141,20 @@ def resume(
     on_progress: Told = "show",
     other_versions: bool = False,
 ) -> TrainResult:
-    """Go on with a training that was stopped or killed. The policies are the same bits as without the stop.
+    """Continue a training that was stopped or killed. Its policies are the same, bit for bit, as without the stop.
 
-    Training goes on from the newest checkpoint that is whole, or from the beginning if there is none. Rows and events
+    Training continues from the newest undamaged checkpoint, or from the beginning if there is none. Rows and events
     after that checkpoint are dropped.
 
     Args:
         directory: the run's folder.
         measure: the argument that ``train`` was called with.
         stop_at: the argument that ``train`` was called with. It is called with new evaluations only.
-        on_progress: called with the progress. By default stderr shows it; None: silent.
-        other_versions: go on from a checkpoint that other versions wrote, although the numbers may differ.
+        on_progress: called with the progress. By default it is shown on stderr; None: silent.
+        other_versions: accept a checkpoint that other versions wrote, although the numbers may differ.
 
-    Raises ``InvalidInput`` for a folder without a training, with a finished one, with one that another process is
-    training, with a ``config.json`` edited since the checkpoint, and with a checkpoint of other versions.
+    Raises ``InvalidInput`` for a folder without a training, with a finished training, with one that another process is
+    running, with a ``config.json`` edited since the checkpoint, and with a checkpoint of other versions.
 
     """
     run = RunDirectory(Path(directory))
@@ -171,7 +171,19 @@ def resume(
 def build(
     training: Training, run: RunDirectory, measure: Measure | None, stop_at: StopAt | None, on_progress: Told
 ) -> Iterator[RunCallback]:
-    """Build environment and model, and the callback that follows the training; raises what they refuse."""
+    """Context manager: build environment and model of a training, and yield the callback to pass to ``learn``.
+
+    Inside, Ctrl-C stops the training after the current update. At the end, also after an error, the environment is
+    closed and the global random generators are restored.
+
+    Args:
+        training: recipe and scenario.
+        run: folder of the run; nothing is written yet.
+        measure: as in ``train``.
+        stop_at: as in ``train``.
+        on_progress: as in ``train``.
+
+    """
     evaluate = None if measure is None else measure(training)
     algorithm = training.recipe.make_algorithm()
     with own_random_state(), stop_on_signal() as stop, closing(make_environment(training)) as environment:
@@ -180,9 +192,15 @@ def build(
 
 
 def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[str] = ()) -> TrainResult:
-    """Learn from a checkpoint, or from the beginning without one, to the end or the next stop; then save.
+    """Run the training of a callback to its end or the next stop; then save, and return the result.
 
-    The callback evaluates on the way. However the training ends, its folder is complete.
+    However the training ends, its folder is complete.
+
+    Args:
+        callback: the callback from ``build``, which holds the model and measures it during the training.
+        state: checkpoint to continue from; None: begin from scratch.
+        notes: messages for the user, passed to ``on_progress`` when the training begins.
+
     """
     run, (training, algorithm, model), course = callback.run, callback.learner, callback.course
     if state is not None:
@@ -204,7 +222,7 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
     except StopRequested as stop:
         status, reason = "interrupted", stop.args[0]
     except BaseException as error:
-        cause = error  # torch's own when a distribution gets a NaN says little about a training
+        cause = error  # torch's message about a NaN in a distribution would not help the user
         if isinstance(error, ValueError) and not weights_are_finite(model, algorithm):
             cause = TrainingDiverged(
                 f"training: a weight or the exploration noise is not finite at step {model.num_timesteps};"
@@ -218,7 +236,7 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
     finally:
         model.logger.close()
     save(callback, status, reason)
-    assert course.policy is not None and course.kept is not None  # taken before the first rollout
+    assert course.policy is not None and course.kept is not None  # set before the first rollout
     return TrainResult(
         run.path, training, course.kept, course.policy, status, course.steps, course.updates, course.wall_s,
         tuple(course.evaluations),
@@ -226,7 +244,16 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
 
 
 def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
-    """Save the best and the last good policy, and write how the run ended. A finished run needs no checkpoint."""
+    """Save the best and the last good policy, and record in ``run.json`` how the run ended.
+
+    The checkpoints of a finished run are deleted.
+
+    Args:
+        callback: the callback of the training, with its policies so far.
+        status: how the run ended.
+        reason: why it was interrupted or failed; None: no reason.
+
+    """
     run, training, course = callback.run, callback.learner.training, callback.course
     for policy, folder in ((course.kept, run.policy), (course.policy, run.last_policy)):
         if policy is not None:
@@ -249,7 +276,7 @@ def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
 
 
 def _check_unfinished(run: RunDirectory, training: Training) -> None:
-    """Raise ``InvalidInput`` if the training has finished; its evaluation by ``ethbrake run`` may be incomplete."""
+    """Raise ``InvalidInput`` if the training has finished, even if its evaluation by ``ethbrake run`` has not."""
     status = read_object(run.status)
     resumable = any(run.checkpoints.glob("step_*"))
     if status["status"] == "finished" or (status.get("stage") is not None and not resumable):
@@ -264,9 +291,10 @@ def _check_unfinished(run: RunDirectory, training: Training) -> None:
 def _newest_checkpoint(
     run: RunDirectory, training: Training, other_versions: bool
 ) -> tuple[TrainingState | None, list[str]]:
-    """The newest checkpoint that is whole, if there is one, and what is wrong with newer ones.
+    """Return the newest undamaged checkpoint (None if there is none), and what is wrong with newer ones.
 
-    Raises ``InvalidInput`` if it belongs to another training, or was written by other versions.
+    Raises ``InvalidInput`` if it belongs to another training, or, unless ``other_versions``, if other versions of the
+    packages wrote it.
     """
     remove_unfinished(run.path)
     if run.checkpoints.is_dir():
@@ -281,7 +309,7 @@ def _newest_checkpoint(
             " train again in another folder"
         )
     now, then = installed_versions(), state.numbers["versions"]
-    asked = then.keys() | (now.keys() - versions_used().keys())  # other parts may have been loaded here since
+    asked = then.keys() | (now.keys() - versions_used().keys())  # this process may have loaded more parts
     other = sorted(name for name in asked if now.get(name) != then.get(name))
     if other and not other_versions:
         name = other[0]

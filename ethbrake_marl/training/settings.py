@@ -1,31 +1,35 @@
-"""Settings ``key=value``: which are the scenario's and which the recipe's, and what belongs together."""
+"""Settings ``key=value``: which ones belong to the scenario, to the recipe or to the agents."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from ethbrake_marl.agents.registry import split_names
+from ethbrake_marl.agents.spec import split_names
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.overrides import Override
 from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.recipe import WORDS, TrainingRecipe
 
-_NO_SETTING = {"name", *WORDS}  # they tell about a file, and change nothing
+_NO_SETTING = {"name", *WORDS}  # descriptive fields, which cannot be set
 
 
 class Settings(NamedTuple):
-    """What is asked for."""
+    """Settings ``KEY=VALUE`` of a command, sorted by whether they belong to scenario, recipe or agents."""
 
-    texts: tuple[str, ...]  # as they were given
-    scenario: tuple[Override, ...]
-    recipe: tuple[Override, ...]
-    harm_count: HarmCount = "first"  # that agents minimise
-    measures: tuple[str, ...] = ()  # that an evaluation tells beside the usual ones
+    texts: tuple[str, ...]  # the settings as the user wrote them
+    scenario: tuple[Override, ...]  # keys of the scenario and their values
+    recipe: tuple[Override, ...]  # keys of the recipe and their values
+    harm_count: HarmCount = "first"  # harm that agents minimise: first impacts only, or all (``total``)
+    measures: tuple[str, ...] = ()  # names of additional measures of an evaluation
 
     def change(self, recipe: TrainingRecipe, tell: Callable[[str], None] | None = None) -> TrainingRecipe:
-        """The recipe with those of its settings that it has; ``tell`` hears what else may have to be changed."""
+        """Return the recipe with the values of ``self.recipe`` for those keys that its class has.
+
+        ``tell`` is called with a note for the user if only one of ``gamma`` and ``reward.shaping_discount``, which
+        should be equal, was set.
+        """
         own = [override for override in self.recipe if override.top in type(recipe).model_fields]
         if not own:
             return recipe
@@ -44,10 +48,17 @@ class Settings(NamedTuple):
 def read_settings(
     texts: Sequence[str] | None, recipes: Sequence[TrainingRecipe] = (), *, of_agents: Sequence[str] = ()
 ) -> Settings:
-    """Tell the settings apart: ``mass_t=40`` and ``scenario.mass_t=40`` are the scenario's, ``gamma=0.9`` a recipe's.
+    """Parse the settings of a command, and sort them by whether they belong to scenario, recipe or agents.
 
-    ``of_agents``: which of ``harm_count=total`` and ``measures=A,B`` may stand among them. Raises ``UnknownName`` with
-    a suggestion for a key that nobody has, ``InvalidInput`` for an unknown count.
+    ``mass_t=40`` and ``scenario.mass_t=40`` belong to the scenario, ``gamma=0.9`` to a recipe.
+
+    Args:
+        texts: settings ``KEY=VALUE`` as the user wrote them; None: none.
+        recipes: recipes of the command, whose keys may be set.
+        of_agents: which of ``harm_count`` and ``measures`` the command allows.
+
+    Raises ``UnknownName`` with a suggestion for an unknown key, ``InvalidInput`` for an unknown harm count.
+
     """
     known = {
         "scenario": {*Scenario.model_fields} - _NO_SETTING,

@@ -1,4 +1,4 @@
-"""A training before it begins: a recipe on a scenario, and what follows from the two."""
+"""``Training``: a recipe combined with a scenario, before the training begins."""
 
 from __future__ import annotations
 
@@ -24,22 +24,25 @@ from ethbrake_marl.training.team import TeamFile, bundle_of
 
 @dataclass(frozen=True, slots=True)
 class Training:
-    """A recipe on a scenario, with what follows from the two. Made by ``Training.of``."""
+    """What is to be trained: a recipe combined with a scenario, and everything that follows from the two.
 
-    recipe: TrainingRecipe
-    scenario: Scenario
-    scheme: Scheme
-    drivers: Mapping[str, str]  # learner, front to rear -> folder of its policy, inside the run's folder
-    observation: ObservationSpec  # of a row of the environment: everything that any learner observes
-    observations: Mapping[str, ObservationSpec]  # of each learner
+    Create it with ``Training.of``.
+    """
+
+    recipe: TrainingRecipe  # the recipe, with all changes
+    scenario: Scenario  # the scenario, whose roles determine the learners
+    scheme: Scheme  # how the learners train together: ``single``, ``shared``, ``independent`` or ``centralised``
+    drivers: Mapping[str, str]  # learner's name, front to rear -> folder of its policy, inside the run's folder
+    observation: ObservationSpec  # features of a row of the environment: everything that any learner observes
+    observations: Mapping[str, ObservationSpec]  # features that each learner observes, by name
 
     @classmethod
     def of(cls, recipe: TrainingRecipe | str | Path, scenario: Scenario | str | Path, **changes: Any) -> Training:
         """Combine a recipe and a scenario, each an object, a name or a path. ``changes`` override keys of the recipe.
 
-        Learners observe what the recipe lists, or else what the scenario lists. Raises ``InvalidInput`` where recipe
-        and scenario do not fit each other: nobody learns, the scheme needs other learners, or one policy would drive
-        learners that observe different features.
+        Learners observe the recipe's features, or else the scenario's. Raises ``InvalidInput`` if recipe and scenario
+        do not fit: no vehicle learns, the scheme needs another number of learners, or one policy would drive learners
+        that observe different features.
         """
         recipe = recipe if isinstance(recipe, TrainingRecipe) else load_recipe(recipe)
         scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
@@ -58,36 +61,42 @@ class Training:
 
     @property
     def columns(self) -> list[list[int]]:
-        """Columns of its row that each learner observes, front to rear."""
+        """For each learner, front to rear: the columns of an environment row that it observes."""
         place = {feature.name: column for column, feature in enumerate(self.observation.features)}
         return [[place[feature.name] for feature in spec.features] for spec in self.observations.values()]
 
     @property
     def begins(self) -> str | None:
-        """What the weights begin as, in words; None: random weights, and the algorithm knows nothing else."""
+        """Description of the initial weights; None if the algorithm always begins with random weights."""
         return self.recipe.begins(self.scenario)
 
     def content(self) -> dict[str, dict[str, Any]]:
-        """Everything that shapes the training, as plain data: with every default, without titles and descriptions."""
+        """Return everything that affects the training as plain data: ``{"recipe": {...}, "scenario": {...}}``.
+
+        Defaults are included; descriptive texts are not.
+        """
         recipe = self.recipe.model_dump(mode="json", exclude=set(WORDS))
         return {"recipe": recipe, "scenario": self.scenario.content(without=WORDS)}
 
     @property
     def identity(self) -> str:
-        """SHA-256 of ``content()``, in hexadecimal digits."""
+        """SHA-256 of ``content()``, in hexadecimal digits; equal for trainings that give the same policy."""
         return self.identity_of(self.content())
 
     @staticmethod
     def identity_of(content: Mapping[str, Any]) -> str:
-        """SHA-256 of plain data, in hexadecimal digits."""
+        """Return the SHA-256 of ``content`` (plain data, as ``content()`` returns it), in hexadecimal digits."""
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def config(self, settings: Sequence[str] = ()) -> dict[str, Any]:
-        """Content of ``config.json``. ``settings`` say how recipe and scenario differ from their files."""
+        """Return the content of ``config.json``: recipe, scenario, seeds and versions.
+
+        ``settings`` (``KEY=VALUE`` each) say how recipe and scenario differ from their files; they are recorded.
+        """
         recipe = self.recipe
         return {
             "recipe": recipe.model_dump(mode="json"),
-            "scenario": self.scenario.model_dump(mode="json", exclude_unset=True),  # as in its file: defaults may clash
+            "scenario": self.scenario.model_dump(mode="json", exclude_unset=True),  # defaults may conflict
             "seeds": {"training": recipe.seed, "evaluation": recipe.evaluation.seed},
             "versions": installed_versions(),
             **recipe.derived(),
@@ -95,12 +104,12 @@ class Training:
         }
 
     def team(self) -> dict[str, Any]:
-        """Content of ``team.json``."""
+        """Return the content of ``team.json``: scheme, number of vehicles, and the folder of each learner's policy."""
         file = TeamFile(scheme=self.scheme, vehicles=self.scenario.vehicles, drivers=dict(self.drivers))
         return file.model_dump(mode="json")
 
     def who_drives(self) -> str:
-        """Scheme and drivers in words: ``scheme shared: policy drives vehicle_2, vehicle_3``."""
+        """Return scheme and drivers in words: ``scheme shared: policy drives vehicle_2, vehicle_3``."""
         bundles: dict[str, list[str]] = {}
         for vehicle, bundle in self.drivers.items():
             bundles.setdefault(bundle, []).append(vehicle)
@@ -109,9 +118,10 @@ class Training:
 
 
 def recorded_training(run: RunDirectory, config: Mapping[str, Any]) -> Training:
-    """The training that the configuration of a run describes.
+    """Return the training that the configuration of a run describes, for example to resume it.
 
-    Raises ``InvalidInput`` naming what is wrong with it, and for a training of another library.
+    ``config`` is the content of the run's ``config.json``; ``run`` is named in errors. Raises ``InvalidInput`` for an
+    invalid configuration, and for a training by another library.
     """
     if "library" in config:
         raise InvalidInput(

@@ -16,8 +16,8 @@ from ethbrake_marl.agents.e_v2x_bm.contacts import closing_speed_squared, least_
 from ethbrake_marl.agents.e_v2x_bm.coupled import CoupledOptimum, optimise_coupled
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
 from ethbrake_marl.agents.e_v2x_bm.samples import Samples
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.forecast import forecast
 from ethbrake_marl.physics.jit import compiled

@@ -5,12 +5,9 @@ import shutil
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import parse_spec, split_names, split_specs
+from ethbrake_marl.agents.spec import parse_spec, split_names, split_specs
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.extensions.cooperation.levels import plan_ablation
-from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
 from ethbrake_marl.policies.shipped import shipped_policies
-from ethbrake_marl.training.recipe import TrainingRecipe
 
 NAMES = (
     "lr=0.001,seed=1",
@@ -39,9 +36,12 @@ def put(name):
 @pytest.mark.parametrize("folder", ["", "runs/", "./", "runs/2+3,4/"])
 @pytest.mark.parametrize("name", NAMES)
 def test_policy__in_a_folder_of_any_name_is_that_folder_wherever_agents_are_named(name, folder):
-    path = folder + name
+    check_folder(folder + name, ("", "+step"))
+
+
+def check_folder(path, ways):
     put(path)
-    for around in ("", "+step", "+search+step"):
+    for around in ways:
         spec = parse_spec(f"ppo@{path}{around}")
         assert (spec.name, spec.policy, "".join(f"+{each}" for each in spec.around)) == ("ppo", path, around)
         assert split_specs(f"full_brake,ppo@{path}{around},coast") == ["full_brake", f"ppo@{path}{around}", "coast"]
@@ -103,17 +103,3 @@ def test_scenario__cannot_name_a_python_file_however_it_is_called(name, tmp_path
         eb.load_scenario("paper-random").replace(
             roles={"vehicle_1": f"{name}:make", "vehicle_2": "learner", "vehicle_3": "full_brake"}
         )
-
-
-def test_recipes_and_levels__may_lie_in_folders_of_any_name(tmp_path):
-    folder = tmp_path / "lr=1,b:2"
-    folder.mkdir()
-    shutil.copy(TrainingRecipe.shipped()["quick"], folder)
-    for level in ("cooperation-1-front", "cooperation-2-paper"):
-        shutil.copy(next(each.path for each in eb.list_scenarios() if each.name == level), folder)
-    curves = LearningCurves.parse("lr=1,b:2/quick.yaml:3,ppo:2")
-    assert [(recipe.name, seeds) for recipe, seeds in curves] == [("quick", 3), ("ppo", 2)]
-    levels = "lr=1,b:2/cooperation-1-front.yaml,lr=1,b:2/cooperation-2-paper.yaml"
-    plan = plan_ablation(levels, "lr=1,b:2/quick.yaml,ppo", None, list_seed=7, folder=tmp_path / "out")
-    assert [level.name for level in plan.levels] == ["cooperation-1-front", "cooperation-2-paper"]
-    assert [recipe.name for recipe in plan.recipes] == ["quick", "ppo"]

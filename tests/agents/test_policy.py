@@ -1,4 +1,4 @@
-"""Policies of bundles and of other libraries drive as agents: alone, searched around and behind every shield."""
+"""Policies of bundles and of other libraries drive as agents: alone and behind every shield."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from tests.fixtures.asked import Asked
 
 SCENARIO = eb.load_scenario("paper-random")
 WORLDS = SCENARIO.sample(12, 7).worlds
-AROUND = ("+search", "+episode", "+episode:pairwise", "+step", "+search+step")
+AROUND = ("+episode", "+episode:pairwise", "+step")
 
 
 def harms(agent, worlds=WORLDS):
@@ -38,6 +38,10 @@ def brake(observation):
 
 @pytest.fixture(scope="module")
 def model():
+    return train_ppo()
+
+
+def train_ppo():
     rows = eb.make_sb3_vec_env("paper-random", 4)
     return stable.PPO("MlpPolicy", rows, n_steps=8, batch_size=16, n_epochs=1, seed=1).learn(64)
 
@@ -117,6 +121,10 @@ def test_memory__belongs_to_each_episode_and_goes_with_its_world(make):
 @pytest.mark.parametrize("around", AROUND)
 @pytest.mark.parametrize("kind", ["model", "function with a memory"])
 def test_policy__behind_every_shield_keeps_the_bound(kind, model, around):
+    check_bound(kind, model, around)
+
+
+def check_bound(kind, model, around):
     own = eb.policy_agent(model, name="sb3") if kind == "model" else eb.policy_agent(ramp, initial_state=no_memory)
     found = eb.evaluate(WORLDS, {"mine": shielded(own, around)}, scenario=SCENARIO).outcome("mine")
     harm = found.first_impact_harm
@@ -160,7 +168,7 @@ def test_model_trained_on_rows_with_something_appended__drives_as_there(appended
     model = stable.PPO("MlpPolicy", rows, n_steps=8, batch_size=16, n_epochs=1, seed=1)
     told = {"scenario": scenario, "appended": appended}  # a model that has its environment needs none of it
     agents = {1: eb.policy_agent(model.policy, **told), 2: eb.policy_agent(model)}
-    assert agents[1].knows == (eb.agents.registry.Source.STATE if appended == "state" else "messages")
+    assert agents[1].knows == (eb.agents.protocol.Source.STATE if appended == "state" else "messages")
     team = drive(scenario.sample(4, 3, channel="training").worlds, eb.Team(agents, "theirs"), scenario)
     rows.seed(3)  # the model has set its own
     seen, over, harm = rows.reset(), np.zeros(4, bool), np.full(4, np.nan)
@@ -191,6 +199,10 @@ def harder(argument, settings):
 
 @pytest.mark.parametrize("around", ["", *AROUND])
 def test_file__makes_an_agent_alone_and_behind_every_shield(tmp_path: Path, around):
+    check_file(tmp_path, around)
+
+
+def check_file(tmp_path, around):
     file = tmp_path / "My+File.py"
     file.write_text(FILE)
     agent = eb.make_agent(f"{file}:harder:0.5{around}", scenario=SCENARIO)

@@ -1,30 +1,19 @@
-"""``ethbrake doctor``: what it finds wrong, what it compiles; and measures of speed. No speed is asserted."""
+"""``ethbrake doctor``: what it finds wrong, what it compiles."""
 
 import dataclasses
-import math
 import re
-import time
-from typing import Any
 from unittest.mock import Mock
 
-import numba
-import numpy as np
 import pytest
 from packaging.requirements import Requirement
 
 from ethbrake_marl.agents.e_v2x_bm import pairwise
 from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.doctor import Check, diagnose
-from ethbrake_marl.envs.making import make_engine
-from ethbrake_marl.extensions.studies.machine import this_machine
 from ethbrake_marl.kernel_store import cache_folder
 from ethbrake_marl.physics import advance as advance_module
-from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.scenario import catalogue
-from tests.cli.conftest import Command, told_json
-from tests.docs.site import load
-
-benchmark = load("../studies/speed")
+from tests.fixtures.commands import Command, told_json
 
 
 def found(name: str) -> tuple[bool, str]:
@@ -113,58 +102,7 @@ def test_compile__leaves_nothing_to_compile(ethbrake: Command) -> None:
     commands = [
         ("evaluate", "--agents", "full_brake,e_v2x_bm,ppo@shipped,ppo@shipped+episode", "--episodes", "3"),
         ("shield", "--agents", "full_brake", "--episodes", "3"),
-        ("evaluate", "--agents", "planner,full_brake+step", "--episodes", "3"),
+        ("evaluate", "--agents", "full_brake+step", "--episodes", "3"),
     ]
     assert [ethbrake(*command).status for command in commands] == [0, 0, 0]
     assert set(cache_folder().iterdir()) == kernels
-
-
-# ---------------------------------------------------------------- speed, of docs/studies
-
-
-SHORT = benchmark.Effort(1, 1e-6)
-
-
-def test_rates__are_work_per_processor_second_without_the_first_round(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock, durations = [0.0], iter([9.0, 0.25, 0.25, 1.0])  # the first round, two calls, one call
-
-    def work() -> int:
-        clock[0] += next(durations)
-        return 10
-
-    monkeypatch.setattr(time, "process_time", lambda: clock[0])
-    assert benchmark.rates(work, benchmark.Effort(2, 0.5)).tolist() == [10.0, 40.0]
-
-
-def test_measure__sets_world_steps_against_the_first_figure(monkeypatch: pytest.MonkeyPatch) -> None:
-    def figure(unit: str, *values: float) -> Any:
-        return benchmark.Benchmark("x", "y", unit, 5, None, lambda effort: np.array(values))
-
-    figures = (figure("world-steps/s", 7.0, 8.0, 9.0), figure("s", 4.0), figure("world-steps/s", 1.0, 2.0, 2.0))
-    monkeypatch.setattr(benchmark, "BENCHMARKS", figures)
-    found = benchmark.measure()
-    assert [speed.relative for speed in found] == [1.0, None, 0.25]
-    assert [(speed.lowest, speed.value, speed.highest) for speed in found] == [(7, 8, 9), (4, 4, 4), (1, 2, 2)]
-
-
-def test_braking__counts_world_steps_to_rest() -> None:
-    worlds = make_engine(benchmark.SCENARIO, 5, seed=benchmark.SEED).worlds
-    command = -worlds.vehicles.braking_capacity_mps2
-    steps = 0
-    while worlds.speeds_mps.any():
-        worlds, steps = advance(worlds, command, 0.1)[0], steps + 1
-    assert benchmark.braking(5, 1.0)() == 5 * steps and steps > 20
-
-
-@pytest.mark.parametrize(
-    "each", [pytest.param(each, marks=pytest.mark.slow if each.unit == "s" else ()) for each in benchmark.BENCHMARKS]
-)
-def test_benchmarks__each_measures_something(each: Any) -> None:
-    speed = each.measure(SHORT)
-    assert each.workload and each.worlds >= 1 and 0.0 < speed.lowest == speed.value == speed.highest < math.inf
-
-
-def test_machine__is_named_in_words() -> None:
-    machine = this_machine()
-    parts = (machine.processor, f"{machine.cores_usable} of {machine.cores} cores", f"numba {numba.__version__}")
-    assert machine.processor and all(part in str(machine) for part in parts)

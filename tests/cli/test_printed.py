@@ -2,23 +2,21 @@
 
 Below a command line stands what it writes to stdout, then what it writes to stderr behind ``! ``, then its exit status
 where that is not 0; how far it is (``500 of 2,000``) is left out. ``$ cat FILE`` shows a file, ``$ sed -i`` changes
-one, ``$ rm`` removes one. ``HERE`` and ``ROOT`` stand for folders. ``python -m tests.cli.test_printed`` writes what is
-printed today: read the difference.
+one, ``$ rm`` removes one. ``HERE`` and ``ROOT`` stand for folders. With ``ETHBRAKE_SNAPSHOTS=write`` the test writes
+what is printed today: read the difference. What extensions add is hidden here; tests/extensions/printed shows it.
 """
 
 import contextlib
 import io
-import os
 import re
 import shlex
 import subprocess
-import sys
-import tempfile
 from pathlib import Path
 
 import pytest
 
 from ethbrake_marl.cli.app import run_command
+from tests.fixtures.snapshots import check_snapshot
 
 ROOT = Path(__file__).resolve().parents[2]
 STORIES = sorted((Path(__file__).parent / "printed").glob("*.txt"))
@@ -44,20 +42,11 @@ def told_again(story: Path) -> str:
 
 
 @pytest.mark.parametrize("story", STORIES, ids=lambda story: story.stem)
-def test_commands__print_what_is_listed(story: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.usefixtures("core_alone", "empty_folder")
+def test_commands__print_what_is_listed(story: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    check_story(story, monkeypatch)
+
+
+def check_story(story: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "120")
-    assert told_again(story) == story.read_text("utf-8")
-
-
-def write_stories() -> None:
-    """What is printed today, into the lists."""
-    os.environ["COLUMNS"] = "120"
-    for story in STORIES:
-        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-            text = told_again(story)
-        story.write_text(text, "utf-8")
-
-
-if __name__ == "__main__":
-    sys.exit(write_stories())
+    check_snapshot(story, told_again(story))

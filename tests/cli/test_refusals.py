@@ -1,29 +1,11 @@
 """What command lines refuse: one line on stderr, nothing on stdout, exit status 2, and no file touched."""
 
-import shlex
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from ethbrake_marl.scenario.catalogue import new_scenario_text
-from tests.cli.conftest import Command, check_refused
-from tests.cli.test_printed import STORIES
-
-Refuse = Callable[..., None]
-
-
-@pytest.fixture
-def refuse(ethbrake: Command, empty_folder: Path) -> Refuse:
-    """Runs a command line in an empty folder, and checks how it is refused."""
-
-    def run(line: str, *fragments: str) -> None:
-        before = {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()}
-        check_refused(ethbrake(*shlex.split(line)), *fragments)
-        assert {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()} == before
-
-    return run
-
+from tests.fixtures.commands import Refuse
 
 USAGE = [
     ("", "Missing command. (see: ethbrake --help)"),
@@ -45,7 +27,6 @@ USAGE = [
         "evaluate --per-world txt --output new",
         "Invalid value for '--per-world': 'txt' is not one of 'csv', 'parquet'. (see",
     ),
-    ("study falsify --agent coast --budget 0", "Invalid value for '--budget': must be greater than or equal to 1 (see"),
 ]
 
 
@@ -101,7 +82,6 @@ EVALUATIONS = [
         "evaluate --scenario cooperation-3-pair --agents ppo@shipped+episode",
         "shipped policy ppo for scenario 'cooperation-3-pair': there is none; shipped are",
     ),
-    ("evaluate --agents ppo@shipped+robust", "agent 'ppo@shipped+robust': mode robust needs an uncertainty"),
     ("evaluate --output /proc/out", "/proc/out: cannot be written to (No such file or directory)"),
     ("evaluate --per-world csv", "--per-world: needs a folder for it: --output FOLDER"),
     ("evaluate --report", "--report: needs a folder for it: --output FOLDER"),
@@ -133,102 +113,11 @@ TRAININGS = [
         "shield --agents ppo@shipped+episode",
         "agent 'ppo@shipped+episode': has a shield already; this command puts its own around each agent",
     ),
-    ("watch --agents nobody --output x.txt", "a film that ends in '.txt': films are written as .gif, .mp4, .svg"),
 ]
 
 
 @pytest.mark.parametrize(("line", "message"), TRAININGS, ids=lambda value: value[:60])
 def test_run_training_export_shield_or_film__is_refused(line: str, message: str, refuse: Refuse) -> None:
-    refuse(line, message)
-
-
-STUDIES = [
-    (
-        "study falsify --agent coast --budget 10 --output worst.txt",
-        "worst.txt: a file of worlds must end in .yaml or .yml",
-    ),
-    (
-        "study falsify --agent coast --budget 10 --measure bound",
-        "agent 'coast': tells no bound; --measure bound is for an agent behind a shield",
-    ),
-    (
-        "study falsify --agent coast --budget 10 --measure difference",
-        "--measure difference: compares two agents; say which is the other one, --against AGENT",
-    ),
-    (
-        "study falsify --agent coast --against coast --budget 10",
-        "agent 'coast' is given twice; each agent drives every world once",
-    ),
-    (
-        "study falsify --agent full_brake --measure harm --against coast --budget 10",
-        "--against coast: --measure harm compares with nobody; use regret or difference",
-    ),
-    ("study falsify --agent coast --budget 10 --measure hram", "unknown measure 'hram'; did you mean 'harm'?"),
-    (
-        "study falsify --agent ppo@nowhere --budget 10",
-        "nowhere: is not a folder; give a policy bundle (manifest.json, weights.safetensors) or a run",
-    ),
-    (
-        "study falsify --agent coast --budget 10 --scenario mixture-delays",
-        "scenario 'mixture-delays': is a mixture; take one of its scenarios: paper-delay-low",
-    ),
-    (
-        "study falsify --agent coast --budget 10 --scenario cooperation-2-blocked",
-        "scenario 'cooperation-2-blocked': v2x: draws delays and losses, which no table of worlds holds",
-    ),
-    (
-        "study falsify --agent coast --budget 10 --scenario paper-scenario-1",
-        "scenario 'paper-scenario-1': draws nothing: all its worlds are the same",
-    ),
-    (
-        "study falsify --agent ladder --measure harm --budget 8",
-        "agent ladder: stands for several agents; one is needed here",
-    ),
-    ("reproduce harm-delay", "unknown item 'harm-delay'; did you mean 'harm-delays'?"),
-    ("reproduce gaps gaps", "item 'gaps' is given twice"),
-    ("reproduce --quick --full", "--quick and --full: give one of the two"),
-    (
-        "reproduce gaps --episodes 1",
-        "Invalid value for '--episodes': must be greater than or equal to 2 (see: ethbrake reproduce --help)",
-    ),
-    ("reproduce gaps --docs nowhere/page.md", "nowhere/page.md: there is no folder nowhere; make it first"),
-    ("reproduce gaps --docs page.html", "page.html: must end in .md"),
-    (
-        "study ablate --output new --levels cooperation-3-par,cooperation-2-paper",
-        "unknown scenario 'cooperation-3-par'; did you mean 'cooperation-3-pair'?",
-    ),
-    (
-        "study ablate --output new --levels cooperation-3-pair,cooperation-3-pair",
-        "levels: 'cooperation-3-pair' is given twice",
-    ),
-    ("study ablate --output new --levels cooperation-3-pair", "levels: 1 given; at least two are needed to compare"),
-    (
-        "study ablate --output new --levels cooperation-0-sensors,paper-distance",
-        "level 'paper-distance': its speeds_mps differs from that of 'cooperation-0-sensors' (20, 18, 20",
-    ),
-    (
-        "study ablate --output new --levels cooperation-3-pair,cooperation-3-five",
-        "level 'cooperation-3-five': its vehicles differs from that of 'cooperation-3-pair' (5; there 3)",
-    ),
-    (
-        "study ablate --output new --episodes 10 --search-episodes 11",
-        "search-episodes 11: must be at most the 10 worlds of --episodes",
-    ),
-    (
-        "study ablate --output new --set scheme=shard",
-        "recipe 'cooperation': scheme = shard: must be single, shared, independent or centralised",
-    ),
-    (
-        "study ablate --output new --shield robust",
-        "shield 'robust': must be step; episode and robust shield one vehicle",
-    ),
-    ("study ablate --output new --recipes ppo,ppo", "recipes ppo, ppo: give at least one, each with a name of its own"),
-    ("study sweep nowhere.yaml --output new", "nowhere.yaml: no such file"),
-]
-
-
-@pytest.mark.parametrize(("line", "message"), STUDIES, ids=lambda value: value[:60])
-def test_study_or_reproduction__is_refused(line: str, message: str, refuse: Refuse) -> None:
     refuse(line, message)
 
 
@@ -251,16 +140,6 @@ def write_scenario(old: str, new: str) -> None:
         ("vehicle_3: full_brake\n", "vehicle_3: ful_brake\n", "unknown agent 'ful_brake'; did you mean 'full_brake'?"),
         ("\nname: mine", "\nname: mine\nname: mine", "line 14, column 1: key 'name' is given twice, first on line 13"),
         ("vehicle_3: full_brake\n", "vehicle_3: coast:4\n", "agent 'coast:4': coast takes no argument"),
-        (
-            "vehicle_1: full_brake\n",
-            "vehicle_1: planner:0\n",
-            "the argument must be a number of candidates per decision",
-        ),
-        (
-            "vehicle_3: full_brake\n",
-            "vehicle_3: best_harm:1000001\n",
-            "must be a number of candidates, for instance 20000",
-        ),
     ],
 )
 def test_validate__names_the_line_of_the_mistake(old: str, new: str, message: str, refuse: Refuse) -> None:
@@ -270,8 +149,8 @@ def test_validate__names_the_line_of_the_mistake(old: str, new: str, message: st
 
 @pytest.mark.parametrize("command", ["run --output new", "train --output new", "evaluate"])
 def test_role_that_cannot_drive__is_refused_before_anything_is_written(command: str, refuse: Refuse) -> None:
-    write_scenario("vehicle_1: full_brake\n", "vehicle_1: planner:0\n")
-    refuse(f"{command} --scenario mine.yaml", "mine.yaml, line 80: roles.vehicle_1 = planner:0: agent 'planner:0'")
+    write_scenario("vehicle_1: full_brake\n", "vehicle_1: coast:4\n")
+    refuse(f"{command} --scenario mine.yaml", "mine.yaml, line 80: roles.vehicle_1 = coast:4: agent 'coast:4'")
 
 
 def test_run__drives_one_vehicle(refuse: Refuse) -> None:
@@ -286,8 +165,6 @@ def test_run__drives_one_vehicle(refuse: Refuse) -> None:
         ("worlds.csv", "scenario sample paper-random --output worlds.csv"),
         ("out/worlds.csv", "evaluate --episodes 10000000 --output out"),
         ("policy.onnx", "agent export shipped/ppo --onnx policy.onnx"),
-        ("film.gif", "watch --agents full_brake --output film.gif"),
-        ("worst.yaml", "study falsify --agent coast --budget 100000 --output worst.yaml"),
     ],
 )
 def test_file_that_is_there__is_not_replaced_unasked(file: str, line: str, refuse: Refuse) -> None:
@@ -301,7 +178,6 @@ def test_file_that_is_there__is_not_replaced_unasked(file: str, line: str, refus
     [
         ("evaluate --output file/x", "is no folder; give a folder of its own (--output)"),
         ("run --output file/x", "file: Not a directory"),
-        ("study ablate --output file/new", "is no folder; give a folder of its own (--output)"),
         ("train --output . --force", ".: is there already, and is no run; give another name"),
     ],
 )
@@ -315,67 +191,14 @@ def test_path_of_a_policy__that_is_too_long_is_refused(refuse: Refuse) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        (
-            "scenario: paper-random",
-            "scenario: paper-distance",
-            "its worlds were found in scenario 'paper-distance', which",
-        ),
-        ("harm_count: first", "harm_count: second", "worst.yaml, line 8: harm_count = second: must be first or total"),
-        ("    score: 120", "    skore: 120", "worst.yaml, line 12: worlds[0].skore: unknown key; did you mean score?"),
-        ("name: regret-2", "name: regret-1", "worst.yaml: world 'regret-1' is given twice; names must differ"),
-        ("{gap_1_m: 9.9251", "{gap_3_m: 9.9251", "worlds[1].state has other columns than worlds[0]; all need the same"),
-        ("version: 1", "version: 2", "worst.yaml, line 2: version = 2: must be less than or equal to 1"),
-    ],
-)
-def test_worlds_that_were_found__are_refused_where_the_file_was_changed(
-    old: str, new: str, message: str, refuse: Refuse
-) -> None:
-    (story,) = (file.read_text("utf-8") for file in STORIES if file.stem == "searches")
-    text = story.partition("$ cat worst.yaml\n")[2].partition("\n\n$ ")[0]
-    assert text.count(old) == 1
-    Path("worst.yaml").write_text(text.replace(old, new) + "\n")
-    refuse("study falsify --again worst.yaml", message)
-
-
-SWEEP = "grid: {scenario: paper-random, recipe: %s}"
-TUNING = "scenario: paper-random\nrecipe: ppo\nsearch: {%s: {low: 1, high: 4}}\n"
-
-
-@pytest.mark.parametrize(
-    ("plan", "line", "message"),
-    [
-        (
-            SWEEP % "pppo",
-            "sweep",
-            "plan.yaml, line 1: grid (paper-random, pppo, seed 0): unknown recipe 'pppo'; did you mean",
-        ),
-        (SWEEP % "ppo", "sweep --jobs 0", "Invalid value for '--jobs': must be greater than or equal to 1"),
-        (SWEEP % "ppo", "sweep --retries -1", "Invalid value for '--retries': must be greater than or equal to 0"),
-        (TUNING % "n_epoch", "tune", "plan.yaml, line 3: unknown setting 'n_epoch'; did you mean 'n_epochs'?"),
-        (TUNING % "n_epochs", "tune --trials 0", "Invalid value for '--trials': must be greater than or equal to 1"),
-        (TUNING % "n_epochs", "tune --export best.txt", "export best.txt: must end in .yaml, as recipes do"),
-        (TUNING % "n_epochs", "tune --export 'Best One.yaml'", "recipe name 'Best One': must be 1 to 64 lower case"),
-        (TUNING % "n_epochs", "tune --export plan.yaml", "plan.yaml: is there already; give another name or use force"),
-    ],
-    ids=lambda value: value[:30],
-)
-def test_plan_of_a_study__is_refused(plan: str, line: str, message: str, refuse: Refuse) -> None:
-    Path("plan.yaml").write_text(plan)
-    command, *options = line.split(" ", 1)
-    refuse(" ".join(["study", command, "plan.yaml", "--output", "new", *options]), message)
-
-
-@pytest.mark.parametrize(
     ("code", "line", "message"),
     [
         ("x = 1\nraise KeyError('secret')\n", "--agents bad.py:make", "file 'bad.py', line 2: KeyError: 'secret'"),
         ("import sys\n\nsys.exit(3)\n", "--set measures=bad.py:worst", "file 'bad.py', line 3: SystemExit: 3"),
         (
-            "import ethbrake_marl as eb\neb.register_agent('planner', print)\n",
+            "import ethbrake_marl as eb\neb.register_agent('coast', print)\n",
             "--agents bad.py:make",
-            "file 'bad.py', line 2: agent 'planner' is registered already; give another name",
+            "file 'bad.py', line 2: agent 'coast' is registered already; give another name",
         ),
         (
             "import ethbrake_marl as eb\neb.make_agent('bad.py:make')\n",

@@ -5,40 +5,22 @@ import json
 import re
 import runpy
 from pathlib import Path
-from textwrap import indent
-from unittest.mock import Mock
 
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.cli import scenario as module
 from ethbrake_marl.evaluation.trial import load_runnable
-from ethbrake_marl.extensions.search import best_harm, planner
-from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.files.yaml import flow_text, parse_yaml
-from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
+from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario, shipped_folder
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.tables import read_worlds
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
-from tests.cli.conftest import Answer, Command, check_refused, rows_of, told_json
+from tests.fixtures.commands import Answer, Command, check_refused, rows_of, told_json
 
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIAL = (ROOT / "docs" / "tutorials" / "first-ten-minutes.md").read_text("utf-8")
 ADD, OWN_DATA = ((ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in ("add-a-scenario", "own-vehicle-data"))
-
-
-@pytest.mark.parametrize("script", ["planner", "planner:1000000", "best_harm", "best_harm:1000000"])
-def test_validate__trying_a_search_has_a_budget(ethbrake: Command, scenario_file, monkeypatch, script: str) -> None:
-    searched = Mock(side_effect=search_profiles)
-    for searching in (planner, best_harm):
-        monkeypatch.setattr(searching, "search_profiles", searched)
-    monkeypatch.setattr(module, "TRIED_WORLDS", 5)
-    path = scenario_file("\n  vehicle_3: full_brake\n", f"\n  vehicle_3: {script}\n")
-    path.write_text(path.read_text().replace("early_impacts: reject", "early_impacts: keep"))
-    assert ethbrake("scenario", "validate", path).out.startswith("OK  mine: 3 vehicles, learners: vehicle_2;")
-    budgets = [call.kwargs["budget"] for call in searched.call_args_list]
-    assert budgets and max(budgets) <= 16
 
 
 SCRIPTS = """
@@ -62,6 +44,7 @@ for name in ("own_calm", "own_fixed", "own_greedy", "own_fails"):
 """
 
 
+@pytest.mark.usefixtures("core_alone")
 def test_validate__drives_scripts_and_tells_what_refuses_them(ethbrake: Command, scenario_file, tmp_path) -> None:
     (tmp_path / "scripts.py").write_text(SCRIPTS)
     runpy.run_path(str(tmp_path / "scripts.py"))
@@ -73,9 +56,9 @@ def test_validate__drives_scripts_and_tells_what_refuses_them(ethbrake: Command,
 
     calm = told_json(tried("own_calm", "--json"))
     assert calm["not_state_free"] == {"vehicle_3": "own_calm"} and not calm["commands_out_of_range"]
-    assert {"e_v2x_bm", "best_harm", "+step"} < calm["refused_by"].keys()
+    assert {"e_v2x_bm", "+step"} < calm["refused_by"].keys()
     assert "command is not fixed at the alert" in calm["refused_by"]["+step"]
-    assert told_json(tried("own_fixed", "--json"))["refused_by"].keys() == {"+robust:interior", "early_impacts: reject"}
+    assert told_json(tried("own_fixed", "--json"))["refused_by"].keys() == {"early_impacts: reject"}
     greedy = tried("own_greedy")
     (many,) = re.findall(r"vehicle_3 asks for more than it can in (\d+) of 200 worlds", greedy.out)
     fast = load_scenario("paper-random").sample(200, 7).worlds.speeds_mps[:, 0]
@@ -109,14 +92,6 @@ def test_explain__tells_every_quantity_that_is_declared(ethbrake: Command) -> No
     )
 
 
-@pytest.mark.parametrize("name", ["realistic-mixed", "paper-scenario-1"])
-def test_sample__draws_a_picture(ethbrake: Command, tmp_path: Path, name: str) -> None:
-    for picture in (tmp_path / "a.png", tmp_path / "b.png"):
-        told = ethbrake("scenario", "sample", name, "--episodes", "40", "--output", picture)
-        assert (told.status, told.out, told.err) == (0, "", f"picture: {picture}\n")
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-
-
 def test_show_and_new__are_the_files_and_force_replaces_one(ethbrake: Command, tmp_path: Path) -> None:
     shipped = {entry["name"]: entry["path"] for entry in told_json(ethbrake("scenario", "list", "--json"))}
     assert ethbrake("scenario", "show", "stress/wide").out == Path(shipped["stress-wide"]).read_text()
@@ -137,11 +112,17 @@ def test_sample__draws_the_worlds_that_evaluate_draws(ethbrake: Command, tmp_pat
     assert all(one[name] == other[name] for name in ("first_impact_harm", "worlds_sha256"))
 
 
-@pytest.mark.parametrize("based_on", sorted(TrainingRecipe.shipped()))
-def test_new_recipe__has_every_key_with_a_comment_and_the_same_values(based_on: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "name", [name for name, file in TrainingRecipe.shipped().items() if file.parent == shipped_folder("train")]
+)
+def test_new_recipe__has_every_key_with_a_comment_and_the_same_values(name: str, tmp_path: Path) -> None:
+    check_new_recipe(name, tmp_path / "mine.yaml")
+
+
+def check_new_recipe(based_on: str, file: Path) -> None:
     text = load_recipe(based_on).new_text("mine")
-    (tmp_path / "mine.yaml").write_text(text)
-    made, base = load_recipe(tmp_path / "mine.yaml"), load_recipe(based_on)
+    file.write_text(text)
+    made, base = load_recipe(file), load_recipe(based_on)
     words = {"name", "title", "description", "source"}
     assert made.model_dump(exclude=words) == base.model_dump(exclude=words)
     lines = text.splitlines()
@@ -179,36 +160,6 @@ def test_tutorial__its_program_prints_what_stands_below_it(capsys) -> None:
     exec(found[1], {})
     now = [float(word) for word in capsys.readouterr().out.split()]
     assert now == pytest.approx([float(word) for word in found[2].split()], rel=1e-9)
-
-
-def test_tutorial__its_changed_scenario_is_valid_and_evaluates_to_the_printed_table(
-    ethbrake: Command, tmp_path: Path, monkeypatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert ethbrake("scenario", "new", "rainy").status == 0
-    change_lines("rainy.yaml", TUTORIAL)
-    assert ethbrake("scenario", "validate", "rainy.yaml").out.strip() in TUTORIAL
-    command = "evaluate --scenario rainy.yaml --agents full_brake,e_v2x_bm --episodes 2000"
-    printed = TUTORIAL.partition(f"$ ethbrake {command}\n")[2].partition("\n...")[0].splitlines()
-    told = ethbrake(*command.split()).out.splitlines()
-    assert len(printed) == 7 and [line.rstrip() for line in told[:7]] == printed
-
-
-def test_how_to_add__its_commands_lead_from_a_copy_to_the_figures_that_it_tells(
-    ethbrake: Command, tmp_path: Path, monkeypatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    told = {}
-    for command in re.findall(r"^\$ ethbrake (.*)$", ADD, re.MULTILINE):
-        told[command.split()[1]] = (done := ethbrake(*command.split())).out
-        assert done.status == 0, command
-        if command.startswith("scenario new"):
-            change_lines("rainy.yaml", ADD)
-    assert indent(told["validate"], "    ") in ADD
-    assert Path("worlds.csv").read_text().splitlines()[0].split(",")[:2] == ["gap_1_m", "gap_2_m"]
-    told_of = r"collides in ([\d.]+ %) of them and does ([\d.]+) .*?collides in ([\d.]+ %) and does ([\d.]+\d)"
-    figures = re.search(told_of, ADD.replace("\n", " "))
-    assert [each for each in figures.groups() if each not in told["--scenario"]] == []
 
 
 def change_lines(path: str, page: str) -> None:

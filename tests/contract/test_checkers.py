@@ -16,9 +16,9 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import ethbrake_marl as eb
 from ethbrake_marl.envs.gymnasium import EthBrakeEnv
-from ethbrake_marl.envs.motion import Viewer
 from ethbrake_marl.envs.pettingzoo import env, parallel_env
 from ethbrake_marl.envs.rendering import HEIGHT, WIDTH
+from ethbrake_marl.envs.viewer import Viewer
 from tests.contract.interfaces import FIVE, LEVELS, PAPER, REST, SCENARIOS, line
 
 pytestmark = pytest.mark.filterwarnings(
@@ -92,3 +92,10 @@ def test_stable_baselines3__makes_it_by_its_id() -> None:
     assert make_vec_env("EthBrake-v0", n_envs=2).reset().shape[0] == 2
     model = PPO("MlpPolicy", "EthBrake-v0", n_steps=16, batch_size=16, n_epochs=1, device="cpu").learn(16)
     assert model.get_env().render(mode="rgb_array").shape == (HEIGHT, WIDTH, 3)
+
+
+def test_old_gymnasium_spec__is_made():
+    spec = gymnasium.make("EthBrake-v0", scenario="paper-random").spec
+    old = spec.to_json().replace("ethbrake_marl.envs.gymnasium:", "ethbrake_marl.envs:")
+    assert old != spec.to_json()
+    assert gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(old)).reset(seed=1)[0].shape

@@ -15,7 +15,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.report.paper_rows import PAPER_NOTE, PAPER_ROWS
 from ethbrake_marl.extensions.report.style import picture_bytes

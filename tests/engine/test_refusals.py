@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.making import make_engine
 from ethbrake_marl.envs.pettingzoo import parallel_env

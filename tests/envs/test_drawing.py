@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.motion import Trace
 from ethbrake_marl.envs.rendering import BODY_M, HEIGHT, WIDTH, View, follow
+from ethbrake_marl.envs.trace import Trace
 from ethbrake_marl.errors import InvalidInput
 from tests.contract.interfaces import CRASH, REST
 

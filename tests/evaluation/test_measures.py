@@ -1,11 +1,10 @@
-"""Summaries, tables and files of an evaluation, and regret: the distance from the best known and the proven harm."""
+"""Summaries, tables and files of an evaluation."""
 
 import csv
 import io
 import json
 import math
 import sys
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,35 +15,22 @@ import pytest
 from rich.console import Console
 
 import ethbrake_marl as eb
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.exploits import Exploits
 from ethbrake_marl.evaluation.lineup import make_lineup
-from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.own_measures import load_measures
 from ethbrake_marl.evaluation.per_world import read_harms, write_per_world
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
-from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS, is_papers_test, summarise_beside_paper
-from ethbrake_marl.extensions.report.report import Report
-from ethbrake_marl.extensions.search import limits
-from ethbrake_marl.extensions.search.limits import IncompleteTable, Unproven, known_limits, unproven_because
-from ethbrake_marl.extensions.search.regret import KNOWN_OF_WORLDS, Between, limits_of, regrets_of
-from ethbrake_marl.extensions.search.shipped import shipped_tables
-from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.game.harm import HARM_COUNTS, Ledger, injury_probability
+from ethbrake_marl.game.harm import HARM_COUNTS, injury_probability
 from ethbrake_marl.game.objectives import STANDARD, declared_objectives, parse_objective, scored
-from ethbrake_marl.physics.left_out import Impacts
-from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
+from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.tables import worlds_from_table
-from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.training.experiment import results_csv
 from tests.contract.interfaces import CRASH
-from tests.docs.site import load
 
-SILENT = pytest.mark.filterwarnings("ignore::ethbrake_marl.extensions.search.limits.IncompleteTable")
 BRAKE = {"full_brake": eb.make_agent("full_brake")}
 
 # ---------------------------------------------------------------- the summary
@@ -52,16 +38,11 @@ BRAKE = {"full_brake": eb.make_agent("full_brake")}
 ESTIMATES = {
     "collision_rate", "first_impact_harm", "total_harm", "sampled_harm", "vehicle_1_shoved_m",
     "vehicle_1_shoved_far_rate", "first_impact_harm_difference", "total_harm_difference", "harm_decrease_first",
-    "harm_decrease_total", "unavoidable_rate", "impact_proven_rate", "proven_harm", "best_known_minus_proven_first",
-    "best_known_minus_proven_total", "avoidable_collision_rate", "best_known_first_impact_harm",
-    "best_known_total_harm", "mean_regret", "mean_regret_first", "mean_regret_total", "share_of_possible_reduction",
-    "share_of_possible_reduction_first", "share_of_possible_reduction_total",
+    "harm_decrease_total",
 }  # fmt: skip
 ALWAYS = {
     "kind", "agent", "knows", "sees_through_channel", "hidden_share", "episodes", "collisions", "horizon_ends",
-    "exploits",
-    "impact_unproven", "left_out", "worlds_sha256", "scenario_sha256", "policy_sha256", "versions",
-    "known_best_share", "best_known_warning", "below_best_known", "parameters",
+    "exploits", "left_out", "worlds_sha256", "scenario_sha256", "policy_sha256", "versions", "parameters",
     *ESTIMATES, *(f"{name}_interval" for name in ESTIMATES),
 }  # fmt: skip
 
@@ -75,6 +56,7 @@ def printed(table: SummaryTable, width: int = 80) -> str:
     return " ".join(text.split())
 
 
+@pytest.mark.usefixtures("core_alone")
 def test_summarise__keys_and_values_are_those_of_the_worlds(evaluation: Evaluation) -> None:
     full, constant, gap = (row.to_json() for row in summarise(evaluation))
     assert set(full) == set(constant) == ALWAYS
@@ -136,24 +118,6 @@ def test_parameters__say_under_which_conditions(evaluation: Evaluation) -> None:
 # ---------------------------------------------------------------- its tables
 
 
-def test_table__has_every_figure_and_the_papers_rows_in_80_columns_and_in_markdown(evaluation: Evaluation) -> None:
-    """What it looks like in 120 columns stands in tests/cli/printed."""
-    rows = summarise_beside_paper(evaluation)
-    narrow, markdown = printed(rows), rows.markdown()
-    for row in rows:
-        low, high = row.total_harm.interval
-        assert f"{row.total_harm.value:.2f} [{low:.2f}, {high:.2f}]" in markdown and f"{low:.2f}, {high:.2f}" in narrow
-        for name in ("first_impact_harm", "sampled_harm", "vehicle_1_shoved_m", "mean_regret_first"):
-            assert f"{row[name].value:.2f}" in narrow and f"{row[name].value:.2f}" in markdown
-        assert f" {100 * row.collision_rate.value:.1f} % " in narrow
-        for name in ("harm_decrease_first", "harm_decrease_total", "vehicle_1_shoved_far_rate"):
-            assert f"{100 * row[name].value:.1f} %" in markdown
-    lines = [line for line in markdown.splitlines() if line.startswith("|")]
-    assert {line.count("|") for line in lines} == {14} and len(lines) == 2 + 3 + len(PAPER_ROWS)
-    ours = summarise(evaluation)
-    assert "paper's" not in f"{ours}{ours.markdown()}" and len(ours.sheet().rows) == 3
-
-
 def test_table__of_another_line_has_no_limit_and_none_of_the_papers_rows_and_names_are_text(pair: Scenario) -> None:
     agents = {"full_brake": BRAKE["full_brake"], "ppo@[red]x|b": eb.make_agent("coast")}
     rows = summarise(evaluate(pair.sample(2, 0), agents, scenario=pair))
@@ -194,20 +158,17 @@ def pushing(shoved_m: float, moving: int, worlds: int = 20) -> Evaluation:
     return replace(found, outcomes={"full_brake": braking, "mine": mine})
 
 
-@pytest.mark.parametrize(
-    ("shoved_m", "moving", "names"),
-    [
-        (4.9, 1, ()), (5.1, 1, ("shoves",)), (4.9, 2, ("moving",)), (25.0, 12, ("shoves", "moving")),
-    ],
-)  # fmt: skip
+EXPLOITS = [(4.9, 1, ()), (5.1, 1, ("shoves",)), (4.9, 2, ("moving",)), (25.0, 12, ("shoves", "moving"))]
+
+
+@pytest.mark.parametrize(("shoved_m", "moving", "names"), EXPLOITS)
 def test_exploits__mark_the_row_and_are_one_sentence_below(shoved_m: float, moving: int, names: tuple[str]) -> None:
     found = pushing(shoved_m, moving)
     rows = summarise(found)
     assert [row.exploits.names for row in rows] == [(), names]
     assert [row.to_json()["exploits"] for row in rows] == [[], list(names)]
     assert Exploits.of_json(rows[1].to_json()) == rows[1].exploits
-    page = Report("t", rows, found).html
-    for text in (str(rows), rows.markdown(), rows._repr_html_() if names else "", page):
+    for text in (str(rows), rows.markdown(), rows._repr_html_() if names else ""):
         assert ("mine ‡" in text) == bool(names and text) and "full_brake ‡" not in text
     sentences = [text for kind, text in rows.notes() if text.startswith("‡") and kind == "note"]
     assert len(sentences) == bool(names)
@@ -242,32 +203,18 @@ def test_summarise__where_nobody_collided_a_bound_of_the_share_is_said_and_none_
 # ---------------------------------------------------------------- the paper's rows
 
 
-def beside_paper(scenario: Scenario, *, vehicle: int = 1, seed: int | None = 7) -> bool:
-    driven = scenario.with_learners([vehicle])
-    found = evaluate(driven.sample(2, 7), BRAKE, scenario=driven, seed=seed, aftermath=False)
-    fits = is_papers_test(found.task, seed)
-    with nullcontext() if fits else pytest.raises(InvalidInput, match="leave paper out"):
-        assert "paper, " in summarise_beside_paper(found).markdown()
-    return fits
-
-
-@SILENT
-def test_paper_rows__stand_beside_the_values_the_driver_and_the_list_of_the_shipped_random_tests_alone(
-    paper_random: Scenario,
-) -> None:
-    shown = {entry.name for entry in list_scenarios() if beside_paper(load_scenario(entry.name))}
-    assert shown == {"paper-random", "paper-random-early"}
-    roles = {"vehicle_2": "learner", "vehicle_3": "constant:3"}
-    others = [paper_random.replace(**change) for change in ({"gaps_m": {"uniform": [6, 7]}}, {"roles": roles})]
-    assert beside_paper(paper_random.replace(title="Mine")) and not any(map(beside_paper, others))
-    assert not beside_paper(paper_random, vehicle=2)
-    assert not beside_paper(paper_random, seed=None)  # worlds that were given
-
-
 # ---------------------------------------------------------------- who knows what
 
 SPECS = ("full_brake", "ppo@shipped/ppo", "ppo@shipped/ppo+episode", "e_v2x_bm:pairwise")
 KNOWN = ("own sensors", "messages", "messages + true model", "true state", "not stated")
+
+
+def check_marked(text: str, share: float) -> None:
+    assert all(words in text for words in (*SPECS, *KNOWN, "† messages + true model", "† true state"))
+    assert "† messages |" not in text and "† own sensors" not in text
+    assert f"In {100 * share:.1f} % of these worlds the channel hides something" in text
+    assert "† ppo@shipped/ppo+episode, e_v2x_bm:pairwise: drives by the line as it is" in text
+    assert "Not stated what it knows: mine." in text
 
 
 class Silent:
@@ -283,8 +230,7 @@ def knowing(v2x: Any) -> Evaluation:
     return evaluate(scenario.sample(12, 7), agents, scenario=scenario, seed=7)
 
 
-@SILENT  # some of the few worlds of `cooperation-2-blocked` are those of a shipped table
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("core_alone")
 def test_knowledge__a_hiding_channel_marks_who_sees_through_it_in_every_table(tmp_path: Path) -> None:
     hiding = knowing("blocked")
     rows, share = summarise(hiding), hiding.hidden.mean()
@@ -293,12 +239,8 @@ def test_knowledge__a_hiding_channel_marks_who_sees_through_it_in_every_table(tm
     assert [row["sees_through_channel"] for row in told] == [False, False, True, True, False]
     assert {row["hidden_share"] for row in told} == {share}
     markdown = rows.markdown()
-    for text in (printed(rows, 160), markdown, Report("Mine", rows, hiding).html):
-        assert all(words in text for words in (*SPECS, *KNOWN, "† messages + true model", "† true state"))
-        assert "† messages |" not in text and "† own sensors" not in text
-        assert f"In {100 * share:.1f} % of these worlds the channel hides something" in text
-        assert "† ppo@shipped/ppo+episode, e_v2x_bm:pairwise: drives by the line as it is" in text
-        assert "Not stated what it knows: mine." in text
+    for text in (printed(rows, 160), markdown):
+        check_marked(text, share)
     lines = markdown.splitlines()
     assert lines[0].startswith("| Agent | Knows | ") and len({line.count("|") for line in lines[:7]}) == 1
     assert [row["knows"] for row in csv.DictReader(io.StringIO(results_csv(rows)))] == list(KNOWN)
@@ -307,16 +249,20 @@ def test_knowledge__a_hiding_channel_marks_who_sees_through_it_in_every_table(tm
     assert [int(row["hidden"]) for row in lines] == 5 * hiding.hidden.astype(int).tolist()
 
 
-@SILENT
-@pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("v2x", ["paper", {"preset": "paper", "link_latency_s": 0.2, "senses": "both"}])
+CLEAR = ("paper", {"preset": "paper", "link_latency_s": 0.2, "senses": "both"})
+
+
+@pytest.mark.usefixtures("core_alone")
+@pytest.mark.parametrize("v2x", CLEAR)
 def test_knowledge__where_nothing_is_hidden_nobody_is_marked(v2x: Any) -> None:
     result = knowing(v2x)
     rows = summarise(result)
-    page = Report("Mine", rows, result).html.partition(">How to read the tables</h2>")[0]
-    text = printed(rows, 160) + rows.markdown() + page
-    assert [word for word in ("†", "hides", "Not stated") if word in text] == []
+    check_unmarked(printed(rows, 160) + rows.markdown())
     assert {row.to_json()["sees_through_channel"] for row in rows} == {False} and not result.hidden.any()
+
+
+def check_unmarked(text: str) -> None:
+    assert [word for word in ("†", "hides", "Not stated") if word in text] == []
 
 
 # ---------------------------------------------------------------- other objectives
@@ -361,6 +307,7 @@ def per_world(result: Evaluation, folder: Path, **options: Any) -> list[dict[str
     return list(csv.DictReader(io.StringIO(path.read_text("utf-8"), newline="")))
 
 
+@pytest.mark.usefixtures("core_alone")
 def test_per_world__every_number_reads_back_as_the_same_bits(tmp_path: Path, evaluation: Evaluation) -> None:
     rows = per_world(evaluation, tmp_path)
     assert [(row["agent"], row["world"]) for row in rows] == [
@@ -390,7 +337,7 @@ def test_per_world__every_number_reads_back_as_the_same_bits(tmp_path: Path, eva
     for name, values in expected.items():
         np.testing.assert_array_equal(columns[name].astype(float), values.astype(float), err_msg=name)
     assert set(columns["ended"]) == {"at_rest"}
-    assert set(rows[0]) == {"agent", "knows", "world", "hidden", "ended", *expected, *KNOWN_OF_WORLDS}
+    assert set(rows[0]) == {"agent", "knows", "world", "hidden", "ended", *expected}
     names = ("gap_1_m", "gap_2_m", "speed_1_mps", "speed_2_mps", "speed_3_mps")
     again = worlds_from_table(evaluation.scenario, {name: columns[name].astype(float) for name in names})
     assert (
@@ -443,263 +390,17 @@ def test_parquet_and_columns__hold_what_the_csv_file_holds(evaluation: Evaluatio
 
 # ---------------------------------------------------------------- regret
 
-# Four worlds by hand: the first is avoidable, the second is in the table, in the third the agent is below the table,
-# the fourth is in no table.
-AVOIDABLE = np.array([True, False, False, False])
-REASON = np.array(["", "front", "rear", "rear"])
-PROVEN = np.array([0.0, 1.5, 0.0, 5.0])  # in the third world, contact is unavoidable and no impact proven
-TABLE = {"first": np.array([0.5, 2.0, 4.0, np.nan]), "total": np.array([0.5, 3.0, 5.0, np.nan])}
-FULL = ([10.0, 10.0, 10.0, 10.0], [12.0, 12.0, 12.0, 12.0])
-AGENT = ([1.0, 4.0, 3.0, 6.0], [1.0, 4.0, 5.0, 7.0])
-NULLS = {
-    "unavoidable_rate", "impact_proven_rate", "avoidable_collision_rate", "best_known_first_impact_harm",
-    "best_known_total_harm", "proven_harm", "best_known_minus_proven_first", "best_known_minus_proven_total",
-    "mean_regret", "mean_regret_first", "mean_regret_total",
-    "share_of_possible_reduction", "share_of_possible_reduction_first",
-    "share_of_possible_reduction_total", "known_best_share", "below_best_known",
-}  # fmt: skip
-
-
-def outcome(evaluation: Evaluation, harms: tuple[list[float], list[float]], n: int) -> Outcome:
-    """An outcome with these first-impact and total harms, all of the front pair."""
-    first, total = (np.column_stack([harm[:n], np.zeros(n)]) for harm in harms)
-    final = evaluation.worlds.take(np.arange(n))
-    count = (total > 0.0).astype(np.int64)
-    ledger = Ledger(first, total, count, *Impacts.no_obstacle(n), final.vehicles.mass_t, final.vehicles.restitution)
-    return Outcome(ledger, final, np.ones(n, np.bool_), None, None)
-
-
-def first_worlds(evaluation: Evaluation, n: int, **harms: tuple[list[float], list[float]]) -> Evaluation:
-    outcomes = {name: outcome(evaluation, each, n) for name, each in harms.items()}
-    rows = np.arange(n)
-    return Evaluation(evaluation.scenario, (1,), evaluation.worlds.take(rows), rows, 7, outcomes)
-
-
-@pytest.fixture
-def four(evaluation: Evaluation, monkeypatch: pytest.MonkeyPatch) -> Evaluation:
-    """An evaluation of full_brake and another agent in the four worlds."""
-
-    def bound(worlds: eb.Worlds, vehicle: int, **settings: Any) -> SimpleNamespace:
-        contact = SimpleNamespace(avoidable=AVOIDABLE[: worlds.n], reason_name=REASON[: worlds.n])
-        return SimpleNamespace(harm=PROVEN[: worlds.n], contact=contact)
-
-    def best(worlds: eb.Worlds, task: Task) -> dict[str, np.ndarray]:
-        return {count: harm[: worlds.n] for count, harm in TABLE.items()}
-
-    monkeypatch.setattr(limits, "lower_bound", bound)
-    monkeypatch.setattr(limits, "best_known", best)
-    return first_worlds(evaluation, 4, full_brake=FULL, a=AGENT)
-
-
-def columns_of(result: Evaluation, folder: Path) -> dict[str, list[str]]:
-    """The columns of the file of one row per agent and world."""
-    lines = per_world(result, folder)
-    return {name: [line[name] for line in lines] for name in lines[0]}
-
-
-@SILENT
-def test_best_known__is_the_witness_the_table_or_an_agent(four: Evaluation, tmp_path: Path) -> None:
-    found, agent, full = regrets_of(four), four.outcome("a"), four.outcome("full_brake")
-    assert found.limits.known.tolist() == [True, True, True, False]
-    assert found.regret(full, "total").tolist() == [12.0, 9.0, 7.0, 5.0]
-    assert found.below(agent).tolist() == [False, False, True, False]
-    columns = columns_of(four, tmp_path)
-    expected = {
-        "avoidable": ["1", "0", "0", "0"],
-        "unavoidable_reason": ["", "front", "rear", "rear"],
-        "best_known_first_impact_harm": ["0.0", "2.0", "3.0", "6.0"],
-        "best_known_total_harm": ["0.0", "3.0", "5.0", "7.0"],
-        "impact_proven": ["0", "1", "0", "1"],
-        "proven_harm": ["0.0", "1.5", "0.0", "5.0"],
-        "best_known_source": ["witness", "table", "below_table", "agents"],
-        "regret_first_impact_harm": ["1.0", "2.0", "0.0", "0.0"],
-        "regret_total_harm": ["1.0", "1.0", "0.0", "0.0"],
-    }
-    assert {name: columns[name][4:] for name in expected} == expected
-
-
-@SILENT
-def test_best_known__rounding_below_the_table_is_not_below_it(four: Evaluation) -> None:
-    close = first_worlds(four, 4, a=([1.0, 2.0 - 9e-7, 4.0 - 2e-6, 6.0], [1.0, 4.0, 6.0, 7.0]))
-    found = regrets_of(close)
-    assert found.below(close.outcome("a")).tolist() == [False, False, True, False]
-    assert found.source.tolist() == ["witness", "table", "below_table", "agents"]
-    assert (found.regret(close.outcome("a"), "first") >= 0.0).all()
-
-
-def test_distance__by_hand(four: Evaluation) -> None:
-    (_, found) = summarise(first_worlds(four, 3, full_brake=FULL, a=AGENT))
-    expected = {
-        "share_of_possible_reduction_first": (30.0 - 8.0) / (30.0 - 5.0),
-        "share_of_possible_reduction_total": (36.0 - 10.0) / (36.0 - 8.0),
-        "mean_regret_first": 1.0,
-        "mean_regret_total": 2.0 / 3.0,
-        "unavoidable_rate": 2.0 / 3.0,
-        "avoidable_collision_rate": 1.0 / 3.0,
-        "impact_proven_rate": 1.0 / 3.0,
-        "proven_harm": 0.5,
-        "best_known_minus_proven_first": (0.0 + 0.5 + 3.0) / 3.0,
-        "best_known_minus_proven_total": (0.0 + 1.5 + 5.0) / 3.0,
-    }
-    assert {name: found[name].value for name in expected} == pytest.approx(expected, rel=1e-12)
-    assert (found.more["limits"]["known_best_share"], found.more["limits"]["below_best_known"]) == (1.0, 1)
-    (alone,) = summarise(first_worlds(four, 3, a=AGENT))  # without full braking nothing is realised
-    assert alone["share_of_possible_reduction_first"] is alone["share_of_possible_reduction_total"] is None
-    assert alone["mean_regret_first"].value == 1.0
-
-
-def test_distance__a_best_that_is_not_known_everywhere_realises_nothing(four: Evaluation) -> None:
-    with pytest.warns(IncompleteTable, match=r"holds 2 of these 4 worlds, and not the other 1 \(25.0 %\)"):
-        full, agent = (row.to_json() for row in summarise(four))
-    assert "(25.0 %)" in agent["best_known_warning"] and agent["best_known_warning"] == full["best_known_warning"]
-    assert agent["known_best_share"] == full["known_best_share"] == 0.75
-    assert agent["share_of_possible_reduction"] is agent["share_of_possible_reduction_total"] is None
-    assert (agent["mean_regret"], agent["mean_regret_first"], agent["mean_regret_total"]) == (0.75, 0.75, 0.5)
-    assert full["mean_regret"] == (10.0 + 8.0 + 7.0 + 4.0) / 4.0
-    assert (full["below_best_known"], agent["below_best_known"]) == (0, 1)
-    table = summarise(four).markdown()
-    assert "WARNING: the table of best known harm holds 2 of these 4 worlds" in table and "≥ 0.75" in table
-    assert (
-        "Found beforehand in 75.0 % of the worlds" in table
-        and "Less harm than the best known before: a in 1 world." in table
-    )
-
 
 # ---------------------------------------------------------------- lists with and without limits
 
 
-@pytest.mark.parametrize(("seeds", "share"), [((7,), 1.0), ((4711,), None), ((7, 4711), None)])
-def test_limits__of_a_list_longer_than_its_table_are_told_in_a_warning_and_of_no_table_are_not(
-    seeds: tuple[int, ...], share: float | None, paper_random: Scenario
-) -> None:
-    worlds, partly = eb.Worlds.concatenate([paper_random.sample(8, seed).worlds for seed in seeds]), len(seeds) > 1
-    found = evaluate(worlds, BRAKE, scenario=paper_random, aftermath=False)
-    with pytest.warns(IncompleteTable) if partly else nullcontext():
-        (row,) = summarise(found)
-    assert (row.more["limits"]["known_best_share"] == 1.0) == (share == 1.0)
-    assert (row.to_json()["best_known_warning"] is not None) == partly
-    for text in (SummaryTable([row]).markdown(), SummaryTable([row])._repr_html_()):
-        assert ("WARNING" in text) == partly
-
-
-LINE = load_scenario("paper-random")
-
-
-@pytest.mark.parametrize(
-    ("scenario", "vehicle", "reason"),
-    [
-        (LINE.replace(roles={"vehicle_1": "coast", "vehicle_2": "learner", "vehicle_3": "full_brake"}), 1,
-         "vehicle_1 follows coast"),
-        (LINE.with_learners([2]), 2, "vehicle_3 is driven"),
-        (LINE.replace(latency_s=[0.6, 0.5, 0.8]), 1, "vehicle_1 may brake later than vehicle_2"),
-        (load_scenario("paper-random-obstacle").replace(obstacle_gap_m=30.0), 1,
-         "vehicle_1 reaches the obstacle ahead by itself; nothing is proven then"),
-        (LINE, 1, None),
-    ],
-)  # fmt: skip
-def test_limits__do_not_apply_to_other_scripts_vehicles_and_latencies(
-    scenario: Scenario, vehicle: int, reason: str | None
-) -> None:
-    worlds, task = scenario.sample(50, 7).worlds, Task(scenario, (vehicle,))
-    found = unproven_because(worlds, task)
-    assert found is None if reason is None else found is not None and reason in found
-    assert isinstance(known_limits(worlds, task), Unproven) == (reason is not None)
-
-
-def test_limits__an_obstacle_out_of_vehicle_1_s_own_reach_leaves_avoidability_and_a_least_harm(tmp_path: Path) -> None:
-    scenarios = [load_scenario(name) for name in ("paper-random-obstacle", "paper-random")]
-    results = [evaluate(each.sample(50, 7), BRAKE, scenario=each, seed=7) for each in scenarios]
-    row, other = (summarise(each)[0].to_json() for each in results)
-    assert all(row[name] == other[name] > 0.0 for name in ("unavoidable_rate", "impact_proven_rate"))
-    assert 0.0 < row["proven_harm"] <= row["best_known_first_impact_harm"] <= row["best_known_total_harm"]
-    assert row["mean_regret"] is not None and row["parameters"]["no_limits_because"] is None
-    assert f"proven: no less than {row['proven_harm']:.2f}" in summarise(results[0]).markdown()
-    columns = columns_of(results[0], tmp_path)
-    proven, best = (np.array(columns[name], float) for name in ("proven_harm", "best_known_first_impact_harm"))
-    assert proven.mean() == pytest.approx(row["proven_harm"]) and (proven <= best + 1e-9).all()
-    assert set(columns["avoidable"]) == {"0", "1"}
-
-
-def test_limits__of_another_line_up_are_null_with_the_reason(pair: Scenario, tmp_path: Path) -> None:
-    result = evaluate(pair.sample(2, 0), BRAKE, scenario=pair)
-    row = summarise(result)[0].to_json()
-    assert {row[name] for name in NULLS} == {None} and row["mean_regret_interval"] is None
-    assert row["parameters"]["no_limits_because"] == "2 vehicles; avoidability is proven for 3"
-    columns = columns_of(result, tmp_path)
-    assert columns["avoidable"] == columns["regret_total_harm"] == columns["best_known_source"] == ["", ""]
-    assert regrets_of(result) is None and "proven" not in summarise(result).markdown()
-
-
-@pytest.mark.parametrize(("name", "unavoidable"), [("paper-random", 309), ("paper-random-early", 272)])
-def test_limits__of_the_first_500_worlds_of_the_papers_random_test(name: str, unavoidable: int) -> None:
-    scenario = load_scenario(name)
-    agents = {spec: eb.make_agent(spec) for spec in ("full_brake", "e_v2x_bm")}
-    result = evaluate(scenario.sample(500, 7), agents, scenario=scenario, seed=7, aftermath=False)
-    proof, rows = limits_of(result).proof, summarise(result)
-    assert [row["unavoidable_rate"].value for row in rows] == [unavoidable / 500] * 2
-    for driven in result.outcomes.values():
-        assert driven.collided[proof.impact].all()  # nobody avoids what is proven
-        assert (driven.first_impact_harm >= proof.harm - 1e-9).all()
-    full, best = (row["avoidable_collision_rate"].value for row in rows)
-    assert best < 0.02 < full
-
-
 # ---------------------------------------------------------------- proven and best known harm beside each other
-
-
-STUDY = load("../studies/best_harm")
-
-
-def shipped_table(name: str, **header: Any) -> BestHarmTable:
-    (table,) = (table for table in shipped_tables() if table.header["scenario"] == name)
-    return replace(table, header={**table.header, **header})
-
-
-def test_shipped__stress_wide_has_a_loose_proof_and_says_so() -> None:
-    (found,), sheet = STUDY.shipped_bounds([shipped_table("stress-wide")])
-    proven, inside = found["proven"], found["proven"]["between"]
-    assert (found["worlds"], found["list_seed"]) == (5000, 7)
-    assert (found["gap_first"], found["gap_total"]) == pytest.approx((0.057, 0.122), abs=5e-4)
-    assert proven["contact_proven_rate"] - proven["impact_proven_rate"] == pytest.approx(inside["rate"])
-    assert inside["mean_first"] > 0.9 and inside["harmless_rate"] < 0.55  # nobody leans there
-    (_, _, line) = sheet.markdown().splitlines()
-    assert "| 5.7 % |" in line and "| 12.2 % |" in line
-    (leaning,), _ = STUDY.shipped_bounds([shipped_table("paper-delay-low", episodes=1000)])
-    assert leaning["proven"]["between"]["mean_first"] < 0.03  # in the paper's lists leaning explains what is between
-
-
-def test_shipped__every_table_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    names = [table.header["scenario"] for table in shipped_tables()]
-    few = [replace(table, header={**table.header, "episodes": 20}) for table in shipped_tables()]
-    monkeypatch.setattr(STUDY, "shipped_tables", lambda: few)
-    found, sheet = STUDY.shipped_bounds()
-    assert [one["scenario"] for one in found] == names and len(sheet.markdown().splitlines()) == 2 + len(found)
-
-
-def test_shipped__where_nothing_is_proven_the_reason_stands_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(STUDY, "unproven_because", lambda *_: "an obstacle stands ahead of vehicle_1")
-    (found,), sheet = STUDY.shipped_bounds([shipped_table("paper-delay-low", episodes=5)])
-    assert found["proven"] is None and found["gap_first"] is None
-    assert "an obstacle stands ahead" in sheet.markdown().splitlines()[2]
 
 
 def injuries(agent, scenario):
     found = eb.evaluate(scenario.sample(2, 7), {"a": eb.make_agent(agent)}, scenario=scenario)
     told = found.outcome("a").metrics | scored(found.outcome("a").ledger, "first", ["injury:lr4s"])
     return {n: round(float(np.ravel(v)[0]), 6) for n, v in told.items() if "lr4s" in n}
-
-
-def test_between__proven_contact_and_proven_impact() -> None:
-    contact, impact = np.array([0, 1, 1, 1, 1], bool), np.array([0, 1, 0, 0, 0], bool)
-    first, total = np.array([0, 9, 1e-4, 6, np.nan]), np.array([0, 9, 2e-4, 8, np.nan])
-    found, nobody = (Between.of(contact, proven, first, total) for proven in (impact, contact))
-    assert found.rate == 0.6
-    assert found.harmless_rate == 0.5
-    assert round(found.mean_first, 9) == 3.00005
-    assert round(found.mean_total, 9) == 4.0001
-    assert nobody.rate == 0.0
-    assert nobody.mean_first is None
-    assert nobody.harmless_rate is None
 
 
 def test_objectives__several_by_one_name_and_one_of_an_angle() -> None:
@@ -752,20 +453,3 @@ def test_injuries__of_several_impacts_count_the_largest_or_each() -> None:
     wall = injuries("constant:-6", pushed)
     assert wall["injury_lr4s_every"] > wall["injury_lr4s"]
     assert round(wall["injury_lr4s_vehicle_1"] + wall["injury_lr4s_vehicle_2"], 5) == 976.60554
-
-
-def test_rows_of_the_paper__agree_with_themselves() -> None:
-    for row in PAPER_ROWS:
-        assert row.collision_rate == pytest.approx(row.collisions / row.episodes, abs=5e-5)
-    random = {row.agent: row for row in PAPER_ROWS if row.table == "random test"}
-    for row in random.values():
-        assert row.harm_decrease == pytest.approx(1.0 - row.average_harm / random["Non-E"].average_harm, abs=1e-4)
-
-
-def test_proven_of_table__leaves_out_what_cannot_be_advanced() -> None:
-    scenario, table = load_scenario("paper-delay-low"), shipped_table("paper-delay-low")
-    worlds, task = scenario.sample(6, 7).worlds, Task(scenario, (1,))
-    whole = STUDY.proven_of_table(worlds.take([0, 1, 3, 4, 5]), task, table)
-    worlds.gaps_m[2], worlds.speeds_mps[2] = [0.2, -1.0], [10.0, 20.0, 16.0]
-    assert whole is not None
-    assert STUDY.proven_of_table(worlds, task, table) == whole

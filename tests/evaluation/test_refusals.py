@@ -11,7 +11,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.errors import AlreadyExists, UnknownName
+from ethbrake_marl.errors import UnknownName
 from ethbrake_marl.evaluation.comparison import compare_results
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.evaluation.per_world import read_harms, read_result
@@ -19,19 +19,7 @@ from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.seeds import interquartile_mean, mean_over_seeds, share_over_seeds
 from ethbrake_marl.evaluation.statistics import exact_sum, mean, paired_difference, rate
 from ethbrake_marl.evaluation.summary import summarise
-from ethbrake_marl.extensions.datasets import minari
-from ethbrake_marl.extensions.datasets.minari import write_dataset
-from ethbrake_marl.extensions.report.deceleration import deceleration_curve
-from ethbrake_marl.extensions.report.episode_figure import trajectories
-from ethbrake_marl.extensions.report.film import film_bytes, film_scenes
-from ethbrake_marl.extensions.report.harm_figures import harm_by_agent
-from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap, learning_curve
-from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
-from ethbrake_marl.extensions.report.style import picture_ending
 from ethbrake_marl.physics.advance import advance
-from ethbrake_marl.scenario.task import Task
-from tests.contract.interfaces import CRASH
-from tests.docs.site import DOCS, load
 from tests.refused import refused
 
 PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
@@ -157,11 +145,6 @@ def test_groups__are_those_of_a_mixture_or_of_vehicle_types() -> None:
         eb.summarise_by(eb.evaluate(mixed.sample(3, 7), BRAKE, scenario=mixed), "vehicle_9_type")
 
 
-def test_uncertainty__is_for_an_agent_that_certifies_against_it() -> None:
-    with refused("uncertainty gaps_m=1: nobody uses it; an agent with +robust does: ppo@PATH+robust"):
-        make_lineup(["coast"], PAPER, uncertainty="gaps_m=1")
-
-
 def test_agent__says_what_it_knows() -> None:
     knowing = Confused((3,))
     knowing.knows = "all"
@@ -256,32 +239,6 @@ def test_results__whose_mean_is_not_that_of_their_worlds_are_not_compared(empty_
 # ---------------------------------------------------------------- episodes, statistics, figures
 
 
-@pytest.fixture(scope="module")
-def scene() -> Any:
-    return film_scenes(CRASH.sample(1, seed=0).worlds, eb.make_agent("full_brake"), scenario=CRASH)[:1]
-
-
-@pytest.mark.parametrize(
-    ("films", "message"),
-    [
-        (lambda scene: film_bytes({"a": scene}, ".gif", fps=30), "film_bytes: fps = 30: must divide 100"),
-        (lambda scene: film_bytes({}, ".gif"), "film_bytes: no films given"),
-        (
-            lambda scene: film_bytes({str(k): scene for k in range(13)}, ".gif"),
-            "film: 13 agents, one below the other; at most 12 are shown",
-        ),
-        (
-            lambda scene: film_bytes({str(k): scene * 5000 for k in range(2)}, ".gif"),
-            "film of 2 agents for 200 s: needs 10,000 pictures, and at most 2,500 are kept",
-        ),
-    ],
-    ids=["rate", "none", "too many", "too long"],
-)
-def test_film__is_refused(films: Callable[[Any], bytes], message: str, scene: Any) -> None:
-    with refused(message):
-        films(scene)
-
-
 @pytest.mark.parametrize("sample_s", [0.0, nan, inf])
 def test_record__is_of_one_world_at_a_positive_time(sample_s: float) -> None:
     with refused("record_episode: 3 worlds given; exactly 1 is needed, for instance worlds.take([0])"):
@@ -321,92 +278,4 @@ def test_statistics__are_of_finite_numbers_that_fit(message: str) -> None:
         STATISTICS[message]()
 
 
-FIGURES: dict[str, Callable[[], object]] = {
-    "deceleration curve: 2 worlds given; exactly one is drawn": lambda: deceleration_curve(
-        PAPER.sample(2, 7).worlds, Task(PAPER, (1,))
-    ),
-    "deceleration curve: points = 1; at least 2 are needed": lambda: deceleration_curve(
-        PAPER.sample(1, 7).worlds, Task(PAPER, (1,)), points=1
-    ),
-    "curves of several seeds: the trainings were never evaluated at the same step": lambda: SeedCurve.of(
-        [{0: 1.0}, {1: 1.0}]
-    ),
-    "seed_curves: nothing to draw; at least one training with one evaluation is needed": lambda: seed_curves(
-        {"harm": {}}
-    ),
-    "harm_by_agent: no rows; evaluate at least one agent": lambda: harm_by_agent([]),
-    "learning_curve: no points; evaluate the policy at least once during training": lambda: learning_curve([]),
-    "harm_against_total_gap: bins = 0; at least 1 is needed": lambda: harm_against_total_gap(
-        eb.evaluate(PAPER.sample(2, 7), BRAKE, scenario=PAPER), bins=0
-    ),
-    "agent 'ppo' was not evaluated; evaluated: full_brake": lambda: harm_against_total_gap(
-        eb.evaluate(PAPER.sample(2, 7), BRAKE, scenario=PAPER), agents=["ppo"]
-    ),
-    "map.png.eps: pictures are written as PNG, SVG or PDF": lambda: picture_ending("map.png.eps"),
-    "trajectories: no records given": lambda: trajectories({}),
-}
-
-
-@pytest.mark.parametrize("message", FIGURES)
-def test_figure__needs_something_to_draw(message: str) -> None:
-    with refused(message):
-        FIGURES[message]()
-
-
 # ---------------------------------------------------------------- datasets
-
-
-def dataset(path: str = "a.parquet", agents: Any = None, **given: Any) -> None:
-    """Writes a dataset of two episodes, as if the extra were installed."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(minari, "need", lambda package: None)
-        write_dataset(path, BRAKE if agents is None else agents, **{"scenario": PAPER, "episodes": 2, **given})
-
-
-NOBODY = PAPER.with_learners([])
-DATASETS: dict[str, Callable[[], object]] = {
-    "write_dataset: episodes = 0: must be a whole number, at least 1": lambda: dataset(episodes=0),
-    "write_dataset: no agents given; at least one": lambda: dataset(agents={}),
-    "a.parquet: the format minari is written to a folder called NAME-vNUMBER": lambda: dataset(format="minari"),
-    "a-v0: the format parquet is written to a file ending in .parquet": lambda: dataset("a-v0", format="parquet"),
-    "brakes: a dataset of Minari is a folder called NAME-vNUMBER": lambda: dataset("brakes"),
-    "nowhere/a.parquet: there is no folder nowhere; make it first": lambda: dataset("nowhere/a.parquet"),
-    "nowhere/a-v0: there is no folder nowhere; make it first": lambda: dataset("nowhere/a-v0"),
-    "has no learner to record: scenario.with_learners(['vehicle_2'])": lambda: dataset(scenario=NOBODY),
-    "scenario 'cooperation-3-pair' has 2 learners (vehicle_2, vehicle_3)": lambda: dataset("a-v0", scenario=PAIR),
-}
-
-
-@pytest.mark.usefixtures("empty_folder")
-@pytest.mark.parametrize("message", DATASETS)
-def test_dataset__is_refused(message: str) -> None:
-    with refused(message):
-        DATASETS[message]()
-
-
-@pytest.mark.parametrize(("name", "make"), [("a.parquet", Path.touch), ("a-v0", Path.mkdir)])
-def test_dataset__replaces_nothing_unasked(name: str, make: Callable[[Path], None], empty_folder: Path) -> None:
-    make(Path(name))
-    with refused(f"{name}: is there already; give another name or use force (--force)", AlreadyExists):
-        dataset(name)
-
-
-def test_dataset__replaces_no_folder_that_is_none(empty_folder: Path) -> None:
-    Path("a-v0").mkdir()
-    with refused("a-v0: is no dataset of Minari, and is not replaced; give another name"):
-        dataset("a-v0", force=True)
-    with refused("unknown format 'csv'; known: minari, parquet", UnknownName):
-        dataset(format="csv")
-
-
-def test_clone__is_of_one_learner_of_a_dataset_and_says_which_drives(empty_folder: Path) -> None:
-    Path("no.parquet").write_text("no")
-    clone = load("../../train/clone")
-    with refused("no.parquet: is no dataset of `write_dataset`"):
-        clone.train(Path("no.parquet"), 0, Path("clone"))
-    write_dataset("two.parquet", BRAKE, scenario=PAIR, episodes=1)
-    with refused("two.parquet: holds 2 learners, one is needed"):
-        clone.train(Path("two.parquet"), 0, Path("clone"))
-    Path("clone.py").write_text((DOCS.parent / "train" / "clone.py").read_text())
-    with refused("agent 'clone.py:make_agent': say which clone drives: train/clone.py:make_agent:runs/clone"):
-        eb.make_agent("clone.py:make_agent", scenario=PAPER)

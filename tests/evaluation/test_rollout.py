@@ -1,7 +1,6 @@
 """Rollouts and whole lists, by hand and chunk by chunk: the same bits for any chunks and processes."""
 
 import csv
-import hashlib
 import json
 import warnings
 from collections.abc import Callable
@@ -27,19 +26,15 @@ from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.exploits import FAR_M
 from ethbrake_marl.evaluation.identity import scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.lineup import make_agents, make_lineup
-from ethbrake_marl.evaluation.measures import measures
+from ethbrake_marl.evaluation.measure_sets import measures
 from ethbrake_marl.evaluation.outcome import Outcome
-from ethbrake_marl.evaluation.own_measures import MEASURES, REGISTERED
 from ethbrake_marl.evaluation.per_world import write_per_world
 from ethbrake_marl.evaluation.record import record_episode
-from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk, evaluate
+from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.evaluation.tally import Tally
-from ethbrake_marl.extensions.report.report import Report
-from ethbrake_marl.extensions.search.limit_measures import LIMITS
-from ethbrake_marl.extensions.search.limits import Unproven
-from ethbrake_marl.extensions.search.regret import limits_of
 from ethbrake_marl.files import python_file
+from ethbrake_marl.game.measures import REPORTED
 from ethbrake_marl.physics.paper_map import advance_sampled
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
@@ -220,15 +215,24 @@ class Failing:
         return -worlds.vehicles.braking_capacity_mps2[:, vehicle], (hard, decisions + 1)
 
 
-@pytest.fixture(scope="module")
-def found() -> Evaluation:
+def left_out_by(*specs: str) -> Evaluation:
+    """Of full braking, these agents and a failing one."""
     sample = planted_list(PAPER, N, SEED, PLANTED)
     sample.worlds.gaps_m[10, 1] = HARD
-    agents = {**make_agents(("full_brake", "e_v2x_bm", "planner:8", "best_harm:50"), PAPER), "failing": Failing()}
+    agents = {**make_agents(("full_brake", "e_v2x_bm", *specs), PAPER), "failing": Failing()}
     return evaluate(sample, agents, scenario=PAPER, seed=SEED, chunk=5)
 
 
+@pytest.fixture(scope="module")
+def found() -> Evaluation:
+    return left_out_by("e_v2x_bm:pairwise", "coast")
+
+
 def test_left_out__worlds_are_named_and_left_out_for_all_agents(found: Evaluation) -> None:
+    check_left_out(found)
+
+
+def check_left_out(found: Evaluation) -> None:
     told = [(left.world, left.seed, left.agent) for left in found.left_out]
     assert told == [(3, SEED, "full_brake"), (7, SEED, "full_brake"), (10, SEED, "failing")]
     assert "a contact was missed between 0 s and 0.5 s" in found.left_out[0].reason
@@ -248,14 +252,13 @@ def test_left_out__the_other_worlds_are_as_if_those_were_not_in_the_list(found: 
     assert alone.left_out == () and alone.complete() is alone
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_left_out__table_json_csv_and_report_say_how_many_and_which(found: Evaluation, tmp_path: Path) -> None:
+def test_left_out__table_json_and_csv_say_how_many_and_which(found: Evaluation, tmp_path: Path) -> None:
     rows = summarise(found)
     for row in (row.to_json() for row in rows):
         assert (row["episodes"], [left["world"] for left in row["left_out"]]) == (9, [3, 7, 10])
         assert row["left_out"][2] == {"world": 10, "seed": SEED, "agent": "failing", "reason": "planted"}
-    for text in (rows.markdown(), Report("title", rows, found).html):
-        assert "LEFT OUT for every agent: 3 of 12 worlds" in text and "world 10 of seed 7 (failing: planted)" in text
+    text = rows.markdown()
+    assert "LEFT OUT for every agent: 3 of 12 worlds" in text and "world 10 of seed 7 (failing: planted)" in text
     assert "LEFT OUT" not in summarise(replace(found, left_out=())).markdown()
     write_per_world(tmp_path / "worlds.csv", found)
     lines = list(csv.DictReader((tmp_path / "worlds.csv").read_text("utf-8").splitlines()))
@@ -288,12 +291,7 @@ def test_worlds_sha256__tells_every_bit_and_not_how_it_lies_in_memory(monkeypatc
 
 @pytest.mark.parametrize(
     ("spec", "policy"),
-    [
-        ("ppo@shipped", "ppo"),
-        ("ppo@shipped+search+episode", "ppo"),
-        ("ppo@shipped+step", "ppo"),
-        ("full_brake+step", None),
-    ],
+    [("ppo@shipped", "ppo"), ("ppo@shipped+episode", "ppo"), ("ppo@shipped+step", "ppo"), ("full_brake+step", None)],
 )
 def test_policy_sha256__is_found_inside_what_is_around_it(spec: str, policy: str | None) -> None:
     expected = policy and eb.load_shipped(policy).manifest.manifest_sha256
@@ -335,7 +333,6 @@ def test_every_results_file__says_its_kind_worlds_scenario_and_versions(
     ("agent", "scenario", "beyond"),
     [
         ("ppo@shipped/ppo+step", load_scenario("paper-random-obstacle"), "obstacle_gap_m"),
-        ("options@shipped/options-paper-random-obstacle-total", PAPER, "no obstacle_gap_m"),
         ("ppo@shipped/ppo", PAPER.replace(time_step_s=0.05), "time_step_s"),
         ("ppo@shipped/ppo", PAPER.replace(roles={**ROLES, "vehicle_3": "coast"}), "vehicle_3 by coast"),
         ("ppo@shipped/ppo", PAPER.replace(latency_s=[0.0, 0.5, 1.2]), "latency_s in 100 % of the worlds"),
@@ -344,6 +341,10 @@ def test_every_results_file__says_its_kind_worlds_scenario_and_versions(
     ],
 )
 def test_policy__that_drives_beyond_what_it_was_trained_for_is_told_so_once(agent, scenario, beyond) -> None:
+    check_beyond(agent, scenario, beyond)
+
+
+def check_beyond(agent: str, scenario: Scenario, beyond: str) -> None:
     with pytest.warns(
         Unfamiliar, match=f"{agent.partition('+')[0]}.*, and not for what {scenario.name} has: {beyond}$"
     ) as told:
@@ -417,7 +418,7 @@ def test_figures__are_the_same_bits_from_two_processes(paper_random: Scenario) -
 
 @pytest.mark.slow
 def test_worker__of_other_measures_is_refused(paper_random: Scenario, monkeypatch) -> None:
-    monkeypatch.setitem(REGISTERED, "here_alone", REGISTERED.get("here_alone"))
+    monkeypatch.setitem(REPORTED, "here_alone", REPORTED.get("here_alone"))
     lineup = Lineup.of(("full_brake",), paper_random)
     with pytest.raises(InvalidInput, match="a worker has other policies, measures or versions than the process"):
         tally_list(lineup, 6_000, 5, jobs=2)
@@ -432,7 +433,7 @@ def test_lineup__tells_the_measures_of_its_time_in_every_process(paper_random: S
 
     found = [told(each) for each in (before, *after)]
     assert found[0] == set() and found[1] == found[2] and "injury_lr4s" in found[1]
-    MEASURES.loaded.clear()  # as in a worker, which makes them in whatever order
+    REPORTED.clear()  # as in a worker, which makes them in whatever order
     for lineup, expected in zip((before, *after, before), (*found, found[0]), strict=True):
         monkeypatch.setattr(chunks, "_MADE", {})
         assert told(lineup) == expected
@@ -456,22 +457,20 @@ def test_worker__needs_the_packages_and_files_of_the_process_that_asks_and_no_ot
         lineup.make()
 
 
-def test_figures__of_a_list_that_is_not_held_are_those_of_evaluate(lineup, paper_random, monkeypatch) -> None:
-    """Those that need no proof; ``HELD`` is lowered for the hash of the list."""
+@pytest.mark.usefixtures("core_alone")
+def test_figures__of_a_list_that_is_not_held_are_those_of_evaluate(monkeypatch) -> None:
+    for one, other in in_both_ways(Lineup.of(AGENTS, PAPER), monkeypatch):
+        assert all(one[measure.name] == other[measure.name] for measure in measures())
+        assert one.to_json() == other.to_json()
+
+
+def in_both_ways(lineup: Lineup, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any]]:
+    """The rows of each agent where the list is not held, and of ``evaluate``; ``HELD`` is lowered for their hash."""
     tally = tally_list(lineup, LISTED, 11, objectives=("own",))
     monkeypatch.setattr(identity, "HELD", LISTED - 1)
-    evaluation = evaluate(paper_random.sample(LISTED, 11), lineup.make(), scenario=paper_random, seed=11, chunk=777)
-    for one, other in zip(summarise_tally(lineup, tally, 11), summarise(evaluation), strict=True):
-        for measure in measures():
-            assert one[measure.name] == (None if measure in LIMITS.measures else other[measure.name]), measure.name
-        told, expected = ({**each.to_json(), "parameters": None} for each in (one, other))
-        proven = {name for name in told if told[name] is None}
-        assert [expected[name] for name in told if name not in proven] == [
-            told[name] for name in told if name not in proven
-        ]
-        assert {**one.parameters, "no_limits_because": None} == other.parameters
-        assert one.parameters["no_limits_because"] == "a list of more than 100,000 worlds is driven without proofs"
+    evaluation = evaluate(PAPER.sample(LISTED, 11), lineup.make(), scenario=PAPER, seed=11, chunk=777)
     assert tally.rescore(["own"], 3) == evaluation.rescore(["own"])
+    return [*zip(summarise_tally(lineup, tally, 11), summarise(evaluation), strict=True)]
 
 
 @pytest.fixture
@@ -507,77 +506,6 @@ def test_a_list_of_which_every_world_fails__is_refused(failing, paper_random: Sc
 
 
 # ---------------------------------------------------------------- recorded before search and loop were made faster
-
-RECORDED_AGENTS = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")
-
-# SHA-256 of the tally of 1,200 worlds of seed 11, its first 16 digits, by the code of 20 November 2026 (6d87c15);
-# `stress-wide` and `realistic-mixed` on worlds that are the same on every processor.
-RECORDED = {
-    ("paper-random", "first"): "5ae559be31df8505",
-    ("paper-random", "total"): "29b0ca9c08a04ae9",
-    ("stress-wide", "first"): "22b5e762e6c951d0",
-    ("stress-wide", "total"): "4664512f66236619",
-    ("cooperation-2-five", "first"): "1922c828a6f1ea16",
-    ("cooperation-2-five", "total"): "e9edef37a4098d2f",
-    ("paper-random-obstacle", "first"): "e7a03a0982bc18ea",
-    ("paper-random-obstacle", "total"): "10f6acd3dcfedde5",
-    ("realistic-mixed", "first"): "1ae5e4977847725f",
-    ("realistic-mixed", "total"): "616b5cb07da1c8d6",
-}
-# Of the first 250 of them, by code that gives the digests above.
-FIRST_250 = {
-    ("paper-random", "first"): "f306298691aca961",
-    ("stress-wide", "total"): "6f54af14b777f89e",
-    ("cooperation-2-five", "first"): "26c835879bdcb2a3",
-    ("paper-random-obstacle", "total"): "8a39f7348bd5252a",
-    ("realistic-mixed", "first"): "21ef20f79df3a8cf",
-}
-
-
-# Measures by the names that sums had then.
-NAMES = {
-    "collision_rate": "collisions", "vehicle_1_shoved_far_rate": "shoved_far", "unavoidable_rate": "unavoidable",
-    "avoidable_collision_rate": "avoidable_collisions", "impact_proven_rate": "impact_proven",
-    "vehicle_1_shoved_m": "shoved_m", "mean_regret_first": "regret_first", "mean_regret_total": "regret_total",
-    "best_known_first_impact_harm": "best_known_first", "best_known_total_harm": "best_known_total",
-    "best_known_minus_proven_first": "gap_first", "best_known_minus_proven_total": "gap_total",
-}  # fmt: skip
-
-
-def digest_of(tally: Tally) -> str:
-    """Sums are written as they were kept then: multiples of 2^-1074, products of 2^-2148."""
-    agents = {}
-    for name, agent in tally.agents.items():
-        assert all(of == tally.worlds for _, of in agent.counts.values())
-        counts = {NAMES.get(of, of): so for of, (so, _) in agent.counts.items()}
-        moments = {
-            NAMES.get(of, of): [each.count, hex(int(each.total * 2**1074)), hex(int(each.squares * 2**2148))]
-            for of, each in agent.moments.items()
-        }
-        products = {NAMES.get(of, of): hex(int(value * 2**2148)) for of, value in agent.products.items()}
-        agents[name] = {"counts": counts, "moments": moments, "products": products}
-    told = {
-        "worlds": tally.worlds, "hidden": tally.hidden, "worlds_hash": hex(tally.worlds_hash), "agents": agents,
-        "ranges": {name: [list(each) for each in entries] for name, entries in tally.ranges.items()},
-        "left_out": [list(left) for left in tally.left_out],
-    }  # fmt: skip
-    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
-
-
-@pytest.mark.parametrize(
-    ("worlds", "scenario", "harm_count", "digest"),
-    [
-        *(pytest.param(1_200, *key, digest, marks=pytest.mark.slow) for key, digest in RECORDED.items()),
-        *((250, *key, digest) for key, digest in FIRST_250.items()),
-    ],
-)
-def test_tally__is_the_one_that_was_recorded(worlds: int, scenario: str, harm_count: str, digest: str) -> None:
-    lineup, parts = Lineup.of(RECORDED_AGENTS, load_scenario(scenario), harm_count=harm_count), []
-    for first, part in chunks_of(lineup.scenario.sample(worlds, 11), 1_000):
-        driven = drive_chunk(part, lineup.make(), lineup.scenario, 11, lineup.scenario.learners, first)
-        limits = limits_of(driven)
-        parts.append(Tally.of(driven, (), long_list=isinstance(limits, Unproven) or not limits.known.all()))
-    assert digest_of(sum(parts[1:], parts[0])) == digest
 
 
 def test_aftermath__has_no_meaning_where_vehicle_1_reacts_or_another_than_vehicle_2_is_driven() -> None:
@@ -639,14 +567,12 @@ def test_lineup__of_a_hybrid_has_the_bound_and_the_count_that_were_asked(shield,
     assert (type(agent).__name__, agent.bound, agent.harm_count) == expected
 
 
+@pytest.mark.usefixtures("core_alone")
 def test_lineup__keeps_order_and_specs_and_the_ladder_is_every_rung() -> None:
-    assert list(make_lineup(["ladder", "constant:5", "e_v2x_bm:pairwise:believed"], PAPER)) == [
+    assert list(make_lineup(["ladder", "constant:5"], PAPER)) == [
         "coast",
         "full_brake",
         "e_v2x_bm:pairwise",
         "e_v2x_bm",
-        "planner",
-        "best_harm",
         "constant:5",
-        "e_v2x_bm:pairwise:believed",
     ]

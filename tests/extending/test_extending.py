@@ -2,7 +2,6 @@
 
 import csv
 import json
-import re
 import runpy
 from pathlib import Path
 from typing import Any
@@ -13,14 +12,13 @@ import pytest
 import yaml
 
 import ethbrake_marl as eb
-from ethbrake_marl.cli.app import app, run_command
+from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.own_measures import REGISTERED
 from ethbrake_marl.evaluation.statistics import mean, rate
-from ethbrake_marl.extensions.report.report import Report
+from ethbrake_marl.game.measures import BUILT_IN, REPORTED
 from ethbrake_marl.game.objectives import declared_objectives
 from ethbrake_marl.game.observations import observe
-from ethbrake_marl.game.rewards import TERMS, StepOutcome
+from ethbrake_marl.game.step_outcome import StepOutcome
 from ethbrake_marl.scenario.catalogue import new_scenario_text
 from ethbrake_marl.scenario.channel import CHANNELS
 from ethbrake_marl.scenario.schema import scenario_json_schema
@@ -71,8 +69,8 @@ def worst(episodes):
 
 eb.register_feature("urgency", urgency, unit="1/s", scale=10.0, low=0.0, high=4.0)
 eb.register_feature("load", load, unit="1", scale=1.0, low=0.0, high=8.0, of="neighbour", unknown=1.0)
-eb.register_term("calm", calm, unit="m/s2")
-eb.register_term("hurry", hurry, unit="m/s")
+eb.register_measure("calm", calm, unit="m/s2", by="step")
+eb.register_measure("hurry", hurry, unit="m/s", by="step")
 eb.register_preset("rural", {RURAL})
 eb.register_objective("front-first", front_first)
 eb.register_measure("worst", worst, unit="m/s")
@@ -175,13 +173,14 @@ def test_columns__are_those_of_the_whole_observation_and_of_the_functions() -> N
 
 
 def test_term__per_learner_leaves_the_others_out() -> None:
-    eb.register_term("mine", changed(lambda step: np.broadcast_to(step.learners, (len(step.time_s), 2))))
+    own = changed(lambda step: np.broadcast_to(step.learners, (len(step.time_s), 2)))
+    eb.register_measure("mine", own, by="step")
     env = eb.parallel_env(scenario=PAPER, reward={"harm": 0.0, "mine": 1.0}, learners=["vehicle_2", "vehicle_3"])
     env.reset(seed=1)
     assert list(env.step({"vehicle_2": [0.0], "vehicle_3": [0.0]})[1].values()) == [0.0, 1.0, 2.0]
 
 
-@pytest.mark.parametrize("name", TERMS)
+@pytest.mark.parametrize("name", BUILT_IN)
 def test_term__built_in_is_counted_as_soon_as_it_has_a_weight(name: str) -> None:
     env = eb.parallel_env(scenario=PAPER, reward={"harm": 0.0, name: 1.0})
     env.reset(seed=1)
@@ -190,29 +189,33 @@ def test_term__built_in_is_counted_as_soon_as_it_has_a_weight(name: str) -> None
 
 
 @pytest.mark.parametrize(
-    ("term", "error", "message"),
+    ("later", "message"),
     [
-        (lambda step: np.where(np.arange(3) == 2, np.nan, 0.0), InvalidInput, "in world 2 at step 1; must be finite"),
-        (lambda step: step.speed_mps, InvalidInput, r"at step 1: AttributeError: .*test_extending.py, line \d+"),
-        (lambda step: step.speeds_mps.fill(0.0), ValueError, "read-only"),
+        (lambda step: np.array([0.0, 0.0, np.nan]), "is nan in world 2 at step 1; must be finite"),
+        (lambda step: step.speed_mps, r"at step 1: its function fails: AttributeError: .*test_extending.py, line \d+"),
+        (lambda step: step.speeds_mps.fill(0.0), "read-only"),
+        (lambda step: np.zeros((3, 4)), r"at step 1: gave float64 of shape \(3, 4\); must be numbers of shape"),
+        (lambda step: np.zeros((3, 3)), "gave a number per vehicle; when it was registered it gave a number per world"),
     ],
 )
-def test_term__that_is_wrong_is_named_and_the_step_is_not_made(term: Any, error: Any, message: str) -> None:
-    eb.register_term("mine", changed(term))
+def test_term__that_is_wrong_is_named_and_the_step_is_not_made(later: Any, message: str) -> None:
+    term = changed(lambda step: later(step) if len(step.time_s) == 3 else np.zeros(len(step.time_s)))
+    eb.register_measure("mine", term, by="step")
     engine = engine_of(reward={"harm": 1.0, "mine": 2.0})
     before = engine.packed.state.copy()
-    with pytest.raises(error, match=message):
+    with pytest.raises(InvalidInput, match=message):
         engine.step(np.zeros((3, 1)))
     assert engine.packed.state.tobytes() == before.tobytes()
 
 
 def test_term__counts_in_running_worlds_only() -> None:
-    eb.register_term("mine", changed(lambda step: np.where(step.speeds_mps.max(axis=1) > 0.0, 1.0, np.nan)))
+    moving = changed(lambda step: np.where(step.speeds_mps.max(axis=1) > 0.0, 1.0, np.nan))
+    eb.register_measure("mine", moving, by="step")
     engine = engine_of(1, reward={"harm": 1.0, "mine": 2.0})
     with pytest.raises(InvalidInput, match="at step"):
         for _ in range(90):
             engine.step(-np.ones((1, 1)))
-    eb.register_term("calm", one)
+    eb.register_measure("calm", one, by="step")
     ending = engine_of(2, reward={"harm": 1.0, "mine": 0.0, "calm": 1.0})
     while not ending.ended.all():
         last = ending.step(-np.ones((2, 1)))
@@ -258,7 +261,7 @@ def test_schemas__know_what_is_registered() -> None:
     assert {"urgency", "front_1.load", "own"} <= set(parts["observation"]["anyOf"][0]["items"]["anyOf"][0]["enum"])
     assert "rural" in json.dumps([parts["v2x"], schema.get("$defs", {})])
     assert "front-first" in json.dumps(parts["objective"])
-    assert weights["calm"]["minimum"] == weights["harm"]["minimum"] == 0
+    assert weights["calm"]["type"] == "number" and weights["harm"]["minimum"] == 0
     assert "observation" not in PAPER.model_dump() and "observation" not in TINY_PPO.model_dump()
 
 
@@ -291,14 +294,8 @@ def test_measure__sees_every_impact_whatever_the_chunk_and_changes_nothing_else(
     assert evaluated(aftermath=False).outcome("full_brake").metrics == {}
 
 
-def test_measure__of_each_vehicle_stands_in_rows_frame_markdown_and_report() -> None:
-    eb.register_measure("squared", squared, unit="m2/s2")
-    injury = changed(lambda episodes: 1.0 / (1.0 + np.exp(4.457 - 0.177 * episodes.largest_speed_change_mps)))
-    eb.register_measure("injured", injury, unit="1")
-    eb.register_measure("change", changed(lambda episodes: episodes.largest_speed_change_mps), unit="m/s")
-    struck = changed(lambda each: np.isin(np.arange(each.worlds.n), each.rows.world[each.rows.pair == 1]))
-    eb.register_measure("rear_ended", struck, unit="1")  # whether Vehicle 3 hit Vehicle 2
-    found = evaluated()
+def test_measure__of_each_vehicle_stands_in_rows_frame_and_markdown() -> None:
+    found = measured_by_vehicle()
     rows, braked = eb.summarise(found), found.outcome("full_brake")
     changes = np.stack([braked.metrics[f"change_{i}"] for i in (1, 2, 3)], axis=1)
     assert (((changes > 0.0).sum(axis=1) > 1) == braked.collided).all() and (changes >= 0.0).all()  # of both in a pair
@@ -308,11 +305,20 @@ def test_measure__of_each_vehicle_stands_in_rows_frame_markdown_and_report() -> 
     told = rows[0].to_json()
     assert told["metric_squared"] == near(told["total_harm"]) and len(told["metric_injured_3_interval"]) == 2
     assert told["metrics"]["injured_3"] == "injured, vehicle 3 (1)"
-    frame, report = found.to_frame("columns"), Report("mine", rows, found).html
+    frame = found.to_frame("columns")
     assert frame["metric_squared"] == near(frame["total_harm"])
-    for text in (rows.markdown(), report):
-        assert "squared (m2/s2)" in text and "injured, vehicle 2 (1)" in text
-    assert "Squared closing speed of every impact." in report
+    text = rows.markdown()
+    assert "squared (m2/s2)" in text and "injured, vehicle 2 (1)" in text
+
+
+def measured_by_vehicle() -> Any:
+    eb.register_measure("squared", squared, unit="m2/s2")
+    injury = changed(lambda episodes: 1.0 / (1.0 + np.exp(4.457 - 0.177 * episodes.largest_speed_change_mps)))
+    eb.register_measure("injured", injury, unit="1")
+    eb.register_measure("change", changed(lambda episodes: episodes.largest_speed_change_mps), unit="m/s")
+    struck = changed(lambda each: np.isin(np.arange(each.worlds.n), each.rows.world[each.rows.pair == 1]))
+    eb.register_measure("rear_ended", struck, unit="1")  # whether Vehicle 3 hit Vehicle 2
+    return evaluated()
 
 
 def test_measure__one_function_and_it_stands_in_every_output(
@@ -328,12 +334,11 @@ def test_measure__one_function_and_it_stands_in_every_output(
         assert run_command(["evaluate", *agents, *words]) == 0
         return capsys.readouterr().out
 
-    text = " ".join(told("--episodes", "40", "--output", "out", "--per-world", "csv", "--report").split())
+    text = " ".join(told("--episodes", "40", "--output", "out", "--per-world", "csv").split())
     rows = list(csv.DictReader(Path("out/worlds.csv").read_text().splitlines()))[:40]
     change, hit = (np.array([float(row[name]) for row in rows]) for name in names)
     assert np.ptp(change) > 1.0 and set(hit) == {0.0, 1.0} and ((change > 2.0) == hit).all()
-    for page in (text, Path("out/report.html").read_text()):
-        assert "change_of_rear (m/s)" in page and f"{change.mean():.2f}" in page and "hit_hard (1)" in page
+    assert "change_of_rear (m/s)" in text and f"{change.mean():.2f}" in text and "hit_hard (1)" in text
     results = json.loads(Path("out/results.json").read_text())[0]
     expected = [mean(change), rate(int(hit.sum()), 40)]
     assert [(results[n], tuple(results[f"{n}_interval"])) for n in names] == [(e.value, e.interval) for e in expected]
@@ -376,27 +381,4 @@ def test_folder__makes_its_scenarios_known_by_name_and_to_the_command_line(
     added = [entry for entry in eb.list_scenarios() if entry not in before]
     assert [(entry.name, entry.origin) for entry in added] == [("coast-road", str(folder)), ("hills", str(folder))]
     assert eb.parallel_env(scenario="hills").reset(seed=1)[0] and {entry.origin for entry in before} == {"shipped"}
-    assert "worst" in REGISTERED
-
-
-DOCS = Path(__file__).resolve().parents[2] / "docs"
-PAGE = "".join((DOCS / f"{name}.md").read_text("utf-8") for name in ("extending", "own-policy"))
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_page__its_code_runs_from_the_top_down(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(app, "registered_commands", [*app.registered_commands])
-    code = "\n".join(re.findall("```python\n(.*?)```", PAGE, re.DOTALL))
-    names: dict[str, object] = {"__name__": "my_file"}
-    exec(compile(code, "extending.md", "exec"), names)
-    assert names["status"] == 0
-    assert run_command(["scenario", "parts"]) == 0
-    told = capsys.readouterr().out
-    assert all(name in told for name in ("comfort", "time_gap", "rural", "front-first", "patient", "absorbed"))
-    policy = eb.load_policy(tmp_path / "runs" / "again")
-    assert policy.manifest.algorithm == "patient" and "comfort" in policy.manifest.reward["terms"]
-    assert policy.manifest.observation.features[-1] == "rear_1.mass_ratio"
-    assert (tmp_path / "runs" / "again" / "harm.png").stat().st_size > 1000
+    assert "worst" in REPORTED

@@ -38,9 +38,7 @@ softer = "hills:softer"
 
 [project.entry-points."ethbrake_marl.measures"]
 worst = "hills:WORST"
-
-[project.entry-points."ethbrake_marl.rewards"]
-calm = "hills:calm"
+calm = "hills:CALM"
 
 [project.entry-points."ethbrake_marl.features"]
 urgency = "hills:URGENCY"
@@ -105,6 +103,7 @@ class PatientRecipe(PpoRecipe):
 
 
 WORST = eb.Part(worst, unit="m/s")
+CALM = eb.Part(calm, unit="m/s2", by="step")
 URGENCY = eb.Part(urgency, unit="m/s", scale=10.0, low=0.0, high=4.0)
 PATIENT = eb.Part(PatientRecipe, "ethbrake_marl.training.ppo:Ppo")
 
@@ -176,7 +175,7 @@ def test_entry_point__is_loaded_when_its_name_is_used(install: Install, capsys: 
 def test_entry_point__that_fails_is_named_and_breaks_nothing_else(
     install: Install, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    groups = ("agents", "measures", "rewards", "features", "objectives", "algorithms", "commands", "shields")
+    groups = ("agents", "measures", "features", "objectives", "algorithms", "commands", "shields")
     install("broken", "import nothing_of_this_name\n", **{group: {"hills": "broken:part"} for group in groups})
     told = "broken:part of the installed package broken: cannot be imported: ModuleNotFoundError: No module named"
     for use in (
@@ -266,14 +265,14 @@ def test_measures__of_a_file_are_told_where_it_is_named(tmp_path: Path, capsys: 
 def test_scenario_recipe_and_bundle__run_no_file_that_they_name(tmp_path: Path) -> None:
     (tmp_path / "evil.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
     evil = f"{tmp_path}/evil.py:make"
-    paper, quick = eb.load_scenario("paper-random"), eb.load_recipe("quick")
+    paper, ppo = eb.load_scenario("paper-random"), eb.load_recipe("ppo")
     for use in (
         lambda: paper.replace(roles={"vehicle_1": evil}),
         lambda: paper.replace(objective=evil),
         lambda: paper.replace(observation=[evil]),
-        lambda: quick.replace(algorithm=evil),
-        lambda: quick.replace(reward={"harm": 1.0, evil: 1.0}),
-        lambda: quick.replace(observation=[evil]),
+        lambda: ppo.replace(algorithm=evil),
+        lambda: ppo.replace(reward={"harm": 1.0, evil: 1.0}),
+        lambda: ppo.replace(observation=[evil]),
     ):
         with pytest.raises(InvalidInput):
             use()

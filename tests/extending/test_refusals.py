@@ -34,7 +34,7 @@ NOTHING = gives(lambda episodes: np.zeros(episodes.worlds.n))
 
 
 PARTS: dict[str, Callable[[], object]] = {
-    "reward: terms: unknown reward term 'hury'": lambda: reward_params({"terms": {"hury": 1.0}}),
+    "reward: terms: unknown measure 'hury'": lambda: reward_params({"terms": {"hury": 1.0}}),
     "feature 'front_1.gap': must be 1 to 64 of a-z, 0-9 and _, beginning with a letter": lambda: eb.register_feature(
         "front_1.gap", TIME, **SCALED
     ),
@@ -74,12 +74,6 @@ PARTS: dict[str, Callable[[], object]] = {
     "recipe 'ppo': observation = [front_1.gp]: unknown feature 'front_1.gp'; did you mean 'front_1.gap'?": lambda: (
         eb.load_recipe("ppo").replace(observation=["front_1.gp"])
     ),
-    "reward term 'My term': must be 1 to 64 of a-z, 0-9 and _, beginning with a letter": lambda: eb.register_term(
-        "My term", gives(0.0)
-    ),
-    "reward term 'calm': needs a function with a docstring that says what it means": lambda: eb.register_term(
-        "calm", 5
-    ),
     "recipe 'ppo': reward.rsik: unknown key; did you mean risk?": lambda: eb.load_recipe("ppo").replace(
         reward={"harm": 1.0, "rsik": 0.5}
     ),
@@ -111,13 +105,13 @@ PARTS: dict[str, Callable[[], object]] = {
     "measure 'mine': needs a function with a docstring that says what it is": lambda: eb.register_measure(
         "mine", 3, unit="1"
     ),
-    "gave float64 of shape (); must be numbers of shape (2,), one per world, or (2, 3), one per vehicle": lambda: (
+    "gave float64 of shape (); must be numbers of shape (2,), one per world or (2, 3), one per vehicle": lambda: (
         eb.register_measure("mine", gives(1.0), unit="1")
     ),
     "measure 'mine': is nan in world 0; must be finite": lambda: eb.register_measure(
         "mine", gives(lambda episodes: np.full(episodes.worlds.n, np.nan)), unit="1"
     ),
-    "gave object of shape (); must be numbers of shape (2,), one per world, or (2, 3), one per vehicle": lambda: (
+    "gave object of shape (); must be numbers of shape (2,), one per world or (2, 3), one per vehicle": lambda: (
         eb.register_measure(
             "mine", gives(lambda episodes: np.ma.masked_array(np.zeros(episodes.worlds.n), True)), unit="1"
         )
@@ -141,8 +135,8 @@ THERE: dict[str, Callable[[], object]] = {
         "front_1", TIME, **SCALED
     ),
     "feature 'gap' is registered already; give another name": lambda: eb.register_feature("gap", TIME, **SCALED),
-    "reward term 'jerk' is registered already; give another name": lambda: eb.register_term("jerk", gives(0.0)),
-    "reward term 'k_energy' is registered already; give another name": lambda: eb.register_term("k_energy", gives(0.0)),
+    "measure 'jerk' is registered already; give another name": lambda: eb.register_measure("jerk", NOTHING),
+    "measure 'k_energy' is registered already; give another name": lambda: eb.register_measure("k_energy", NOTHING),
     "preset 'nominal' is registered already; give another name": lambda: eb.register_preset(
         "nominal", {"lost": 0.1, "preset": "clear"}
     ),
@@ -177,11 +171,11 @@ def test_name__is_unknown(message: str) -> None:
     "register",
     [
         lambda value: eb.register_feature("mine", value, **SCALED),
-        lambda value: eb.register_term("mine", value),
+        lambda value: eb.register_measure("mine", value, by="step"),
         lambda value: eb.register_objective("mine", value),
         lambda value: eb.register_measure("mine", value, unit="1"),
     ],
-    ids=["feature", "term", "objective", "measure"],
+    ids=["feature", "measure by step", "objective", "measure by impacts"],
 )
 def test_part__needs_a_docstring_and_a_name_that_no_other_part_has(register: Callable[[Any], None]) -> None:
     with refused(" 'mine': needs a function with a docstring that says what it"):
@@ -203,17 +197,22 @@ def started(reward: dict[str, Any]) -> Any:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (lambda step: step.speeds_mps[:, :2], "gave float64 of shape (1, 2); must be numbers of shape (1,), (1, 1)"),
-        ("no", "gave <U2 of shape (); must be numbers of shape (1,), (1, 1) (one per learner) or (1, 3)"),
-        (None, "gave object of shape (); must be numbers of shape (1,), (1, 1) (one per learner) or (1, 3)"),
-        (lambda step: np.full(len(step.time_s), np.nan), "is nan for vehicle_1 in world 0 at step 1; must be finite"),
+        (lambda step: step.speeds_mps[:, :1], "gave float64 of shape (2, 1); must be numbers of shape (2,), one per"),
+        (
+            "no",
+            "gave <U2 of shape (); must be numbers of shape (2,), one per world or (2, 3), one per vehicle or (2, 2)",
+        ),
+        (None, "gave object of shape (); must be numbers of shape (2,), one per world or (2, 3), one per vehicle"),
+        (lambda step: np.full(len(step.time_s), np.nan), "is nan in world 0; must be finite"),
+        (lambda step: np.full(step.speeds_mps.shape, np.inf), "is inf for vehicle_1 in world 0; must be finite"),
+        (lambda step: step.speed_mps, "its function fails: AttributeError: 'StepOutcome' object has no attribute"),
+        (lambda step: step.speeds_mps.fill(0.0), "its function fails: ValueError: assignment destination is read-only"),
     ],
-    ids=["shape", "text", "nothing", "nan"],
+    ids=["shape", "text", "nothing", "nan", "inf", "fails", "writes"],
 )
-def test_reward_term__gives_a_finite_number_per_vehicle(given: Any, message: str) -> None:
-    eb.register_term("mine", gives(given))
-    with refused(f"reward term 'mine': {message}"):
-        started({"harm": 1.0, "mine": 2.0}).step({"vehicle_2": [0.0]})
+def test_measure_by_step__gives_a_finite_number_per_vehicle(given: Any, message: str) -> None:
+    with refused(f"measure 'mine': {message}"):
+        eb.register_measure("mine", gives(given), by="step")
 
 
 @pytest.mark.parametrize(

@@ -18,12 +18,8 @@ from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 from ethbrake_marl.shield.step import StepShield
-from tests.fixtures.extensions import of
 from tests.physics.random_worlds import Draws, driving_lines
 from tests.shield.attacks import line
-
-RobustShield = of("certified.robust_step", "RobustShield")
-parse_uncertainty = of("certified.uncertainty", "parse_uncertainty")
 
 GOLDEN = Path(__file__).with_name("physics_worlds.json")
 LINES = {  # by name: vehicles and worlds
@@ -35,16 +31,10 @@ UNTIL_S = (0.1, 0.2, 0.7, 1.3, 2.0, 4.0, 8.0)  # the command changes at each
 SCENARIO_WORLDS = Path(__file__).with_name("scenario_worlds.json")
 WORLDS = 1_000
 
-DECISIONS = {
-    "paper": "e588aa78dd473755",
-    "five vehicles": "ce8815bf25435b2b",
-    "robust": "8845d4c2238eac5c",
-    "obstacle": "e97447f43f026090",
-}
+DECISIONS = {"paper": "e588aa78dd473755", "five vehicles": "ce8815bf25435b2b", "obstacle": "e97447f43f026090"}
 SHIELDS = {
     "paper": lambda: (StepShield(load_scenario("paper-random"), 1), 60),
     "five vehicles": lambda: (StepShield(line(5), 2, harm_count="total"), 40),
-    "robust": lambda: (RobustShield(load_scenario("paper-random"), 1, uncertainty=parse_uncertainty("gaps_m=0.5")), 10),
     "obstacle": lambda: (StepShield(load_scenario("paper-random-obstacle"), 1, harm_count="total"), 40),
 }
 
@@ -103,8 +93,8 @@ def test_scenario__worlds_are_what_they_were(name: str) -> None:
 def decisions_hash(shield: StepShield, worlds: int) -> str:
     """A hash of all that is decided about random proposals, some of them beyond the range or no number."""
     shield.begin(shield.scenario.sample(worlds, 3).worlds, np.arange(worlds))
-    rng, digest = np.random.default_rng(0), hashlib.sha256(shield.first_bound.tobytes())
-    while not shield.running.finished.all():
+    rng, digest = np.random.default_rng(0), hashlib.sha256(shield.memory.first_bound.tobytes())
+    while not shield.memory.running.finished.all():
         proposed = np.where(rng.random(worlds) < 0.05, np.nan, rng.uniform(-1.2, 1.2, worlds))
         decision = shield.decide(proposed)
         for column in (decision.applied, decision.reason, decision.bound, decision.margin, decision.intervened):

@@ -11,7 +11,6 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import script_agents
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, UnknownName
 from ethbrake_marl.evaluation.trial import load_runnable
-from ethbrake_marl.extensions.learners.start_weights import widened
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.files.store import hold_lock
 from ethbrake_marl.policies.bundle import load_policy
@@ -25,7 +24,7 @@ from ethbrake_marl.training.team import load_team
 from ethbrake_marl.training.training import Training, check_same_training
 from tests.fixtures.policies import make_policy
 from tests.learning.test_algorithms import A2C, recipe_file
-from tests.learning.tiny import TINY_COUNTERFACTUAL, TINY_MODES, TINY_OPTIONS, TINY_PPO
+from tests.learning.tiny import TINY_PPO
 from tests.refused import refused
 
 PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
@@ -58,11 +57,6 @@ def recipe(old: str, new: str) -> Any:
     return load_recipe("mine.yaml")
 
 
-def modes(**changes: Any) -> Any:
-    """The recipe of several networks, with changes in how they are trained."""
-    return TINY_MODES.replace(modes=TINY_MODES.model_dump(mode="json")["modes"] | changes)
-
-
 RECIPES: dict[str, Callable[[], object]] = {
     "mine.yaml, line 4: n_env: unknown key; did you mean n_envs?": lambda: recipe("n_envs: 16", "n_env: 16"),
     "mine.yaml, line 15: network.policies: unknown key; did you mean policy?": lambda: recipe(
@@ -74,7 +68,7 @@ RECIPES: dict[str, Callable[[], object]] = {
     ),
     "mine.yaml, line 9: gamma = .nan: must be a finite number": lambda: recipe("gamma: 0.99", "gamma: .nan"),
     "mine.yaml, line 9: gamma = 1.5: must be less than or equal to 1": lambda: recipe("gamma: 0.99", "gamma: 1.5"),
-    "must be one of counterfactual, options, ppo, sac": lambda: recipe("algorithm: ppo", "algorithm: trpo"),
+    "mine.yaml, line 2: algorithm = trpo: must be one of ": lambda: recipe("algorithm: ppo", "algorithm: trpo"),
     "must be a whole number, written without a decimal point": lambda: recipe("total_steps: 4096", "total_steps: 1e6"),
     "mine.yaml, line 8: learning_rate.start = -0.001: must be greater than 0": lambda: recipe(
         "start: 1e-3", "start: -1e-3"
@@ -100,29 +94,6 @@ RECIPES: dict[str, Callable[[], object]] = {
     ),
     "recipe 'sac': buffer_size = 63: must be at least n_envs = 128": lambda: load_recipe("sac").replace(buffer_size=63),
     "recipe 'sac': n_steps: unknown key; did you mean total_steps?": lambda: load_recipe("sac").replace(n_steps=3),
-    "recipe 'options': averaging = 1: must be less than 1": lambda: load_recipe("options").replace(averaging=1.0),
-    "recipe 'options': near = [{smallest: 0.1, largest: 1}, {smallest: 0.1, largest: 1}...": lambda: load_recipe(
-        "options"
-    ).replace(near=[{"smallest": 0.1, "largest": 1.0}] * 9),
-    "recipe 'counterfactual': reward.shaping = 0.1: must be 0: what is tried is played to the end": lambda: (
-        TINY_COUNTERFACTUAL.replace(reward={"harm": 1.0, "shaping": 0.1})
-    ),
-    "recipe 'counterfactual': offset.largest = 0.1: must be at least smallest = 0.3": lambda: (
-        TINY_COUNTERFACTUAL.replace(offset={"smallest": 0.3, "largest": 0.1})
-    ),
-    "recipe 'counterfactual': gradient_limit = often: must be auto or a finite number above 0": lambda: (
-        TINY_COUNTERFACTUAL.replace(gradient_limit="often")
-    ),
-    "must be ppo@, counterfactual@ or universal@": lambda: TINY_COUNTERFACTUAL.replace(start="sac@shipped"),
-    "n_envs x n_steps = 16777216 decisions per update; at most": lambda: TINY_COUNTERFACTUAL.replace(n_envs=2**22),
-    "must be single, shared, independent or centralised": lambda: TINY_COUNTERFACTUAL.replace(scheme="centralized"),
-    "recipe 'options': memory = 15: must be at least tried = 16": lambda: TINY_OPTIONS.replace(memory=15),
-    "must hold a range where there are neither fixed": lambda: TINY_OPTIONS.replace(near=[], fixed=[], drawn=0),
-    "recipe 'counterfactual': modes.networks = 1: must be greater than or equal to 2": lambda: modes(networks=1),
-    "recipe 'counterfactual': modes.shares = {alone: 0.5, further: 0.5, gate: 0.5, together: 0}: alone": lambda: modes(
-        shares={"alone": 0.5, "further": 0.5, "gate": 0.5, "together": 0.0}
-    ),
-    "recipe 'counterfactual': modes.gat: unknown key; did you mean gate?": lambda: modes(gat=[8]),
 }
 
 
@@ -159,15 +130,6 @@ def test_setting__is_refused(message: str) -> None:
 
 
 TRAININGS: dict[str, Callable[[], object]] = {
-    "runs/mine: is not a folder; give a policy bundle (manifest.json, weights.safetensors) or a run": lambda: train(
-        load_recipe("counterfactual").replace(start="ppo@runs/mine"), "cooperation-2-five", "run", steps=1
-    ),
-    "recipe 'options': drawn = 2: must be at most the 1 of among": lambda: train(
-        load_recipe("options").replace(among=["policy@shipped/ppo"]), "paper-random", "new"
-    ),
-    "recipe 'options': among: sac@shipped/ppo: give policy@shipped/NAME, or ppo@ and its path": lambda: train(
-        load_recipe("options").replace(among=["sac@shipped/ppo"], drawn=1), "paper-random", "new"
-    ),
     "algorithm 'My algorithm': must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _": lambda: (
         register_algorithm("My algorithm", PpoRecipe, Ppo)
     ),
@@ -201,7 +163,6 @@ TRAININGS: dict[str, Callable[[], object]] = {
     "recipe 'ppo': turns = 5: 2 learners need 10 updates, total_steps = 2048 are 8": lambda: train(
         TINY_PPO, PAIR, Path("run"), scheme="independent", steps=2048, turns=5
     ),
-    "recipe 'counterfactual': modes: are for one learner, not for 2": lambda: train(TINY_MODES, PAIR, Path("run")),
     ".: holds no training; give the folder of a run": lambda: resume(Path()),
     ".: holds no team (team.json); give the folder of a run, or a bundle as ppo@.": lambda: load_team(Path(), PAIR),
 }
@@ -216,9 +177,6 @@ def test_training__is_refused(message: str) -> None:
 
 NAMES: dict[str, Callable[[], object]] = {
     "unknown recipe 'ppo-papre'; did you mean 'ppo-paper'?": lambda: load_recipe("ppo-papre"),
-    "unknown shipped policy 'nobody'": lambda: train(
-        load_recipe("options").replace(among=["policy@shipped/nobody"], drawn=1), "paper-random", "new"
-    ),
     "unknown recipe 'pppo'; did you mean 'ppo'?": lambda: train("pppo", PAPER, Path("run")),
     "unknown scenario 'paper-randm'; did you mean 'paper-random'?": lambda: train("ppo", "paper-randm", Path("run")),
     "unknown setting 'gama'; did you mean 'gamma'?": lambda: read_settings(["gama=0.9"], [PPO]),
@@ -241,40 +199,12 @@ def test_algorithm__has_a_name_of_its_own() -> None:
         register_algorithm("ppo", PpoRecipe, Ppo)
 
 
-def test_observation_and_network__hold_those_of_the_policy_to_start_from() -> None:
-    turned = load_recipe("counterfactual").replace(observation=["own", "front_1", "contact"])
-    with refused("observation: lacks rear_1.known, rear_1.gap, rear_1.closing_speed, rear_1.acceleration"):
-        widened(eb.load_shipped("ppo"), Training.of(turned, PAPER))
-    smaller = load_recipe("counterfactual").replace(network={"policy": [64, 64]})
-    with refused(
-        "network: policy_hidden is (64, 64), but (128, 128) in the policy to start from; they must be the same"
-    ):
-        widened(eb.load_shipped("ppo"), Training.of(smaller, PAPER))
-
-
-def test_policy_to_start_from__has_one_network(empty_folder: Path) -> None:
-    several = {"networks": 3, "gate_hidden": (6,), "value_hidden": ()}
-    several = make_policy(eb.ObservationSpec(), {"name": "paper-random"}, "counterfactual", **several)
-    several.save(Path("first"))
-    with refused("recipe 'counterfactual': start: has 3 networks; give a policy of one"):
-        train(TINY_MODES.replace(start="counterfactual@first"), PAPER, Path("run"))
-
-
-def test_tried_actions__are_at_most_the_decisions_of_an_update() -> None:
-    assert TINY_COUNTERFACTUAL.replace(counterfactuals=32).counterfactuals == 8 * 4
-    with refused("counterfactuals = 33: must be at most n_envs x n_steps = 32"):
-        TINY_COUNTERFACTUAL.replace(counterfactuals=33)
-    assert TINY_OPTIONS.replace(tried=32, memory=99).tried == 8 * 4
-    with refused("tried = 33: must be at most n_envs x n_steps = 32"):
-        TINY_OPTIONS.replace(tried=33, memory=99)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"n_stepz": 3}, "mine.yaml, line 23: n_stepz: unknown key; did you mean n_steps?"),
         ({"n_steps": 2.5}, "mine.yaml, line 22: n_steps = 2.5: must be a whole number"),
-        ({"algorithm": "a3c"}, "mine.yaml, line 1: algorithm = a3c: must be one of counterfactual, options, ppo, sac"),
+        ({"algorithm": "a3c"}, "mine.yaml, line 1: algorithm = a3c: must be one of "),
         ({"scheme": "independent"}, "scheme independent: recipe 'mine' is for A2C; it needs one for PPO"),
     ],
     ids=lambda value: str(value)[:30],

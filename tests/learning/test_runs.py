@@ -13,7 +13,6 @@ from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -26,7 +25,6 @@ from ethbrake_marl.cli.train import run_folder
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import summarise
-from ethbrake_marl.extensions.search import limits, regret
 from ethbrake_marl.files.store import new_folder, write_file
 from ethbrake_marl.game.objectives import objective_harm, objectives_of
 from ethbrake_marl.policies.bundle import load_policy
@@ -34,6 +32,7 @@ from ethbrake_marl.policies.layers import dense
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.teams import Trained, read_trained
 from ethbrake_marl.progress import Progress
+from ethbrake_marl.scenario.catalogue import shipped_folder
 from ethbrake_marl.training import (
     model_state,
     models,
@@ -51,19 +50,19 @@ from ethbrake_marl.training.session import TrainResult, resume
 from ethbrake_marl.training.training import Training
 from tests.docs.site import load
 from tests.learning.tiny import (
-    MODES,
-    TINY_COUNTERFACTUAL,
-    TINY_MODES,
-    TINY_OPTIONS,
+    LINKS,
+    OUTSIDE,
+    PRECIOUS,
     TINY_PPO,
     TINY_SAC,
     Answer,
     ctrl_c_in,
     files_of,
+    link_out,
+    newest,
     scalars,
     watch_steps,
 )
-from tests.programmes.files import CHANGES, newest
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of those who read event files
 SCENARIO = eb.load_scenario("paper-random")
@@ -160,17 +159,15 @@ def test_train__stops_where_it_should_and_goes_on_to_the_same_bits(tmp_path: Pat
     assert files_of(run) == files_of(tmp_path / "whole")
 
 
-def test_train__measures_what_an_evaluation_of_the_kept_policy_tells_and_proves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    prove = Mock(side_effect=limits.known_limits)
-    monkeypatch.setattr(regret, "known_limits", prove)
-    result = train_module.train(TINY, SCENARIO, tmp_path / "run", steps=UPDATE, on_progress=None)
-    prove.assert_not_called()
+def test_train__measures_what_an_evaluation_of_the_kept_policy_tells(tmp_path: Path) -> None:
+    check_measured(tmp_path / "run")
+
+
+def check_measured(run: Path) -> None:
+    result = train_module.train(TINY, SCENARIO, run, steps=UPDATE, on_progress=None)
     worlds = result.training.scenario.sample(TINY.evaluation.worlds, TINY.evaluation.seed)
     agents = {"policy": eb.LearnedAgent(result.last_policy, "policy")}
     (row,) = summarise(evaluate(worlds, agents, scenario=result.training.scenario))
-    prove.assert_called_once()
     names = ("first_impact_harm", "total_harm", "collision_rate")
     told = {name: getattr(row, name).value for name in names} | {"horizon_rate": row.horizon_ends / row.episodes}
     assert result.evaluations[-1].items() >= told.items()
@@ -219,28 +216,26 @@ def test_train__an_error_of_the_callers_function_is_passed_on(tmp_path: Path) ->
     assert load_policy(tmp_path / "run").manifest.steps == 0
 
 
-OF_THEIR_KIND = ("cooperation", "cooperation-ppo", "modes", "ppo-paper", "sac-paper")  # others differ in numbers
+OF_THEIR_KIND = ("cooperation-ppo", "ppo-paper", "sac-paper")  # others differ in numbers
+CORE_RECIPES = [name for name, file in TrainingRecipe.shipped().items() if file.parent == shipped_folder("train")]
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=() if name in OF_THEIR_KIND else pytest.mark.slow)
-        for name in sorted(TrainingRecipe.shipped())
-    ],
+    "name", [pytest.param(name, marks=() if name in OF_THEIR_KIND else pytest.mark.slow) for name in CORE_RECIPES]
 )
 def test_shipped_recipe__trains_for_one_update(name: str, tmp_path: Path) -> None:
     recipe = load_recipe(name)
     if recipe.algorithm == "ppo":
         recipe = recipe.replace(n_envs=16, n_steps=recipe.batch_size // 16)
-    elif recipe.algorithm == "sac":
+    else:
         recipe = recipe.replace(n_envs=1)
-    else:  # the fewest worlds whose decisions can be split into batches and tried
-        most = max(recipe.batch_size, recipe.tried if recipe.algorithm == "options" else recipe.counterfactuals)
-        recipe = recipe.replace(n_envs=-(-most // recipe.rounds))
-    result = train(recipe, SCENARIO, tmp_path / "run", steps=1)
+    check_one_update(recipe, tmp_path / "run")
+
+
+def check_one_update(recipe: TrainingRecipe, run: Path) -> None:
+    result = train(recipe, SCENARIO, run, steps=1)
     assert (result.status, result.updates, result.steps) == ("finished", 1, recipe.n_envs * recipe.rounds)
-    assert load_policy(tmp_path / "run").manifest.algorithm == recipe.algorithm
+    assert load_policy(run).manifest.algorithm == recipe.algorithm
 
 
 @pytest.mark.parametrize("terminal", [False, True])
@@ -291,18 +286,6 @@ def test_progress__calls_harm_only_what_somebody_bears(objective: str, words: st
     total = TINY.replace(reward=TINY.reward.model_copy(update={"harm_count": "total"}))
     said = progress_module.objective_in_words(Training.of(total, SCENARIO.replace(objective=objective)))
     assert said == words.replace("by first", "by all").replace("first-impact", "total")
-
-
-GOAL = 1.10  # harm of the policy, in the least harm known
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("seed", range(3))
-def test_quick__ends_near_the_best_known_for_every_seed(seed: int, tmp_path: Path) -> None:
-    result = train_module.train("quick", "paper-random", tmp_path / "run", seed=seed, on_progress=None)
-    agents = {"last": eb.LearnedAgent(result.last_policy), "kept": eb.LearnedAgent(result.policy)}
-    for row in summarise(evaluate(SCENARIO.sample(10_000, seed=7), agents, scenario=SCENARIO, aftermath=False)):
-        assert row.first_impact_harm.value <= GOAL * row["best_known_first_impact_harm"].value
 
 
 def test_course__the_best_is_judged_by_the_count_of_the_reward_and_comes_back_from_json(policy) -> None:
@@ -393,8 +376,6 @@ MIXTURE = eb.load_scenario(
 REMEMBERING = PAPER.replace(
     early_impacts="keep", roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "e_v2x_bm:pairwise"}
 )
-AMONG = {"among": ["policy@shipped/ppo", "policy@shipped/sac"], "drawn": 2, "near": [], "focus": 0.5,
-         "relative": True, "tie_break": 0.5, "observation": ["own", "front_1", "rear_1", "contact"]}  # fmt: skip
 PPO = TINY_PPO.replace(total_steps=8 * 128)
 TEAM = TINY_PPO.replace(total_steps=6 * 256)
 TRAININGS = {
@@ -406,11 +387,6 @@ TRAININGS = {
     "independent": (TEAM.replace(scheme="independent"), PAIR),
     "turns": (TEAM.replace(scheme="independent", turns=2), PAIR),
     "centralised": (TEAM.replace(scheme="centralised"), PAIR),
-    "counterfactual": (TINY_COUNTERFACTUAL.replace(gradient_limit="auto"), PAPER),
-    "modes": (TINY_MODES, PAPER),
-    "options": (TINY_OPTIONS, PAPER),
-    "among": (TINY_OPTIONS.replace(**AMONG), MIXTURE),
-    "scout": (TINY_MODES.replace(focus=0.75, modes=MODES | {"tie_break": 0.0}), PAPER),
 }
 Whole = Callable[[str], tuple[Path, TrainResult]]
 
@@ -437,21 +413,25 @@ def told_by(run: Path) -> tuple[list[dict[str, str]], dict[str, dict[int, float]
     )
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
+def trained_once(trainings: Mapping[str, Any], factory: pytest.TempPathFactory) -> Whole:
     """The training of each kind that nobody stops."""
     made: dict[str, tuple[Path, TrainResult]] = {}
 
     def get(name: str) -> tuple[Path, TrainResult]:
         if name not in made:
-            folder = tmp_path_factory.mktemp("whole") / name
-            made[name] = folder, train(*TRAININGS[name], folder, measure=measure)
+            folder = factory.mktemp("whole") / name
+            made[name] = folder, train(*trainings[name], folder, measure=measure)
         return made[name]
 
     return get
 
 
-def stop(name: str, run: Path, at: tuple[str, int]) -> TrainResult:
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
+    return trained_once(TRAININGS, tmp_path_factory)
+
+
+def stop(training: tuple[TrainingRecipe, eb.Scenario], run: Path, at: tuple[str, int]) -> TrainResult:
     """Train until Ctrl-C in a step of the environment, or after an update."""
     unit, number = at
 
@@ -461,14 +441,14 @@ def stop(name: str, run: Path, at: tuple[str, int]) -> TrainResult:
 
     with pytest.MonkeyPatch.context() as patch:
         watch_steps(patch, ctrl_c_in(number if unit == "step" else 0))
-        return train(*TRAININGS[name], run, measure=measure, on_progress=ctrl_c)
+        return train(*training, run, measure=measure, on_progress=ctrl_c)
 
 
 @pytest.fixture(scope="module")
 def stopped_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A PPO run stopped with two checkpoints."""
     run = tmp_path_factory.mktemp("stopped") / "run"
-    stop("ppo", run, ("step", 100))
+    stop(TRAININGS["ppo"], run, ("step", 100))
     assert len(list(run.glob("checkpoints/step_*"))) == 2
     return run
 
@@ -493,19 +473,14 @@ FAST = [("ppo", 37), ("sac", 52), ("mixture", 70), ("remembering", 100), ("turns
     ("name", "at"),
     [
         *((name, ("step", step)) for name, step in FAST),
-        ("counterfactual", ("update", 5)),
-        ("modes", ("update", 5)),
-        ("among", ("update", 5)),
         *(
-            pytest.param(name, (unit, number), marks=pytest.mark.slow)
-            for name, unit, numbers in (
-                ("ppo", "step", (1, 61, 76)),
-                ("sac", "step", (1, 37, 61)),
-                ("shared", "step", (72,)),
-                ("independent", "step", (72,)),
-                ("centralised", "step", (72,)),
-                ("modes", "update", (3, 7)),  # in its other stages
-                ("scout", "update", (5,)),
+            pytest.param(name, ("step", number), marks=pytest.mark.slow)
+            for name, numbers in (
+                ("ppo", (1, 61, 76)),
+                ("sac", (1, 37, 61)),
+                ("shared", (72,)),
+                ("independent", (72,)),
+                ("centralised", (72,)),
             )
             for number in numbers
         ),
@@ -515,13 +490,18 @@ FAST = [("ppo", 37), ("sac", 52), ("mixture", 70), ("remembering", 100), ("turns
 def test_resume__after_ctrl_c_everything_is_as_if_nobody_had_stopped_it(
     name: str, at: tuple[str, int], whole: Whole, tmp_path: Path
 ) -> None:
-    reference, expected = whole(name)
-    stopped = stop(name, tmp_path / "run", at)
+    check_resumed(TRAININGS[name], tmp_path / "run", at, *whole(name))
+
+
+def check_resumed(
+    training: tuple[TrainingRecipe, eb.Scenario], run: Path, at: tuple[str, int], reference: Path, expected: TrainResult
+) -> None:
+    stopped = stop(training, run, at)
     assert stopped.status == "interrupted" and 0 <= stopped.steps < expected.steps
-    result = resume(tmp_path / "run", measure=measure)
+    result = resume(run, measure=measure)
     assert (result.status, result.steps, result.updates) == ("finished", expected.steps, expected.updates)
     assert result.evaluations == expected.evaluations
-    assert_same(tmp_path / "run", reference)
+    assert_same(run, reference)
 
 
 def test_resume__after_a_failure_and_another_stop_it_ends_as_if_nothing_had_happened(
@@ -753,20 +733,20 @@ def test_resume__a_policy_that_cannot_be_replaced_is_refused_at_once(run: Path, 
         resume(run, measure=measure)
 
 
-@pytest.mark.parametrize("category", [name for name in CHANGES if name.endswith(": link outside")])
-def test_resume__follows_no_link_out_of_the_run(run: Path, category: str) -> None:
-    outside = run.parents[1] / "outside"
+@pytest.mark.parametrize("name", LINKS)
+def test_resume__follows_no_link_out_of_the_run(run: Path, name: str) -> None:
+    outside = run.parents[1] / OUTSIDE
     (outside / "step_000000000001").mkdir(parents=True)
-    (outside / "precious.txt").write_text("years of work")
-    CHANGES[category][3](random.Random(0), run)
+    (outside / PRECIOUS).write_text("years of work")
+    link_out(name, run)
     try:
         resume(run, measure=None)
     except (InvalidInput, FileExistsError):
         pass
     else:
-        assert not CHANGES[category][2]
-    assert sorted(path.name for path in outside.iterdir()) == ["precious.txt", "step_000000000001"]
-    assert (outside / "precious.txt").read_text() == "years of work"
+        assert not LINKS[name][1]
+    assert sorted(path.name for path in outside.iterdir()) == [PRECIOUS, "step_000000000001"]
+    assert (outside / PRECIOUS).read_text() == "years of work"
 
 
 def test_learning_rate__falls_as_a_cosine_and_never_rises_again() -> None:
@@ -780,13 +760,6 @@ def test_learning_rate__falls_as_a_cosine_and_never_rises_again() -> None:
         0.0001,
     ]
     # 1e-4 + 4e-4 * (1.0 + 0.5**0.5) / 2.0 = 0.0004414213562373095
-
-
-def test_recipe__tells_only_the_keys_that_it_has() -> None:
-    told = TINY_COUNTERFACTUAL.model_dump(mode="json")
-    assert {"focus", "modes"} & told.keys() == set()
-    assert "initial_action" not in told["network"]
-    assert TINY_COUNTERFACTUAL.replace(focus=0.75).model_dump(mode="json")["focus"] == 0.75
 
 
 def test_scheme__says_who_drives_what() -> None:

@@ -1,4 +1,4 @@
-"""The scripts below train/: IPPO and MAPPO in one file each, BenchMARL's MAPPO, SuperSuit with PPO, and a clone."""
+"""The scripts below train/: IPPO and MAPPO in one file each, SuperSuit with PPO, and a clone of a dataset."""
 
 import runpy
 import sys
@@ -11,7 +11,6 @@ import torch
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.datasets.minari import write_dataset
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.training.own_team import save_team
 from ethbrake_marl.training.team import load_team
@@ -21,43 +20,52 @@ from tests.learning.tiny import harm_beside_full_braking
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning", "ignore::FutureWarning")
 TRAIN = Path(__file__).resolve().parents[2] / "train"
 PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
-RECIPE = eb.load_recipe("cooperation-ppo").replace(
-    n_envs=16, n_steps=16, batch_size=128, network={"policy": [16, 16], "value": [16, 16]}
-)
+
+
+@pytest.fixture
+def supersuit(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    module = load("../../train/supersuit_ppo")
+    monkeypatch.delitem(sys.modules, module.__name__)  # so that its functions are pickled as a script's are
+    return module
+
+
+def test_supersuit__worlds_are_seeded_and_no_two_copies_are_alike(supersuit: ModuleType) -> None:
+    seen = []
+    for seed in (5, 5, 6):
+        worlds = supersuit.make_worlds(PAIR)
+        worlds.seed(seed)
+        seen.append(worlds.reset())
+    assert seen[0].shape == (2 * supersuit.COPIES, 27)
+    assert np.array_equal(seen[0], seen[1]) and not np.array_equal(seen[0], seen[2])
+    assert len(np.unique(seen[0][::2], axis=0)) == supersuit.COPIES  # rows of Vehicle 2
+    native = eb.make_sb3_vec_env(PAIR, 1, seed=5).reset()
+    assert np.array_equal(seen[0][:2], native)  # copy 0 lives in the training worlds of its seed
 
 
 @pytest.mark.parametrize(
-    ("arguments", "extra", "message"),
-    [
-        ([], False, "-m pip install 'ethbrake-marl[marl]'"),
-        (["--scenario", "cooperation-3-pear"], False, "did you mean 'cooperation-3-pair'?"),
-        (["--recipe", "sac"], False, "recipe 'sac': is for SAC; MAPPO needs one for PPO"),
-        (["--steps", "-5"], False, "total_steps = -5: must be greater than or equal to 1"),
-        (["--output", "there"], True, "there: is there already, and is no run; give another name"),
-        (["--scenario", "cooperation-0-sensors"], True, "no vehicle learns"),
-    ],
+    ("action", "steps", "ends"), [(1.0, 85, {(True, True)}), (-1.0, 160, {(True, False)})], ids=["drive on", "brake"]
 )
-def test_mappo__refuses_what_cannot_be_before_it_trains(
-    arguments: list[str],
-    extra: bool,
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+def test_supersuit__tells_which_episodes_the_horizon_cut_off(
+    action: float, steps: int, ends: set[tuple[bool, bool]], supersuit: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "there").mkdir()
-    if extra:
-        pytest.importorskip("benchmarl", reason="needs the extra marl")
-        monkeypatch.setattr("benchmarl.experiment.Experiment.run", lambda *_: pytest.fail("training"))
-    else:
-        monkeypatch.setitem(sys.modules, "benchmarl", None)  # cannot be imported, as where the extra is missing
-    monkeypatch.setattr(sys, "argv", ["benchmarl_mappo.py", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        runpy.run_path(str(TRAIN / "benchmarl_mappo.py"), run_name="__main__")
-    told = capsys.readouterr().err
-    assert ended.value.code == 2 and message in told and (extra or told.count("\n") == 1)
-    assert list(tmp_path.rglob("*")) == [tmp_path / "there"]
+    """Who drives on is never at rest; who brakes is before the horizon."""
+    monkeypatch.setattr(supersuit, "COPIES", 4)
+    worlds = supersuit.make_worlds(PAIR)
+    worlds.seed(1)
+    worlds.reset()
+    told: set[tuple[bool, bool]] = set()
+    for _ in range(steps):
+        _, _, done, infos = worlds.step(np.full((worlds.num_envs, 1), action, np.float32))
+        over = [info for d, info in zip(done, infos, strict=True) if d]
+        told |= {(True, info.get("TimeLimit.truncated", False)) for info in over}
+        assert all(info["terminal_observation"].shape == (27,) for info in over)
+    assert told >= ends and (action < 0.0 or told == ends)
+
+
+@pytest.mark.long
+def test_supersuit__learns_to_beat_full_braking(supersuit: ModuleType, tmp_path: Path) -> None:
+    supersuit.train(PAIR, 200_000, 0, tmp_path / "run")
+    assert harm_beside_full_braking(f"ppo@{tmp_path / 'run'}") < 0.9
 
 
 SINGLE_FILES = pytest.mark.parametrize("script", ["ippo", "mappo"])
@@ -185,172 +193,3 @@ def test_save_team__refuses_layers_that_a_bundle_cannot_hold(tmp_path: Path) -> 
     with pytest.raises(InvalidInput, match="must be linear layers, with ReLU or with Tanh between them"):
         save_team(tmp_path / "a", {"vehicle_2": OwnActor(torch.nn.GELU())}, eb.parallel_env(), seed=0, steps=1)
     assert not (tmp_path / "a").exists()
-
-
-@pytest.fixture
-def mappo() -> ModuleType:
-    pytest.importorskip("benchmarl", reason="needs the extra marl")
-    return load("../../train/benchmarl_mappo")
-
-
-@pytest.mark.usefixtures("mappo")
-def test_line_env__keeps_torchrls_contract_and_shows_the_native_worlds() -> None:
-    from torchrl.envs.utils import check_env_specs
-
-    from ethbrake_marl.extensions.benchmarl.task import LineEnv
-
-    check_env_specs(LineEnv(PAIR, 4, 0, RECIPE.reward))
-    env = LineEnv(PAIR, 4, 5, RECIPE.reward)
-    native = eb.make_sb3_vec_env(PAIR, 4, seed=5, reward=RECIPE.reward, appended="state")
-    seen, rows, own = env.reset(), native.reset(), env.engine.observation.size
-    env.engine.reset(seed=5)  # reset goes on with the stream; the native interface has just begun it
-    assert seen["learners", "observation"].shape == (4, 2, own)
-    np.testing.assert_array_equal(env._observe_all()["state"].numpy(), rows[::2, own:])
-    actions = torch.full((4, 2, 1), -0.7)
-    seen["learners", "action"] = actions
-    ended = 0
-    for _ in range(90):
-        now = env._observe_all()["learners"]["observation"]
-        np.testing.assert_array_equal(now.reshape(8, own).numpy(), rows[:, :own])
-        stepped = env.step(seen.clone())["next"]
-        rows, rewards, dones, _ = native.step(actions.reshape(8, 1).numpy())
-        np.testing.assert_allclose(stepped["learners", "reward"].reshape(8).numpy(), rewards, atol=1e-6)
-        np.testing.assert_array_equal(stepped["done"][:, 0].numpy(), dones[::2])
-        ended += int(stepped["done"].sum())
-        if stepped["done"].any():
-            restart = stepped.select("done", "terminated", "truncated").clone()
-            restart["_reset"] = stepped["done"].clone()
-            env._reset(restart)
-    assert ended > 0
-
-
-@pytest.mark.usefixtures("mappo")
-def test_line_env__behind_a_shield_keeps_the_bound_of_every_alert() -> None:
-    from torchrl.envs.utils import check_env_specs
-
-    from ethbrake_marl.extensions.benchmarl.task import LineEnv, LineTask
-
-    check_env_specs(LineEnv(PAIR, 4, 0, RECIPE.reward, shield="step"))
-    config = {"scenario": PAIR, "reward": "harm", "horizon_is_end": True}
-    harm = {}
-    for shield in (None, "step"):
-        env = LineTask("pair", {**config, "shield": shield}).get_env_fun(64, True, 5, "cpu")()
-        seen = env.reset()
-        bound = env.engine.guarded.shield.first_bound.copy() if shield else np.inf
-        returned = torch.zeros(64)
-        for _ in range(90):
-            seen["learners", "action"] = torch.ones((64, 2, 1))
-            seen = env.step(seen)["next"]
-            returned += seen["learners", "reward"][:, 0, 0]
-        harm[shield] = -returned.numpy()
-        assert env.engine.ended.all() and (harm[shield] <= bound + 1e-3).all()
-    assert harm["step"].mean() < 0.5 * harm[None].mean()
-
-
-@pytest.mark.parametrize("algorithm", ["mappo", "ippo"])
-def test_mappo__leaves_a_policy_that_acts_as_benchmarls_own_does(
-    algorithm: str, mappo: ModuleType, tmp_path: Path
-) -> None:
-    from tensordict import TensorDict
-    from torchrl.envs.utils import ExplorationType, set_exploration_type
-
-    recipe = RECIPE.replace(total_steps=2 * 16 * 16 * 2, scheme="centralised")
-    experiment = mappo.make_experiment(recipe, PAIR, str(tmp_path), algorithm)
-    assert type(experiment.algorithm).__name__.lower() == algorithm
-    experiment.run()
-    policy = mappo.policy_of(experiment, recipe, PAIR)
-    assert policy.manifest.steps == 2 * 16 * 16 * 2
-    seen = eb.make_sb3_vec_env(PAIR, 50, seed=1).reset()
-    batch = TensorDict({"learners": {"observation": torch.from_numpy(seen.reshape(50, 2, -1))}}, batch_size=[50])
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        theirs = experiment.group_policies["learners"](batch)["learners", "action"].reshape(100, 1).numpy()
-    np.testing.assert_allclose(policy(seen), theirs, atol=1e-5)
-
-
-@pytest.mark.long
-def test_mappo__learns_to_beat_full_braking(mappo: ModuleType, tmp_path: Path) -> None:
-    mappo.train_mappo(eb.load_recipe("cooperation-ppo").replace(total_steps=300_000), PAIR, tmp_path / "run")
-    assert harm_beside_full_braking(f"team@{tmp_path / 'run'}") < 0.9
-
-
-@pytest.fixture
-def supersuit(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    module = load("../../train/supersuit_ppo")
-    monkeypatch.delitem(sys.modules, module.__name__)  # so that its functions are pickled as a script's are
-    return module
-
-
-def test_supersuit__worlds_are_seeded_and_no_two_copies_are_alike(supersuit: ModuleType) -> None:
-    seen = []
-    for seed in (5, 5, 6):
-        worlds = supersuit.make_worlds(PAIR)
-        worlds.seed(seed)
-        seen.append(worlds.reset())
-    assert seen[0].shape == (2 * supersuit.COPIES, 27)
-    assert np.array_equal(seen[0], seen[1]) and not np.array_equal(seen[0], seen[2])
-    assert len(np.unique(seen[0][::2], axis=0)) == supersuit.COPIES  # rows of Vehicle 2
-    native = eb.make_sb3_vec_env(PAIR, 1, seed=5).reset()
-    assert np.array_equal(seen[0][:2], native)  # copy 0 lives in the training worlds of its seed
-
-
-@pytest.mark.parametrize(
-    ("action", "steps", "ends"), [(1.0, 85, {(True, True)}), (-1.0, 160, {(True, False)})], ids=["drive on", "brake"]
-)
-def test_supersuit__tells_which_episodes_the_horizon_cut_off(
-    action: float, steps: int, ends: set[tuple[bool, bool]], supersuit: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Who drives on is never at rest; who brakes is before the horizon."""
-    monkeypatch.setattr(supersuit, "COPIES", 4)
-    worlds = supersuit.make_worlds(PAIR)
-    worlds.seed(1)
-    worlds.reset()
-    told: set[tuple[bool, bool]] = set()
-    for _ in range(steps):
-        _, _, done, infos = worlds.step(np.full((worlds.num_envs, 1), action, np.float32))
-        over = [info for d, info in zip(done, infos, strict=True) if d]
-        told |= {(True, info.get("TimeLimit.truncated", False)) for info in over}
-        assert all(info["terminal_observation"].shape == (27,) for info in over)
-    assert told >= ends and (action < 0.0 or told == ends)
-
-
-@pytest.mark.long
-def test_supersuit__learns_to_beat_full_braking(supersuit: ModuleType, tmp_path: Path) -> None:
-    supersuit.train(PAIR, 200_000, 0, tmp_path / "run")
-    assert harm_beside_full_braking(f"ppo@{tmp_path / 'run'}") < 0.9
-
-
-@pytest.fixture
-def clone() -> ModuleType:
-    pytest.importorskip("pyarrow")
-    return load("../../train/clone")
-
-
-@pytest.mark.parametrize(
-    ("episodes", "least"),
-    [pytest.param(1000, 0.9, marks=pytest.mark.slow), pytest.param(10_000, 0.98, marks=pytest.mark.long)],
-)
-def test_clone__of_ppo_reaches_its_share_in_other_worlds(
-    clone: ModuleType, tmp_path: Path, episodes: int, least: float
-) -> None:
-    """Of the harm that could be saved, from full braking to the best known."""
-    names = ("full_brake", "best_harm", "ppo@shipped")
-    agents = {name: eb.make_agent(name, scenario=PAPER) for name in names}
-    ppo = {"ppo": agents["ppo@shipped"]}
-    write_dataset(tmp_path / "ppo.parquet", ppo, scenario=PAPER, episodes=episodes, seed=1)
-    clone.train(tmp_path / "ppo.parquet", 0, tmp_path / "clone")
-    agents["clone"] = eb.make_agent(f"{TRAIN / 'clone.py'}:make_agent:{tmp_path / 'clone'}", scenario=PAPER)
-    found = eb.evaluate(PAPER.sample(500, 7), agents, scenario=PAPER, aftermath=False)
-    worst, best, shipped, cloned = (found.outcome(name).first_impact_harm.mean() for name in agents)
-    assert (worst - cloned) >= least * (worst - shipped) > 0.8 * (worst - best)
-
-
-def test_clone__drives_as_the_network_itself(clone: ModuleType, tmp_path: Path) -> None:
-    agents = {"full_brake": eb.make_agent("full_brake")}
-    write_dataset(tmp_path / "a.parquet", agents, scenario=PAPER, episodes=10, seed=1)
-    seen, done, told = clone.read_dataset(tmp_path / "a.parquet")
-    assert (seen.shape[1], done.shape[1], seen.dtype) == (27, 1, torch.float32) and bool((done == -1.0).all())
-    network = clone.clone(seen, done, 0)
-    policy = clone.as_policy(network, told, 0)
-    with torch.no_grad():
-        theirs = network(seen[:50]).clamp(-1.0, 1.0).numpy()
-    assert np.allclose(policy(seen[:50].numpy()), theirs, atol=1e-5)

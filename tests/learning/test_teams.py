@@ -14,8 +14,9 @@ from ethbrake_marl.files.yaml import parse_yaml, read_yaml
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.network_spec import NetworkSpec
 from ethbrake_marl.policies.teams import PolicyTeam
+from ethbrake_marl.scenario.catalogue import shipped_folder
 from ethbrake_marl.training.models import make_model
-from ethbrake_marl.training.recipe import TrainingRecipe, algorithm_names, load_recipe
+from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.training.run_folder import RunDirectory
 from ethbrake_marl.training.session import train
 from ethbrake_marl.training.team import has_policy_each, load_team
@@ -178,8 +179,12 @@ def test_recipe__of_the_paper_has_its_network_and_table(name: str, value: tuple[
     assert recipe.network_spec(27) == NetworkSpec(**shape, **NETWORKS[name])
 
 
-@pytest.mark.parametrize("name", sorted(SHIPPED))
+@pytest.mark.parametrize("name", [name for name, file in SHIPPED.items() if file.parent == shipped_folder("train")])
 def test_recipe__that_ships_comes_back_from_its_json_and_its_template_and_passes_the_schema(name: str) -> None:
+    check_shipped(name)
+
+
+def check_shipped(name: str) -> None:
     recipe, new = load_recipe(name), parse_yaml(load_recipe(name).new_text("mine"), "mine.yaml").content
     assert TrainingRecipe.of(recipe.model_dump(mode="json")) == recipe
     assert TrainingRecipe.of(new).name == "mine"
@@ -190,8 +195,12 @@ def test_recipe__that_ships_comes_back_from_its_json_and_its_template_and_passes
     assert "horizon_is_end" in recipe.model_fields_set
 
 
-@pytest.mark.parametrize("algorithm", algorithm_names())
+@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
 def test_schema__says_what_every_key_of_an_algorithm_means(algorithm: str) -> None:
+    check_meanings(algorithm)
+
+
+def check_meanings(algorithm: str) -> None:
     recipe = type(load_recipe(algorithm))
     properties = TrainingRecipe.json_schema()["$defs"][recipe.__name__]["properties"]
     assert set(properties) == set(recipe.model_fields)

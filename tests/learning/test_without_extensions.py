@@ -1,46 +1,39 @@
 """Training where no extension is installed: PPO and SAC, and a clear word for every other algorithm."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl import registry
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.training.experiment import RUN_REPORTS, run_experiment
-from ethbrake_marl.training.recipe import ALGORITHMS, algorithm_names, load_recipe
+from ethbrake_marl.cli.train import quickest
+from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.training.experiment import run_experiment
+from ethbrake_marl.training.recipe import TrainingRecipe, algorithm_names, load_recipe
 from tests.learning.tiny import TINY_PPO
 
 TINY = TINY_PPO.replace(total_steps=256)
 
 
-@pytest.fixture(autouse=True)
-def core_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hide the entry points of the extensions, and what was loaded from them."""
-    every: Callable[[str], dict[str, list[registry.EntryPoint]]] = registry.points
-
-    def points(group: str) -> dict[str, list[registry.EntryPoint]]:
-        core = {
-            name: [each for each in found if ".extensions." not in each.value] for name, found in every(group).items()
-        }
-        return {name: found for name, found in core.items() if found}
-
-    monkeypatch.setattr(registry, "points", points)
-    for parts in (ALGORITHMS, RUN_REPORTS):
-        core = {name: part for name, part in parts.loaded.items() if name in points(parts.group)}
-        monkeypatch.setattr(parts, "loaded", core)
+pytestmark = pytest.mark.usefixtures("core_alone")
 
 
 def test_algorithm__of_an_absent_extension_is_refused_by_name() -> None:
     assert algorithm_names() == ("ppo", "sac")
     with pytest.raises(InvalidInput) as error:
         load_recipe("counterfactual")
-    told = "counterfactual.yaml, line 10: algorithm = counterfactual: must be one of ppo, sac; the package or extension"
-    assert told in str(error.value)
+    told = "counterfactual.yaml, line 10: algorithm = counterfactual: must be one of ppo, sac"
+    assert f"{told}; the extension learners, which gives it, is not installed" in str(error.value)
     with pytest.raises(InvalidInput, match=r"recipe 'ppo': algorithm = options: must be one of ppo, sac$"):
         TINY.replace(algorithm="options")
+
+
+def test_recipes__that_are_listed_can_be_used_and_run_takes_the_first_of_them() -> None:
+    assert TrainingRecipe.usable().keys() < TrainingRecipe.shipped().keys()
+    assert {load_recipe(name).algorithm for name in TrainingRecipe.usable()} == {"ppo", "sac"}
+    assert quickest() == "ppo"
+    with pytest.raises(UnknownName, match=r"^unknown recipe 'quik'; known: cooperation-ppo, ppo, ppo-paper, sac"):
+        load_recipe("quik")
 
 
 def test_algorithm__of_an_absent_extension_leaves_a_run_that_says_so(tmp_path: Path) -> None:

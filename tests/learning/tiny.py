@@ -1,6 +1,7 @@
 """Trainings of a second, and what the tests do to them and compare of them."""
 
 import os
+import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -34,47 +35,6 @@ TINY_SAC = eb.load_recipe("sac").replace(
     checkpoint_every_updates=12,
     log_every_updates=10,
 )
-TINY_COUNTERFACTUAL = eb.load_recipe("counterfactual").replace(
-    start=None,
-    observation=None,
-    n_envs=8,
-    n_steps=4,
-    counterfactuals=16,
-    batch_size=8,
-    network={"policy": [8]},
-    total_steps=256,
-    evaluation={"every_updates": 4, "worlds": 10, "seed": 7},
-    checkpoint_every_updates=3,
-)
-TINY_OPTIONS = eb.load_recipe("options").replace(
-    observation=None,
-    n_envs=8,
-    n_steps=4,
-    tried=16,
-    memory=40,  # fills up on the way
-    gradient_steps=3,
-    batch_size=8,
-    network={"policy": [8], "choices": 9},
-    total_steps=256,
-    evaluation={"every_updates": 4, "worlds": 10, "seed": 7},
-    checkpoint_every_updates=3,
-)
-MODES = {
-    "networks": 2,
-    "gate": [4],
-    "worlds": 64,
-    "templates": 20,
-    "gain": 0.0,
-    "margin": 5.0,
-    "imitation_epochs": 2,
-    "gate_states": 32,
-    "gate_memory": 100,
-    "gate_steps": 4,
-    "tie_break": 0.05,
-    "together_rate": 0.5,
-    "shares": {"alone": 0.25, "further": 0.25, "gate": 0.25, "together": 0.25},
-}
-TINY_MODES = TINY_COUNTERFACTUAL.replace(modes=MODES)
 Answer = tuple[Any, ...]
 
 
@@ -105,6 +65,34 @@ def ctrl_c_in(*steps: int) -> Callable[[int, Answer], Answer]:
         return answer
 
     return watch
+
+
+def newest(run: Path) -> Path:
+    """The newest checkpoint."""
+    return max(run.glob("checkpoints/step_*"))
+
+
+OUTSIDE, PRECIOUS = "outside", "precious.txt"  # beside a run: what nothing may touch
+# What may stand in a run as a link out of it -> where it leads, and whether the run must be refused then.
+LINKS = {
+    "checkpoints": ("", True),
+    "tensorboard": ("", True),
+    "run.lock": (PRECIOUS, True),
+    "progress.csv": (PRECIOUS, False),
+    "config.json": (PRECIOUS, True),
+    "team.json": (PRECIOUS, False),
+    "policy": ("", False),
+    "tensorboard/events.out.tfevents.1.x": (PRECIOUS, False),
+}
+
+
+def link_out(name: str, run: Path) -> None:
+    """A link out of the run in the place of something in it."""
+    path = run / name
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    path.unlink(missing_ok=True)
+    path.symlink_to(run.parents[1] / OUTSIDE / LINKS[name][0])
 
 
 def files_of(run: Path) -> dict[str, bytes]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,6 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.motion import stopping_distances
@@ -25,12 +22,8 @@ from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.tables import worlds_from_table
 from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield.drivers import ShieldedDriver
-from tests.fixtures.extensions import of
 from tests.physics.random_worlds import Draws, line
 from tests.reference.small_steps import run
-
-parse_uncertainty = of("certified.uncertainty", "parse_uncertainty")
-limits_of = of("search.regret", "limits_of")
 
 SWITCHES_S = (0.0, 0.75, 1.5, 6.0)
 
@@ -266,18 +259,15 @@ def slow() -> Scenario:
     return load_scenario("paper-random").replace(brake_rate_mps3=12.65, release_rate_mps3=25)
 
 
-def test_search_and_shield__execute_what_they_foresee(slow: Scenario) -> None:
-    worlds = slow.sample(40, seed=7)
-    names = ("full_brake", "e_v2x_bm", "best_harm", "constant:2+step")
-    result = eb.evaluate(worlds, {name: eb.make_agent(name, scenario=slow) for name in names}, scenario=slow)
+def test_shield__executes_what_it_foresees(slow: Scenario) -> None:
+    names = ("full_brake", "e_v2x_bm", "constant:2+step")
+    agents = {name: eb.make_agent(name, scenario=slow) for name in names}
+    result = eb.evaluate(slow.sample(40, seed=7), agents, scenario=slow)
     harm = {name: result.outcome(name).first_impact_harm for name in names}
-    told = result.outcome("e_v2x_bm").predicted_harm
-    np.testing.assert_allclose(told, harm["e_v2x_bm"], rtol=1e-9, atol=1e-9)
-    assert harm["best_harm"].mean() < harm["e_v2x_bm"].mean() < harm["full_brake"].mean()
+    np.testing.assert_allclose(result.outcome("e_v2x_bm").predicted_harm, harm["e_v2x_bm"], rtol=1e-9, atol=1e-9)
+    assert harm["e_v2x_bm"].mean() < harm["full_brake"].mean()
     assert (harm["constant:2+step"] <= harm["e_v2x_bm"] + 1e-9).all()  # its bound
     assert (harm["constant:2+step"] != harm["e_v2x_bm"]).any()
-    proof = limits_of(result).proof  # of harm, not of contact
-    assert proof.avoidable is None and (proof.harm <= harm["best_harm"] + 1e-9).all() and proof.harm.mean() > 5.0
 
 
 def test_shield__of_a_mixture_in_which_some_worlds_build_up(slow: Scenario, tmp_path: Path) -> None:
@@ -329,18 +319,6 @@ def test_table__of_a_scenario_with_one_of_both_rates_is_read_again(key: str) -> 
     drawn = one.sample(3, seed=1).worlds
     read = worlds_from_table(one, QUANTITY.columns(drawn))
     assert np.array_equal(getattr(read.vehicles, key), getattr(drawn.vehicles, key))
-
-
-def test_robust_shield__trusts_a_longer_line_inside_its_box() -> None:
-    five = load_scenario("cooperation-2-five").replace(brake_rate_mps3=15, release_rate_mps3=25)
-    told = five.sample(20, seed=7).worlds
-    shift = Draws(2).uniform(-0.4, 0.4, (20, 4)) * [1.0, 0.0, 0.0, 0.0]
-    task = Task(five, five.learners, "first")
-    uncertain = parse_uncertainty("gaps_m.pair_1=0.5")
-    shielded = ShieldedDriver.around(make_agent("full_brake"), task, mode="robust", uncertainty=uncertain, told=told)
-    driven = drive(replace(told, gaps_m=told.gaps_m + shift), shielded, five)
-    assert driven.guarded.shield.distrusted.sum() == 0
-    assert driven.ledger.world_harm("first").sum() > 0.0
 
 
 def test_release__has_its_own_rate_and_passes_zero_without_a_stop() -> None:

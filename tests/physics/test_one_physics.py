@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.scripts import StateFree
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.profiles import ProfileProblem, Profiles, profile_problem

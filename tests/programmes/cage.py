@@ -33,6 +33,7 @@ from ethbrake_marl.extensions.search.best_harm import search_list
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.tables import read_worlds
+from tests.learning.tiny import OUTSIDE, PRECIOUS
 
 CPU_LIMIT_S = 10  # of a case
 WALL_LIMIT_S = 90.0  # on a machine that does other things too
@@ -43,8 +44,6 @@ BROKEN = 99  # exit status of a traceback
 
 Build = Callable[[Path], object]
 INSIDE = "inside"  # of a case's folder: where the command runs
-OUTSIDE = "outside"  # beside it: what no case may touch
-PRECIOUS = "precious.txt"
 HERE = "/@here"  # in a command or a variable: the absolute path of the folder where the command runs
 
 # Text of somebody who wants to move the cursor, hide or turn around what follows, or break a line.

@@ -34,7 +34,8 @@ from ethbrake_marl.policies.shipped import shipped_policies
 from ethbrake_marl.scenario.tables import read_worlds
 from ethbrake_marl.training.checkpoint import NUMBERS
 from ethbrake_marl.training.session import train
-from tests.programmes.cage import NASTY, OUTSIDE, PRECIOUS, Case, damaged, write
+from tests.learning.tiny import LINKS, link_out, newest
+from tests.programmes.cage import NASTY, Case, damaged, write
 
 # ---------------------------------------------------------------- text
 
@@ -635,11 +636,6 @@ def stopped(algorithm: str) -> Path:
     return folder
 
 
-def newest(run: Path) -> Path:
-    """The newest checkpoint."""
-    return max(run.glob("checkpoints/step_*"))
-
-
 def _text_of_table(rng: random.Random, path: Path) -> None:
     path.write_bytes(
         rng.choice(
@@ -658,13 +654,8 @@ def _text_of_table(rng: random.Random, path: Path) -> None:
     )
 
 
-def _link(name: str, target: str, rng: random.Random, run: Path) -> None:
-    """A link out of the run in the place of something in it."""
-    path = run / name
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    path.unlink(missing_ok=True)
-    path.symlink_to(run.parents[1] / OUTSIDE / target)
+def _link(name: str, rng: random.Random, run: Path) -> None:
+    link_out(name, run)
 
 
 def _pipe(rng: random.Random, run: Path) -> None:
@@ -720,14 +711,7 @@ CHANGES: dict[str, tuple[tuple[str, ...], int, bool, Spoil]] = {
     "something more": (("ppo",), 24, False, _more),
     "files exchanged": (("ppo", "sac"), 25, False, _swapped),
     "a pipe for a file": (("ppo", "sac"), 25, False, _pipe),
-    "checkpoints: link outside": (("ppo",), 1, True, partial(_link, "checkpoints", "")),
-    "tensorboard: link outside": (("ppo",), 1, True, partial(_link, "tensorboard", "")),
-    "run.lock: link outside": (("ppo",), 1, True, partial(_link, "run.lock", PRECIOUS)),
-    "progress.csv: link outside": (("ppo",), 1, False, partial(_link, "progress.csv", PRECIOUS)),
-    "config.json: link outside": (("ppo",), 1, True, partial(_link, "config.json", PRECIOUS)),
-    "team.json: link outside": (("ppo",), 1, False, partial(_link, "team.json", PRECIOUS)),
-    "policy: link outside": (("ppo",), 1, False, partial(_link, "policy", "")),
-    "events: link outside": (("ppo",), 1, False, partial(_link, "tensorboard/events.out.tfevents.1.x", PRECIOUS)),
+    **{f"{name}: link outside": (("ppo",), 1, certain, partial(_link, name)) for name, (_, certain) in LINKS.items()},
     "progress.csv damaged": (("ppo",), 10, False, lambda r, f: _text_of_table(r, f / "progress.csv")),
     "checkpoint: numbers edited": (("ppo", "sac"), 40, False, lambda r, f: edited(r, newest(f) / NUMBERS)),
     "checkpoint: numbers are no JSON": (("ppo",), 17, False, lambda r, f: no_json(r, newest(f) / NUMBERS)),

@@ -224,18 +224,18 @@ def inside(robust: str, given: Given, scenario: Any = "paper-random", intervals:
     shield = RobustShield(scenario, 1, uncertainty=uncertainty, robust=robust)
     shield.begin(told, np.arange(boxes))
     decisions, begun = 0, time.process_time()
-    while not shield.running.finished.all():
-        decisions += int((~shield.running.finished).sum())
+    while not shield.memory.running.finished.all():
+        decisions += int((~shield.memory.running.finished).sum())
         shield.decide(np.zeros(boxes))
     took, above, excess, harm = time.process_time() - begun, 0, -np.inf, 0.0
     draws = [min(BATCH, given.draws - first) for first in range(0, given.draws, BATCH)]
     for k, n in product(range(boxes), draws):
         truth = uncertainty.draw(told.take(np.full(n, k)), rng)
-        plan = np.repeat(shield.backup.plan[k : k + 1], n, axis=0)
+        plan = np.repeat(shield.memory.backup.plan[k : k + 1], n, axis=0)
         realised = plan_harm(begin_running(profile_problem(truth, [1], horizon_s=scenario.horizon_s)), plan)
-        over = realised - shield.first_bound[k]
+        over = realised - shield.memory.first_bound[k]
         above, excess, harm = above + int((over > TOLERANCE).sum()), max(excess, over.max()), harm + realised.sum()
-    bound = float(shield.first_bound.mean())
+    bound = float(shield.memory.first_bound.mean())
     return Told(
         None if robust == "corners" else above == 0 and bool(np.isfinite(bound)),
         f"{boxes * given.draws:,} worlds of {boxes} boxes, above: {above:,}, most by {excess:.2g}; bound {bound:.2f},"

@@ -10,19 +10,14 @@ from scipy import stats
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.evaluation.varying import states_of
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.ranges import ranges
 from ethbrake_marl.scenario.sampling import middle_world
 from ethbrake_marl.scenario.tables import worlds_from_state, worlds_from_table
-from ethbrake_marl.scenario.task import Task
-from tests.fixtures.extensions import of
 from tests.refused import refused
-
-parse_uncertainty = of("certified.uncertainty", "parse_uncertainty")
-prove = of("search.limits", "prove")
 
 PAPER = eb.load_scenario("paper-random")
 FIXED = PAPER.replace(gaps_m=40, speeds_mps=20, latency_s=0, early_impacts="keep", horizon_s=30)
@@ -104,17 +99,6 @@ def test_table_of_initial_states__gives_the_same_worlds() -> None:
     assert worlds_from_state(wet, state).friction.tolist() == [0.5]
 
 
-def test_uncertainty_of_friction__moves_all_capacities_together() -> None:
-    # Its uncertainty moves all capacities together: of 0.6 +- 0.2, shares 0, 1/8, ..., 1 of the way up.
-    worlds = FIXED.replace(friction=0.6, braking_capacity_mps2=[4, 7, 9]).sample(1, 7).worlds
-    members = parse_uncertainty("friction=0.2,braking_capacity_mps2.vehicle_3=3").members(worlds)
-    shares, dry = [0, 0.125, 0.25, 0.375, 0.625, 0.75, 0.875, 1], ([4, 7, 6], [4, 7, 12])
-    expected = [[4, 5.886, 5.886]] + [np.minimum(d, 9.81 * (0.4 + 0.4 * share)) for d in dry for share in shares]
-    assert members.vehicles.braking_capacity_mps2.shape == (17, 3)
-    assert len(expected) == 17
-    assert np.abs(members.vehicles.braking_capacity_mps2 - np.array(expected)).max() <= 1e-12
-
-
 def test_mixture__where_only_some_tell_it_tells_no_friction() -> None:
     told = PAPER.replace(name="wet", friction=0.4).declared()
     mixed = eb.Scenario(name="road", mixture=[{"scenario": PAPER}, {"scenario": told}])
@@ -126,18 +110,6 @@ def test_mixture__where_only_some_tell_it_tells_no_friction() -> None:
     assert "friction" not in columns
     assert (columns["braking_capacity_2_mps2"] == braking).all()
     assert [state["braking_capacity_2_mps2"] for state in states_of(worlds, mixed)] == braking.tolist()
-
-
-def test_proof__reads_what_the_road_allows() -> None:
-    # The proof reads what the road allows; and 20 x 0.5 = 10 m are lost where all brake alike.
-    near = FIXED.replace(gaps_m=30, braking_capacity_mps2=[9, 7, 6], latency_s=[0, 0.5, 0.8])
-    assert [
-        prove(near.replace(friction=mu).sample(1, 7).worlds, Task(near, (1,))).avoidable.tolist() for mu in (0.3, 1.0)
-    ] == [[True], [True]]
-    assert final(FIXED.replace(gaps_m=[4, 40], latency_s=[0, 0.5, 0.5], friction=0.3)).pair_hit[0].tolist() == [
-        True,
-        False,
-    ]
 
 
 def test_table__has_one_row_for_each_world_of_which_none_is_torn() -> None:
@@ -259,15 +231,6 @@ ROADS: dict[str, Callable[[], object]] = {
     ),
     "scenario 'paper-random': friction = 0: must be finite and in (0, 2]": lambda: FIXED.replace(friction=0),
     "must be a number or a distribution; a key that is not used is left out": lambda: FIXED.replace(friction=None),
-    "uncertainty: friction is one number for the whole line; give it without a vehicle": lambda: parse_uncertainty(
-        "friction.vehicle_2=0.1"
-    ),
-    "uncertainty: friction=0.1: friction is not known in every world; declare it in the scenario": lambda: (
-        parse_uncertainty("friction=0.1").members(FIXED.sample(1, 7).worlds)
-    ),
-    "uncertainty: friction=1: 0.6 in world 0 may be as low as -0.4; it must stay above 0": lambda: parse_uncertainty(
-        "friction=1"
-    ).members(FIXED.replace(friction=0.6).sample(1, 7).worlds),
     "scenario 'paper-random': draws nothing: all its worlds are the same": lambda: ranges(
         eb.Scenario(**{**FIXED.declared(), "table": {"columns": ["gap_1_m", "mass_3_t"], "rows": [[12, 30]]}})
     ),

@@ -15,7 +15,7 @@ import numpy as np
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive, script_agents
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.episode import CLOCK
 from ethbrake_marl.physics.state import Floats, Worlds
@@ -72,7 +72,7 @@ def worst_case(rng, engine, shield, k, candidates=8):
     best, action = np.full(n, -1.0), np.ones((n, K))
     for middle in np.linspace(-1.0, 1.0, candidates):
         candidate = middle + rng.uniform(-0.1, 0.1, (n, K)) if K == 1 else rng.uniform(-1.0, 1.0, (n, K))
-        decision = certify(shield.running, as_asked(shield, candidate), shield.backup, shield.bound)
+        decision = certify(shield.memory.running, as_asked(shield, candidate), shield.memory.backup, shield.bound)
         reason = decision.reason.reshape(n, K)
         better = ((reason == 1) | (reason == 2)).any(axis=1) & (decision.bound > best)
         best[better], action[better] = decision.bound[better], np.clip(candidate[better], -1.0, 1.0)
@@ -123,7 +123,7 @@ ADVERSARIES: dict[str, Adversary] = {**TEAM_ADVERSARIES, "trained": trained}
 
 def shape(shield: StepShield) -> tuple[int, int]:
     """Of a decision's proposals: worlds, vehicles."""
-    return len(shield.first_bound), len(shield.vehicles)
+    return len(shield.memory.first_bound), len(shield.vehicles)
 
 
 def as_asked(shield: StepShield, proposed: Floats) -> Floats:
@@ -133,8 +133,8 @@ def as_asked(shield: StepShield, proposed: Floats) -> Floats:
 
 def planned(shield: StepShield) -> Floats:
     """What the plan says now, [n, K]."""
-    plan, (n, K) = shield.backup.plan, shape(shield)
-    return plan[np.arange(n), np.minimum(shield.running.steps, plan.shape[1] - 1)].reshape(n, K)
+    plan, (n, K) = shield.memory.backup.plan, shape(shield)
+    return plan[np.arange(n), np.minimum(shield.memory.running.steps, plan.shape[1] - 1)].reshape(n, K)
 
 
 # ---------------------------------------------------------------- attacks
@@ -167,7 +167,7 @@ def attack(
     engine, sound = plain_engine(scenario, truth), leak is None and uncertain is None
     kind, settings = (StepShield, {}) if uncertain is None else (uncertain[0], {"uncertainty": uncertain[1]})
     shield = begun(scenario, worlds, kind, harm_count=harm_count, allowance=allowance, cap=cap, **settings)
-    first_bound, told, decision = shield.first_bound.copy(), shield.bound, None
+    first_bound, told, decision = shield.memory.first_bound.copy(), shield.bound, None
     rows = np.arange(worlds.n)[:, np.newaxis]
     who, obeys = rows % len(learners) == np.arange(len(learners)), rows % 4 < 2
     accepted, rises, decisions, k = np.zeros(worlds.n, np.int64), 0, 0, 0
@@ -185,8 +185,8 @@ def attack(
         engine.step(decision.applied.reshape(shape(shield)))
         assert not sound or shield.expects(seen_columns(engine.packed)).all()
         k += 1
-    assert not sound or not shield.distrusted.any()
-    over = 0 if cap is None else int((engine.ledger.vehicle_harm(harm_count) > shield.baseline_shares).sum())
+    assert not sound or not shield.memory.distrusted.any()
+    over = 0 if cap is None else int((engine.ledger.vehicle_harm(harm_count) > shield.memory.baseline_shares).sum())
     realised = engine.ledger.world_harm(harm_count)
     return Attack(realised, first_bound, shield.bound, accepted, rises, over, decisions)
 
@@ -287,16 +287,18 @@ def _of_pairs(change: Callable[[StepShield, np.ndarray], None]) -> Leak:
     """A leak that changes the state of pairs [n, 4, pairs]: 0 gap, 1 hit flag, 2 first-impact harm, 3 total harm."""
 
     def leak(shield, last):
-        states, N = shield.running.states.copy(), shield.running.problem.mass.shape[1]
+        states, N = shield.memory.running.states.copy(), shield.memory.running.problem.mass.shape[1]
         change(shield, states[:, N : N + 4 * (N - 1)].reshape(-1, 4, N - 1))
-        shield.running = shield.running._replace(states=states)
+        shield.memory = shield.memory._replace(running=shield.memory.running._replace(states=states))
 
     return leak
 
 
 def budget_may_rise(percent: float) -> Leak:
     def leak(shield, last):
-        shield.backup = shield.backup._replace(harm=shield.backup.harm * (1.0 + percent / 100.0))
+        shield.memory = shield.memory._replace(
+            backup=shield.memory.backup._replace(harm=shield.memory.backup.harm * (1.0 + percent / 100.0))
+        )
 
     return leak
 
@@ -325,9 +327,9 @@ def belief(name: str, believed: Callable[[np.ndarray], np.ndarray]) -> Leak:
 
     def leak(shield, last):
         if last is None:
-            problem = shield.running.problem
+            problem = shield.memory.running.problem
             changed = problem._replace(**{name: believed(getattr(problem, name).copy())})
-            shield.running = shield.running._replace(problem=changed)
+            shield.memory = shield.memory._replace(running=shield.memory.running._replace(problem=changed))
 
     return leak
 
@@ -346,13 +348,15 @@ def far_pairs_forgotten(shield: StepShield, pairs: np.ndarray) -> None:
 
 def plan_rounded(shield: StepShield, last: Decision | None) -> None:
     """The plan is kept with two decimals; its harm is believed unchanged."""
-    shield.backup = shield.backup._replace(plan=np.round(shield.backup.plan, 2))
+    shield.memory = shield.memory._replace(
+        backup=shield.memory.backup._replace(plan=np.round(shield.memory.backup.plan, 2))
+    )
 
 
 @_of_pairs
 def gaps_blurred(shield: StepShield, pairs: np.ndarray) -> None:
     """Gaps are believed 1 cm longer than they are, from the third step on."""
-    if int(shield.running.steps.max()) == 3:
+    if int(shield.memory.running.steps.max()) == 3:
         pairs[:, 0] += 0.01
 
 

@@ -41,7 +41,7 @@ class Recorder:
     def stepped(self, memory: Any, before: Any, after: Any) -> Any:
         made, ended = memory
         over = after.ended & ~before.ended
-        harm, bound = after.ledger.world_harm("first"), after.guarded.shield.first_bound
+        harm, bound = after.ledger.world_harm("first"), after.guarded.shield.memory.first_bound
         return made + 1, [*ended, *zip(harm[over].tolist(), bound[over].tolist(), strict=True)]
 
 
@@ -115,13 +115,21 @@ class Play:
     def known(self) -> list[Any]:
         """What must not change when nothing happens: bound, plan, trust, place in the episodes."""
         shield = self.shield()
-        held = [shield.bound, shield.backup.plan, shield.distrusted, shield.running.steps, shield.running.states]
+        held = [
+            shield.bound,
+            shield.memory.backup.plan,
+            shield.memory.distrusted,
+            shield.memory.running.steps,
+            shield.memory.running.states,
+        ]
         return [array.tolist() for array in held]
 
     def astray(self) -> int:
         """1 where the shield is not where the engine is, or trusts it no longer."""
         shield, engine = self.shield(), self.engine()
-        return int(not (shield.running.steps == engine.steps)[~engine.ended].all() or shield.distrusted.any())
+        return int(
+            not (shield.memory.running.steps == engine.steps)[~engine.ended].all() or shield.memory.distrusted.any()
+        )
 
     def member_is(self, how: str, asked: Callable[[], Any]) -> Callable[[], None]:
         """A call in which one member fails so, while the others are well."""

@@ -1,32 +1,20 @@
 """The core's shields where no extension is installed: they work, and everything else is refused in one line."""
 
 from collections.abc import Callable
-from importlib.metadata import EntryPoint
 
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl import registry
-from ethbrake_marl.agents.registry import _AGENTS, _SHIELDS, _VARIANTS, agent_entries, make_agent
+from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.agents.registry import agent_entries
 from ethbrake_marl.errors import UnknownName
 from tests.refused import refused
 
 PAPER = eb.load_scenario("paper-random")
 
 
-@pytest.fixture(autouse=True)
-def _no_extensions(monkeypatch: pytest.MonkeyPatch) -> None:
-    installed = registry.points
-
-    def points(group: str) -> dict[str, list[EntryPoint]]:
-        core = {name: [each for each in found if ".extensions." not in each.value]
-                for name, found in installed(group).items()}  # fmt: skip
-        return {name: found for name, found in core.items() if found}
-
-    monkeypatch.setattr(registry, "points", points)
-    for each in (_AGENTS, _SHIELDS, _VARIANTS):
-        monkeypatch.setattr(each, "loaded", {})
+pytestmark = pytest.mark.usefixtures("core_alone")
 
 
 @pytest.mark.parametrize(("mode", "code"), [(None, 1), ("step", 1), ("episode", 0)])

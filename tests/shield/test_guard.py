@@ -12,7 +12,7 @@ from gymnasium.wrappers import Autoreset
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive, episode_engine
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.engine.compiled_step import STEP
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
@@ -78,7 +78,7 @@ def test_step__what_is_not_certified_is_refused_and_the_worlds_stay_as_they_are(
     with pytest.raises(UncertifiedStep, match=CHEATS[what]):
         env.step(DRIVE)
     assert env.attached.engine.worlds.speeds_mps.tolist() == before.speeds_mps.tolist()
-    assert env.attached.shield is shield and not shield.distrusted.any()
+    assert env.attached.shield is shield and not shield.memory.distrusted.any()
 
 
 @pytest.mark.parametrize("what", STATE)
@@ -125,7 +125,7 @@ def test_autoreset__of_gymnasium_inside_is_left_alone():
             over = terminated or truncated
         assert info["shield_trusted"]
         env.step(DRIVE)  # begins the next episode
-        assert env.attached.shield.running.steps.tolist() == [0]
+        assert env.attached.shield.memory.running.steps.tolist() == [0]
 
 
 @pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
@@ -138,7 +138,7 @@ def test_clone__between_proposal_and_step_goes_on_apart(clone):
     assert other.attached.engine is other.venv.engine and other.attached.engine is not env.attached.engine
     told, again = ([reported(row) for row in each.step_wait()[3]] for each in (env, other))
     assert told == again and "bound_harm" in told[0]
-    assert env.attached.shield.running.steps.tolist() == other.attached.shield.running.steps.tolist()
+    assert env.attached.shield.memory.running.steps.tolist() == other.attached.shield.memory.running.steps.tolist()
 
 
 def test_reset__in_between_brings_the_proposal_to_another_episode_and_its_bound_holds():
@@ -147,7 +147,7 @@ def test_reset__in_between_brings_the_proposal_to_another_episode_and_its_bound_
     env.step_async(np.ones((2, 1), np.float32))
     env.venv.reset()
     assert all(row["shield_trusted"] for row in env.step_wait()[3])
-    assert env.attached.shield.running.steps.tolist() == env.attached.engine.steps.tolist() == [1, 1]
+    assert env.attached.shield.memory.running.steps.tolist() == env.attached.engine.steps.tolist() == [1, 1]
 
 
 def test_threads__no_episode_gets_above_its_bound():
@@ -164,8 +164,8 @@ def test_threads__no_episode_gets_above_its_bound():
         for done in [pool.submit(work) for _ in range(3)]:
             done.result()
     shield, engine = env.attached.shield, env.attached.engine
-    assert all(trusted) and shield.running.steps.tolist() == engine.steps.tolist()
-    assert (engine.ledger.world_harm("first") <= shield.first_bound).all()
+    assert all(trusted) and shield.memory.running.steps.tolist() == engine.steps.tolist()
+    assert (engine.ledger.world_harm("first") <= shield.memory.first_bound).all()
 
 
 @Acts
@@ -275,4 +275,4 @@ def asks_once(settings, policy):
             env.step({"vehicle_2": [-0.3], "vehicle_9": [0.0]})
         env.step(actions)
         assert asked() == [k + 1]
-        assert settings != {"mode": "step"} or attached.shield.running.steps.tolist() == [k + 1]
+        assert settings != {"mode": "step"} or attached.shield.memory.running.steps.tolist() == [k + 1]

@@ -11,8 +11,8 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.envs.gymnasium import EthBrakeEnv
 from ethbrake_marl.envs.pettingzoo import env as aec_env, parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
@@ -59,16 +59,16 @@ STEP_SHIELD: dict[str, Callable[[], object]] = {
         started().begin(WORLDS.take([0, 1]), np.array([3, 7]))
     ),
     "certify: proposed (2,), backup's harm (5,), budget (5,); (5,), and twice (5,) needed": lambda: certify(
-        started().running, np.zeros(2), started().backup, started().bound
+        started().memory.running, np.zeros(2), started().memory.backup, started().bound
     ),
     "certify: a budget is below the backup's harm; nothing could be guaranteed": lambda: certify(
-        started().running, np.zeros(5), started().backup, started().bound - 1.0
+        started().memory.running, np.zeros(5), started().memory.backup, started().bound - 1.0
     ),
-    "shield: plan (5, 3); (5, at least 75) is needed": lambda: plan_harm(started().running, np.zeros((5, 3))),
+    "shield: plan (5, 3); (5, at least 75) is needed": lambda: plan_harm(started().memory.running, np.zeros((5, 3))),
     "certify: proposed (1,), backup's harm (1,), budget (1,); (1, 2), and twice (1,) needed": lambda: certify(
-        team().running, np.zeros(1), team().backup, team().bound
+        team().memory.running, np.zeros(1), team().memory.backup, team().bound
     ),
-    "shield: plan (1, 81); (1, at least 75, 2) is needed": lambda: plan_harm(team().running, np.zeros((1, 81))),
+    "shield: plan (1, 81); (1, at least 75, 2) is needed": lambda: plan_harm(team().memory.running, np.zeros((1, 81))),
     "shield: vehicle = (2, 1): several are named front to rear, each once": lambda: StepShield(PAIR, (2, 1)),
     "shield: vehicle = (): must be an index from 0 to 2": lambda: StepShield(PAIR, ()),
     "shield: cap 'baseline' and 5 possible worlds: give one of the two": lambda: StepShield(

@@ -22,11 +22,8 @@ from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts
 from ethbrake_marl.shield.running import begin_running
 from ethbrake_marl.shield.step import StepShield
 from tests.fixtures.asked import Acts
-from tests.fixtures.extensions import of
 from tests.shield.attacks import ADVERSARIES, LEAKS, TEAM_ADVERSARIES, TEAMS, all_infos, attack, begun, line, search
 from tests.shield.plays import reported
-
-Searched = of("search.around", "Searched")
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::RuntimeWarning",  # uncompiled, a division by 0 warns
@@ -185,15 +182,15 @@ def test_begin__of_some_rows_leaves_the_others_alone(scenario, settings):
 def begins_apart(scenario, kind=StepShield, **settings):
     worlds = scenario.sample(6, 3).worlds
     shield, fresh = begun(scenario, worlds, kind, **settings), begun(scenario, worlds, kind, **settings)
-    shield.decide(np.zeros_like(shield.backup.plan[:, 0]))
+    shield.decide(np.zeros_like(shield.memory.backup.plan[:, 0]))
     before = shield.take(np.arange(6))
     shield.begin(worlds.take([0]), np.array([4]))
-    assert shield.running.steps.tolist() == [1, 1, 1, 1, 0, 1]
+    assert shield.memory.running.steps.tolist() == [1, 1, 1, 1, 0, 1]
     for row, as_in, there in ((0, before, 0), (5, before, 5), (4, fresh, 0)):
         now, then = shield.take(np.array([row])), as_in.take(np.array([there]))
-        assert now.running.states.tolist() == then.running.states.tolist()
-        assert np.array_equal(now.running.caps, then.running.caps)
-        assert now.baseline_shares.tolist() == then.baseline_shares.tolist()
+        assert now.memory.running.states.tolist() == then.memory.running.states.tolist()
+        assert np.array_equal(now.memory.running.caps, then.memory.running.caps)
+        assert now.memory.baseline_shares.tolist() == then.memory.baseline_shares.tolist()
         assert now.bound.tolist() == then.bound.tolist()
 
 
@@ -203,19 +200,19 @@ SURPRISES = {"brakes harder": [-0.3, 0, 0, 0], "not a number": [0, 0, np.nan, 0]
 @pytest.mark.parametrize("what", SURPRISES)
 def test_surprise__is_flagged_and_falls_back_for_the_rest_of_that_episode_alone(what):
     shield, seen_columns = begun(TWO, SMALL), 4  # 2 speeds, gap, hit flag
-    stale = shield.running.states[:, :seen_columns].copy()
+    stale = shield.memory.running.states[:, :seen_columns].copy()
     shield.decide(np.full(4, -0.5), seen=stale)
-    seen = shield.running.states[:, :seen_columns].copy()
-    assert not shield.distrusted.any()
+    seen = shield.memory.running.states[:, :seen_columns].copy()
+    assert not shield.memory.distrusted.any()
     seen[1] = stale[1] if what == "no message" else seen[1] + SURPRISES[what]
     for _ in range(3):
         decision = shield.decide(np.ones(4), seen=seen)
-        assert shield.distrusted.tolist() == [False, True, False, False]
+        assert shield.memory.distrusted.tolist() == [False, True, False, False]
         assert ShieldReason(decision.reason[1]).text == "assumption broken" and decision.intervened[1]
         assert decision.applied[1] <= 0.0 and np.isfinite([decision.applied, shield.bound]).all()
-        seen = shield.running.states[:, :seen_columns].copy()
+        seen = shield.memory.running.states[:, :seen_columns].copy()
     shield.begin(SMALL.take([3]), np.array([1]))
-    assert not shield.distrusted.any()
+    assert not shield.memory.distrusted.any()
 
 
 @Acts
@@ -234,12 +231,12 @@ def test_agent__is_never_worse_than_the_episode_mode_nor_than_its_prediction(har
     shield = driven.guarded.shield
     assert (harm <= shield.predicted_harm).all() and (harm <= hybrid + 1e-9).all()
     assert harm.mean() < hybrid.mean() - 0.2
-    assert harm.tolist() == shield.bound.tolist() and not shield.distrusted.any()
+    assert harm.tolist() == shield.bound.tolist() and not shield.memory.distrusted.any()
 
 
 def test_agent__a_policy_that_keeps_the_bound_is_left_alone():
     shield = drive(WORLDS, ShieldedDriver(eb.make_agent("e_v2x_bm"), PAPER), PAPER, 1).guarded.shield
-    fine = shield.alone_harm <= shield.first_bound
+    fine = shield.memory.alone_harm <= shield.memory.first_bound
     assert fine.mean() > 0.9 and shield.chosen_policy[fine].all()
 
 
@@ -309,11 +306,12 @@ def test_rollout__certifies_by_hand_what_plan_and_constants_do_not(proposed, pol
     """10 m/s, 15 m to a vehicle at rest, and a plan (3.5 m/s2: 14.3 m) that coasting would make useless."""
     scenario, worlds = two()
     shield = begun(scenario, worlds)
-    shield.backup = Backup(np.full_like(shield.backup.plan, -0.7), np.zeros(1), np.zeros(0))
+    held = Backup(np.full_like(shield.memory.backup.plan, -0.7), np.zeros(1), np.zeros(0))
+    shield.memory = shield.memory._replace(backup=held)
     proposer = None if policy is None else Proposer({1: eb.make_agent(policy)}, {1: None}, worlds)
     decision = shield.decide(np.full(1, proposed), proposer=proposer)
     assert (reason(decision), decision.applied[0], decision.bound[0]) == (why, plan[0], 0.0)
-    assert shield.backup.plan[0, :2].tolist() == plan and decision.margin[0] == pytest.approx(margin)
+    assert shield.memory.backup.plan[0, :2].tolist() == plan and decision.margin[0] == pytest.approx(margin)
 
 
 def driven(policy, **settings):
@@ -339,7 +337,7 @@ def test_rollout__once_accepted_is_what_the_policy_then_does_and_the_bound_is_ex
     later = np.cumsum(accepted, axis=0) - accepted > 0  # after the first accepted rollout of that world
     assert np.isin(reasons[later], [-1, ShieldReason.SAME_AS_PLAN, ShieldReason.ENDED]).all()
     assert harm.tolist() == guarded.shield.bound.tolist()
-    assert (harm <= guarded.shield.predicted_harm).all() and not guarded.shield.distrusted.any()
+    assert (harm <= guarded.shield.predicted_harm).all() and not guarded.shield.memory.distrusted.any()
 
 
 @pytest.mark.parametrize("distrusted", [False, True])
@@ -348,8 +346,8 @@ def test_rollout__leaves_the_past_in_the_plan_what_was_applied(distrusted):
     told = replace(ROLLED, vehicles=weaker) if distrusted else None
     guarded, _, reasons, applied = driven(eb.LearnedAgent(Weights()), logging=True, told=told)
     shield, running = guarded.shield, ~np.isin(reasons, [-1, ShieldReason.ENDED])
-    assert (shield.distrusted == distrusted).all()
-    assert (shield.backup.plan.T[: len(applied)] == applied)[running].all() and running[0].all()
+    assert (shield.memory.distrusted == distrusted).all()
+    assert (shield.memory.backup.plan.T[: len(applied)] == applied)[running].all() and running[0].all()
     for entry in shield.log:
         assert entry.plan[: entry.step].tolist() == applied[: entry.step, entry.world].tolist()
 
@@ -369,12 +367,6 @@ def test_rollout__a_policy_that_does_otherwise_when_it_is_tried_out_gets_no_furt
 def test_later_rollouts__may_be_switched_off():
     _, _, reasons, _ = driven(eb.LearnedAgent(Weights()), later_rollouts=False)
     assert not (reasons == ShieldReason.POLICY_ROLLOUT).any()
-
-
-def test_rollout__also_of_a_searched_policy_that_cannot_be_divided():
-    driver = ShieldedDriver(Searched(Remembering(), PAPER, candidates=20), PAPER)
-    episodes = drive(WORLDS.take(np.arange(20)), driver, PAPER, 1)
-    assert episodes.ledger.world_harm("first").tolist() == episodes.guarded.shield.bound.tolist()
 
 
 # ---------------------------------------------------------------- several shielded vehicles, decided together
@@ -435,9 +427,10 @@ def test_one_vehicle_in_a_list__is_the_single_shield_bit_for_bit():
     single, listed = StepShield(PAPER, 1), StepShield(PAPER, [1])
     for shield in (single, listed):
         shield.begin(worlds, np.arange(20))
-    held = single.backup
-    listed.backup = Backup(held.plan[:, :, np.newaxis], held.harm, held.constants[:, np.newaxis])
-    while not single.running.finished.all():
+    held = single.memory.backup
+    backup = Backup(held.plan[:, :, np.newaxis], held.harm, held.constants[:, np.newaxis])
+    listed.memory = listed.memory._replace(backup=backup)
+    while not single.memory.running.finished.all():
         proposed = rng.uniform(-1.2, 1.2, 20)
         one, other = single.decide(proposed), listed.decide(proposed[:, np.newaxis])
         for name in ("applied", "reason", "margin", "bound"):
@@ -450,10 +443,10 @@ def test_team__whose_rollout_keeps_the_bound_is_left_alone():
     for name in ("full_brake", "constant:5"):
         shield, team = StepShield(PAIR, (1, 2)), {i: eb.make_agent(name) for i in (1, 2)}
         shield.begin(worlds, np.arange(30), team)
-        drives = shield.alone_harm <= shield.first_bound
+        drives = shield.memory.alone_harm <= shield.memory.first_bound
         command = [team[i].act(worlds, i) / worlds.vehicles.braking_capacity_mps2[:, i] for i in (1, 2)]
         assert not shield.decide(np.stack(command, axis=1)).intervened[drives].any() and drives.any()
-        assert (shield.first_bound <= without.first_bound).all()
+        assert (shield.memory.first_bound <= without.memory.first_bound).all()
 
 
 # Behind the interfaces.
@@ -507,7 +500,7 @@ def test_drive_chunks__is_what_the_shielded_team_does_whatever_the_chunk(monkeyp
         assert whole.harm.tolist() == ledger.world_harm("total").tolist() == shield.bound.tolist()
         assert whole.vehicle_harm.tolist() == ledger.vehicle_harm("total").tolist() == shield.shares().tolist()
         assert whole.bound.tolist() == shield.predicted_harm.tolist() and (whole.harm <= whole.bound).all()
-        assert whole.baseline.tolist() == shield.baseline_shares.tolist() and not shield.distrusted.any()
+        assert whole.baseline.tolist() == shield.memory.baseline_shares.tolist() and not shield.memory.distrusted.any()
     logged = np.zeros((12, 2), np.int64)
     np.add.at(logged, tuple(np.transpose([(entry.world, entry.vehicle - 1) for entry in shield.log])), 1)
     assert whole.replaced.tolist() == logged.tolist() and (logged.sum(axis=0) > 0).all()
@@ -588,14 +581,14 @@ def test_no_number__keeps_the_plan_and_what_is_beyond_is_clipped() -> None:
 
 def test_surprise__after_the_last_step_replaces_nothing() -> None:
     shield = begun(TWO.replace(horizon_s=0.5), SMALL)  # decisions at 0.35 and 0.45 s
-    while not shield.running.finished.all():
+    while not shield.memory.running.finished.all():
         _ = shield.decide(np.ones(4))
-    replaced, seen = shield.interventions.tolist(), shield.running.states + 0.1
+    replaced, seen = shield.interventions.tolist(), shield.memory.running.states + 0.1
     decision = shield.decide(np.ones(4), seen=seen, only=np.ones(4, bool))
-    assert shield.distrusted.all()
+    assert shield.memory.distrusted.all()
     assert [ShieldReason(each).text for each in decision.reason] == ["ended", "ended", "ended", "ended"]
     assert shield.interventions.tolist() == replaced
-    assert shield.running.steps.tolist() == [2, 2, 2, 2]
+    assert shield.memory.running.steps.tolist() == [2, 2, 2, 2]
 
 
 def test_copy__goes_on_apart_its_log_included() -> None:
@@ -604,18 +597,18 @@ def test_copy__goes_on_apart_its_log_included() -> None:
     other = copy.copy(shield)
     other.decide(np.ones(2))
     shield.decide(np.full(2, 0.5))
-    assert shield.running.steps.tolist() == [1, 1]
-    assert other.running.steps.tolist() == [1, 1]
+    assert shield.memory.running.steps.tolist() == [1, 1]
+    assert other.memory.running.steps.tolist() == [1, 1]
     assert [entry.proposed for entry in shield.log + other.log] == [0.5, 0.5, 1.0, 1.0]
 
 
 def test_surprise__of_one_world_hands_the_whole_team_to_the_fallback() -> None:
     scenario = eb.load_scenario(TEAMS[4, 3])
     shield = begun(scenario, scenario.sample(3, 1).worlds)
-    seen = shield.running.states.copy()
+    seen = shield.memory.running.states.copy()
     seen[1, 1] -= 0.5  # a vehicle is slower than it can be
     decision = shield.decide(np.ones((3, 3)), seen=seen)
-    assert shield.distrusted.tolist() == [False, True, False]
+    assert shield.memory.distrusted.tolist() == [False, True, False]
     assert [ShieldReason(each).text for each in decision.reason[1]] == [
         "assumption broken",
         "assumption broken",
@@ -635,11 +628,13 @@ def test_joint_constants__hold_all_alike_and_ladders_each_once() -> None:
 def test_bound_at_the_alert__is_at_most_full_braking_and_any_single_constant() -> None:
     worlds = PAIR.sample(40, 8).worlds
     joint = begun(PAIR, worlds)
-    braked = plan_harm(joint.running, np.full((40, STEPS, 2), -1.0))
-    assert (joint.first_bound <= braked).all()
-    assert joint.first_bound.mean() < 0.8 * braked.mean()
+    braked = plan_harm(joint.memory.running, np.full((40, STEPS, 2), -1.0))
+    assert (joint.memory.first_bound <= braked).all()
+    assert joint.memory.first_bound.mean() < 0.8 * braked.mean()
     for vehicle in (1, 2):
-        assert (joint.first_bound <= begun(PAIR.with_learners([vehicle]), worlds).first_bound + 1e-6).all()
+        assert (
+            joint.memory.first_bound <= begun(PAIR.with_learners([vehicle]), worlds).memory.first_bound + 1e-6
+        ).all()
 
 
 def test_settles__says_what_the_plan_comes_to_in_the_engine() -> None:
@@ -649,5 +644,5 @@ def test_settles__says_what_the_plan_comes_to_in_the_engine() -> None:
     shield.begin(worlds, np.arange(60))
     episodes = drive(worlds, ShieldedDriver(eb.make_agent("e_v2x_bm"), scenario), scenario, 1)
     rests = (episodes.final.speeds_mps == 0.0).all(axis=1)
-    assert rests.tolist() == shield.settles.tolist()
+    assert rests.tolist() == shield.memory.settles.tolist()
     assert 0 < rests.sum() < 60

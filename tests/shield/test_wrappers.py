@@ -114,7 +114,7 @@ def test_batch__tells_of_every_row_the_episode_that_ended(name, mode):
     ended, intervened, rng = 0, 0, np.random.default_rng(0)
     for _ in range(120):
         running, shield = ~env.attached.engine.ended, env.attached.shield
-        before = shield["bound_harm"].copy() if mode == "episode" else shield.first_bound.copy()
+        before = shield["bound_harm"].copy() if mode == "episode" else shield.memory.first_bound.copy()
         found = env.step(rng.uniform(-1.0, 1.0, (8, 1)).astype(np.float32))
         over, infos = (found[2], found[3]) if name == "sb3" else (found[2] | found[3], found[4])
         for k in np.flatnonzero(over):

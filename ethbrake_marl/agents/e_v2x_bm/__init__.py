@@ -1,1 +1,1 @@
-"""E-V2X-BM: the constant deceleration of least harm, in closed form and in the engine's physics."""
+"""E-V2X-BM: the constant deceleration of least harm, in closed form or by simulation with the engine's physics."""

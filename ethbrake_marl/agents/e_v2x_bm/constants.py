@@ -1,9 +1,9 @@
-"""Many constant decelerations of one vehicle in one world, compiled: what the coupled search asks for.
+"""Simulate many constant decelerations of one vehicle in one world, compiled; used by the coupled search.
 
-The harm is that of ``physics.advance`` under constant commands, to the same bits; the motion is not kept. Three
-things make it cheap. Until the vehicle's command takes effect all candidates are one, and that part is moved once. A
-simulation ends as soon as nobody can meet anybody any more (``will_stay_apart``). And it is given up once its harm,
-which never falls again, has reached a bound that the caller names.
+The harm equals that of ``physics.advance`` under constant commands, to the bit; the motion is not kept. Three things
+make it cheap. All candidates share the motion until the vehicle's command takes effect, so it is simulated once. A
+simulation ends as soon as no two vehicles can meet any more (``will_stay_apart``). And it is abandoned once its harm,
+which never decreases, has reached a bound.
 """
 
 from __future__ import annotations
@@ -24,25 +24,28 @@ from ethbrake_marl.physics.rows import FLAG, LISTED, ROW, builds_up, place_force
 from ethbrake_marl.physics.segment import move_apart, start_events, to_next_event, to_next_impact
 from ethbrake_marl.physics.state import Bools, Floats
 
-DURATION, RESTITUTION, SHARED_S = range(3)  # columns of a line's clock
+DURATION, RESTITUTION, SHARED_S = range(3)  # entries of a line's clock
 
-CLEAR_M, CLEAR_MPS = 1e-6, 1e-6  # margins, a million times what rounding can do to a gap or a speed
+CLEAR_M, CLEAR_MPS = 1e-6, 1e-6  # margins, a million times the rounding error of a gap or a speed
 
-_DIGIT = 1_000.0  # impacts of a pair that are told apart
+_DIGIT = 1_000.0  # base in which ``_course`` encodes the number of impacts of each pair
 
 
 class Line(NamedTuple):
-    """One world as candidates run in it, in tables of ``physics.kernel``; an obstacle ahead stands in column 0."""
+    """One world in which decelerations of one vehicle are simulated, as tables of ``physics.rows``.
 
-    start: Floats  # [rows_for(2 K), N or N + 1] with everybody's command but that of the controlled vehicle
-    shared: Floats  # the same where that vehicle's command takes effect
-    table: Floats  # room
-    clock: Floats  # [3] length of a simulation, restitution, time from the start to ``shared``
-    controlled: int  # column of the vehicle
-    vehicles: int  # column of Vehicle 1
-    harm: int  # the row whose sum is minimised
-    other: int  # the row of the other count
-    no_rows: Floats  # an empty list of impacts
+    A table has a row per quantity and a column per vehicle, front to rear; an obstacle ahead is column 0.
+    """
+
+    start: Floats  # [rows, N or N + 1] table at the start, with all commands but the controlled vehicle's
+    shared: Floats  # same shape: table at the time when the controlled vehicle's command takes effect
+    table: Floats  # same shape: workspace, in which each simulation runs
+    clock: Floats  # [3] length of a simulation (s), restitution, time from ``start`` to ``shared`` (s)
+    controlled: int  # column of the controlled vehicle
+    vehicles: int  # column of Vehicle 1: 1 behind an obstacle, else 0
+    harm: int  # row of the harm that is minimised: first-impact or total
+    other: int  # row of the other harm, which decides ties
+    no_rows: Floats  # empty list of impacts, so that single impacts are not recorded
 
 
 @compiled(apart=True)
@@ -51,7 +54,29 @@ def make_line(
     mass: Floats, limit: Floats, in_force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats,
     time: float, restitution: float, horizon: float, vehicle: int, total: bool,
 ) -> Line:  # fmt: skip
-    """One world at its ``time``, ready for ``share_start``; an ``obstacle`` that is finitely far is in it."""
+    """Return the tables of one world of N vehicles, on which ``share_start`` is called next.
+
+    Args:
+        gap: [N - 1] m, bumper to bumper.
+        speed: [N] m/s.
+        hit: [N - 1] whether the pair has had an impact.
+        obstacle: distance from Vehicle 1 to an obstacle ahead, m; infinite: none.
+        obstacle_hit: whether Vehicle 1 has had an impact with it.
+        command: [N] commands, m/s2; the controlled vehicle's is ignored.
+        latency: [N] s since the alert.
+        mass: [N] t.
+        limit: [N] speed limits, m/s.
+        in_force: [N] accelerations in force at the start, m/s2.
+        brake_rate: [N] rates at which brakes build up, m/s3.
+        release_rate: [N] rates at which brakes are released, m/s3.
+        pieces: [N, 2 K] braking profiles with K intervals of constant command, as in ``Vehicles``.
+        time: time of the world, s since the alert.
+        restitution: of every impact, 0 to 1.
+        horizon: end of the simulations, s since the alert.
+        vehicle: index of the controlled vehicle, from 0.
+        total: minimise total harm; if False, first-impact harm.
+
+    """
     at = 1 if obstacle < math.inf else 0
     vehicles = speed.shape[0]
     table = np.zeros((rows_for(pieces.shape[1]), vehicles + at))
@@ -75,7 +100,11 @@ def make_line(
 
 @compiled(apart=True, bare=True)
 def share_start(line: Line) -> int:
-    """Move the line to where its controlled vehicle's command takes effect; DONE, or what went wrong."""
+    """Simulate in ``line.shared`` until the controlled vehicle's command takes effect; return a status.
+
+    That time is written to ``line.clock``. The status is ``FLAG.DONE``, or the code of the check of the physics that
+    failed.
+    """
     table, clock = line.shared, line.clock
     copy_table(line.start, table)
     start_events(table, builds_up(table))
@@ -95,9 +124,18 @@ def share_start(line: Line) -> int:
 
 @compiled(apart=True, bare=True)
 def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -> int:
-    """Fill what the decelerations ``samples.at[first:end]`` do; DONE, or what went wrong with one of them.
+    """Simulate constant decelerations of the controlled vehicle and write their results into ``samples``.
 
-    Where the harm reaches ``bound`` it stands for any harm that is not below it, and the other columns mean nothing.
+    Args:
+        line: the world, after ``share_start``; its ``table`` is overwritten.
+        samples: ``at`` holds the decelerations; the other columns are filled in.
+        first: index of the first sample to simulate.
+        end: index after the last one.
+        bound: harm at which a simulation stops, m2/s2. Its harm is then only known to be at least ``bound``, and its
+            other columns are meaningless.
+
+    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+
     """
     for s in range(first, end):
         if s > first and samples.at[s] == samples.at[s - 1]:
@@ -114,7 +152,10 @@ def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -
 
 @compiled(within=True)
 def _simulate_one(line: Line, command: float, bound: float) -> int:
-    """Leave the harm of one candidate in the line's table."""
+    """Simulate one ``command`` (m/s2) in ``line.table``, until the harm reaches ``bound`` at the latest.
+
+    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    """
     table, duration = line.table, line.clock[DURATION]
     table[ROW.COMMAND, line.controlled] = command
     _copy_state(line.start, table)
@@ -135,7 +176,7 @@ def _simulate_one(line: Line, command: float, bound: float) -> int:
 
 @compiled(within=True)
 def _copy_state(of: Floats, table: Floats) -> None:
-    """Put the table into the state of another one; both have the same vehicles."""
+    """Copy the state of the vehicles and pairs from table ``of`` to ``table``; masses and other parameters stay."""
     vehicles = table.shape[1]
     for i in range(vehicles):
         table[ROW.SPEED, i] = of[ROW.SPEED, i]
@@ -156,7 +197,7 @@ def _copy_state(of: Floats, table: Floats) -> None:
 
 @compiled(within=True)
 def copy_table(one: Floats, other: Floats) -> None:
-    """Copy a whole table."""
+    """Copy every entry of the table ``one`` into the table ``other`` of the same shape."""
     for row in range(one.shape[0]):
         for i in range(one.shape[1]):
             other[row, i] = one[row, i]
@@ -164,17 +205,18 @@ def copy_table(one: Floats, other: Floats) -> None:
 
 @compiled(within=True)
 def will_stay_apart(table: Floats) -> bool:
-    """Whether surely no pair has another impact, however long everybody's command goes on; False when not sure.
+    """Return whether no pair can have another impact, however long all commands last; False if that is not certain.
 
-    All commands are in full effect, brake or coast, and nobody moves backward. Every vehicle then keeps the
-    acceleration it has (that of its body, where some rest against each other) until it stands. A pair of front ``f``
-    and rear ``r`` with gap g, closing speed w and decelerations d has no impact where
+    ``table`` is the table of one world (``physics.rows``). Commands must be in full effect, and no vehicle may drive or
+    move backward. Then every vehicle keeps its acceleration until it stands; vehicles that rest against each other have
+    a common one. A pair of a front vehicle f and a rear vehicle r has gap g, closing speed w, speeds v and
+    decelerations d. It has no impact if one of these is true, the last one with margins for rounding:
 
-    * r stands, or both are one body;
-    * ``w <= 0`` and ``d_r >= d_f``: w stays so until r stands, in the kernel's rounding, too;
-    * r would stop behind f, ``g + v_f^2 / 2 d_f > v_r^2 / 2 d_r``, the pair is apart (or separates), and if r brakes
-      harder while it closes the least gap is positive, too: ``w^2 < 2 (d_r - d_f) g``. (If r brakes less hard, the gap
-      is concave until f stands, and falls from then on.) All with margins.
+    * r stands, or both move as one body;
+    * ``w <= 0`` and ``d_r >= d_f``: then w stays at most 0 until r stands;
+    * r would stop behind f, ``g + v_f^2 / (2 d_f) > v_r^2 / (2 d_r)``; the pair does not touch, or separates; and if r
+      closes and brakes harder, the smallest gap is positive too: ``w^2 < 2 (d_r - d_f) g``. (If r brakes less hard, the
+      gap is least at one of its ends: it is concave until f stands, and decreases from then on.)
     """
     vehicles, hardest = table.shape[1], 0.0
     if pieces_to_come(table):
@@ -185,7 +227,7 @@ def will_stay_apart(table: Floats) -> bool:
         if builds_up(table) and table[ROW.FORCE, i] != table[ROW.COMMAND, i]:
             return False
         hardest = max(hardest, -table[ROW.COMMAND, i])
-    for p in range(vehicles - 1):  # what surely meets is soon told
+    for p in range(vehicles - 1):  # quick test for pairs that may meet
         closing = table[ROW.SPEED, p + 1] - table[ROW.SPEED, p]
         if closing > 0.0 and closing * closing >= 2.0 * hardest * table[ROW.GAP, p]:
             return False
@@ -213,13 +255,16 @@ def will_stay_apart(table: Floats) -> bool:
 
 @compiled(within=True)
 def _way_to_stop(speed: float, acceleration: float) -> float:
-    """How far a vehicle goes that slows down or coasts; infinitely far if it coasts (m)."""
+    """Return the distance in which a vehicle with this speed (m/s) stops, m; ``acceleration`` (m/s2) <= 0.
+
+    It is infinite for a moving vehicle with acceleration 0.
+    """
     return speed * speed / (2.0 * abs(acceleration)) if speed > 0.0 else 0.0
 
 
 @compiled(within=True)
 def _course(line: Line) -> float:
-    """A number that says how many impacts each pair, and the obstacle, had."""
+    """Return a number that encodes how many impacts each pair, and the obstacle, had in ``line.table``."""
     course, digit, table = 0.0, 1.0, line.table
     for p in range(line.vehicles, table.shape[1] - 1):
         course += table[ROW.COUNT, p] * digit
@@ -229,7 +274,7 @@ def _course(line: Line) -> float:
 
 @compiled(within=True)
 def _sum_row(line: Line, row: int) -> float:
-    """Sum of a row over the pairs, and the obstacle's entry, in the order in which NumPy adds up a row."""
+    """Sum a row of ``line.table`` over the pairs and the obstacle, in the order in which NumPy sums a row."""
     table, first, total = line.table, line.vehicles, 0.0
     eights = (table.shape[1] - 1 - first) // 8
     if eights > 0:
@@ -241,7 +286,10 @@ def _sum_row(line: Line, row: int) -> float:
 
 @compiled(apart=True, bare=True)
 def _sum_eights(table: Floats, row: int, first: int, end: int) -> float:
-    """Sum of whole eights of entries: each place of them by itself, then the places two by two."""
+    """Sum ``table[row, first:end]``, a multiple of eight entries, in NumPy's order.
+
+    Each of the eight positions in a block is summed separately, then the eight sums are added pairwise.
+    """
     return (
         (_sum_place(table, row, first, end) + _sum_place(table, row, first + 1, end))
         + (_sum_place(table, row, first + 2, end) + _sum_place(table, row, first + 3, end))
@@ -253,7 +301,7 @@ def _sum_eights(table: Floats, row: int, first: int, end: int) -> float:
 
 @compiled(apart=True, bare=True)
 def _sum_place(table: Floats, row: int, first: int, end: int) -> float:
-    """Sum of every eighth entry."""
+    """Sum every eighth entry of ``table[row, first:end]``, beginning with the first."""
     total = table[row, first]
     for p in range(first + 8, end, 8):
         total += table[row, p]

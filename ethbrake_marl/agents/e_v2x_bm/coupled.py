@@ -1,8 +1,8 @@
 """E-V2X-BM coupled: the best constant deceleration of one vehicle in the engine's own physics.
 
 The closed form of ``pairwise`` treats the pairs as independent. Here every candidate is simulated to the horizon with
-velocity exchange, second impacts and resting contact, so the harm found is the harm realised: the only one of the
-three baselines that may bound a shield. docs/baselines.md says how close to the true minimum the search comes.
+velocity exchange, second impacts and resting contact, so the predicted harm is the harm that occurs. Of the three
+baselines only this one may bound a shield. docs/baselines.md says how close the search comes to the true minimum.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from ethbrake_marl.agents.e_v2x_bm.constants import make_line
 from ethbrake_marl.agents.e_v2x_bm.pairwise import CANDIDATES, closed_form, find_breakpoints, onset_s, optimise_pairwise
 from ethbrake_marl.agents.e_v2x_bm.search import make_room, search_line
 from ethbrake_marl.agents.protocol import Agent, Source, fixed_commands
-from ethbrake_marl.agents.registry import AgentSettings, variants_of
+from ethbrake_marl.agents.registry import variants_of
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.engine.memory import Memory, is_state_free
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, renumbered
@@ -29,20 +30,20 @@ from ethbrake_marl.physics.jit import by_parts, compiled
 from ethbrake_marl.physics.rows import FLAG
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
-_MANY = 200  # worlds to search: fewer are neither remembered nor shared between threads
+_MANY = 200  # smallest number of worlds for which a search is cached and uses several threads
 
-_REMEMBERED = 32  # searches: the baseline's, which a shield around another agent asks for in the same worlds
+_REMEMBERED = 32  # cached searches; a shield around another agent repeats the baseline's search
 
-_FOUND: dict[bytes, Floats] = {}  # by the SHA-256 of all that was asked
+_FOUND: dict[bytes, Floats] = {}  # SHA-256 of a search's arguments -> its result
 
 
 class CoupledOptimum(NamedTuple):
-    """The best constant deceleration found in each world [n]."""
+    """The best constant deceleration of one vehicle found in each of n worlds."""
 
-    deceleration_mps2: Floats  # a*, in [0, braking capacity]
-    harm: Floats  # realised, under the count that was minimised (m2/s2)
-    first_impact_harm: Floats  # realised with a*
-    total_harm: Floats  # realised with a*
+    deceleration_mps2: Floats  # [n] best deceleration a*, in [0, braking capacity]
+    harm: Floats  # [n] the harm that was minimised, with a*: one of the two below (m2/s2)
+    first_impact_harm: Floats  # [n] harm of each pair's first impact, with a* (m2/s2)
+    total_harm: Floats  # [n] harm of all impacts, with a* (m2/s2)
 
 
 def optimise_coupled(
@@ -53,27 +54,35 @@ def optimise_coupled(
     horizon_s: float = 8.0,
     others_mps2: Floats | None = None,
 ) -> CoupledOptimum:
-    """Constant deceleration of ``vehicle`` (index from 0) with the least realised harm until ``horizon_s``.
+    """Return the constant deceleration of ``vehicle`` with the least simulated harm until ``horizon_s``.
 
-    The other vehicles follow ``others_mps2`` [n, N], signed accelerations (default: full braking of all; the
-    controlled vehicle's column is ignored). If braking in the middle of the pairwise collision-free interval
-    proves harmless, it is taken. Otherwise an even grid and the pairwise breakpoints are simulated; where the number of
-    impacts changes, one smooth piece of the harm ends, and that border is located to 1e-9 m/s2; so are the best local
-    minima, on the safe side where the harm jumps. Equal harms are decided by the other count, then by the middle one of
-    the equal decelerations. A world's result does not depend on the batch it is in.
+    If the closed form (``optimise_pairwise``) finds decelerations that avoid both neighbours, and the middle one is
+    harmless in the simulation, it is taken. Otherwise an even grid of decelerations, and those at which the closed
+    form's harm has a kink, are simulated. The harm may jump where the number of impacts changes; these places and the
+    best local minima are located to 1e-9 m/s2. At a jump the result lies on the side of less harm. Among equals the
+    other harm decides, then the middle one is taken. The result of a world does not depend on its batch.
 
-    Raises ``InvalidInput`` for an unknown ``vehicle`` or ``harm_count`` or others beyond their capacities,
-    ``PhysicsError`` naming the worlds in which some candidate could not be simulated as far as it was needed.
+    Args:
+        worlds: n worlds of N vehicles.
+        vehicle: index of the controlled vehicle, from 0.
+        harm_count: impacts whose harm is minimised: ``first`` (each pair's first) or ``total`` (all).
+        horizon_s: end of the simulations, s.
+        others_mps2: constant commands of the other vehicles, [n, N] m/s2; the controlled vehicle's column is ignored.
+            None: all brake fully.
+
+    Raises ``InvalidInput`` for an unknown ``vehicle`` or ``harm_count`` or commands beyond capacity; ``PhysicsError``
+    with the worlds in which some candidate could not be simulated.
+
     """
     check_harm_count(harm_count)
     capacity = worlds.vehicles.braking_capacity_mps2
     command = -capacity if others_mps2 is None else np.array(others_mps2, dtype=np.float64)
-    # The closed form lets the others brake with all their capacity: it is what they are told. Who is told to coast or
-    # to drive keeps the capacity: the closed form cannot say what that one does.
+    # The closed form assumes that the others brake with full capacity, so their capacity is set to their command. The
+    # closed form cannot represent a vehicle that coasts or drives; it keeps its capacity.
     braking = np.where(command < 0.0, -command, capacity)
     braking[:, vehicle] = capacity[:, vehicle]
     told = replace(worlds, vehicles=replace(worlds.vehicles, braking_capacity_mps2=braking))
-    best = closed_form(told, vehicle).deceleration_mps2  # where brakes build up, no more than a first guess
+    best = closed_form(told, vehicle).deceleration_mps2  # only a first guess if brakes build up
     command[:, vehicle] = -best
     _, impacts = advance(worlds, command, until_s=horizon_s)
     first = impacts.first_impact_harm.sum(axis=1) + impacts.obstacle_first_harm
@@ -90,7 +99,18 @@ def optimise_coupled(
 def _minimise(
     worlds: Worlds, told: Worlds, command: Floats, vehicle: int, rows: Ints, harm_count: HarmCount, horizon_s: float
 ) -> Floats:
-    """Best deceleration of worlds ``rows`` [m], its harm and that of the other count: [3, m]."""
+    """Search the best deceleration in some worlds; return it, its harm and its harm under the other count, [3, m].
+
+    Args:
+        worlds: n worlds.
+        told: the same worlds for the closed form, with the capacities of other vehicles set to their braking commands.
+        command: commands of all vehicles, [n, N] m/s2; the controlled vehicle's is ignored.
+        vehicle: index of the controlled vehicle, from 0.
+        rows: [m] indices of the worlds to search.
+        harm_count: impacts whose harm is minimised.
+        horizon_s: end of the simulations, s.
+
+    """
     v = worlds.vehicles
     lines = (
         worlds.gaps_m, worlds.speeds_mps, worlds.time_s, worlds.pair_hit, worlds.obstacle_gap_m, worlds.obstacle_hit,
@@ -129,7 +149,13 @@ def _search_worlds(
     release_rate: Floats, pieces: Floats, restitution: Floats, vehicle: int, rows: Ints, total: bool, horizon: float,
     found: Floats, status: Ints,
 ) -> None:  # fmt: skip
-    """Fill ``found`` [3, m] and ``status`` [m] for worlds ``rows`` [m]."""
+    """Search the best deceleration of ``vehicle`` (index) in the worlds with the indices ``rows`` [m].
+
+    Writes the deceleration, its harm and its harm under the other count to ``found`` [3, m], and the status of the
+    physics (``FLAG.DONE`` if sound) to ``status`` [m]. ``capacity`` and ``onset`` [n, N] are braking capacities (m/s2)
+    and times until a vehicle may brake (s). The other arguments are those of ``make_line``, for n worlds along a new
+    first axis.
+    """
     room, at, best = make_room(), np.empty(CANDIDATES), np.empty(3)
     for m in range(rows.shape[0]):
         k = rows[m]
@@ -147,13 +173,13 @@ Mode = Literal["coupled", "pairwise"]
 
 
 class EV2XBM:
-    """The constant deceleration of least harm.
+    """Agent that brakes with the constant deceleration of least harm.
 
-    ``coupled`` minimises the harm realised in the engine's physics until ``horizon_s`` under ``harm_count``, the
-    others following their scripts, and all vehicles without one (learners) braking fully. ``pairwise`` is the paper's
-    closed form: everybody else brakes fully, and no velocities are exchanged. It remembers ``deceleration_mps2`` [n],
-    which is a*, and ``predicted_harm`` [n], what each of them expects (m2/s2). Raises ``InvalidInput`` for an unknown
-    mode or count, and, when an episode begins, in ``coupled`` mode for another vehicle's script whose command is not
+    Mode ``coupled`` minimises the harm in the engine's physics until ``horizon_s`` under ``harm_count``. It assumes
+    that the others follow their scripts, and that vehicles without a script (learners) brake fully. Mode ``pairwise``
+    is the paper's closed form: all others brake fully, and no velocities are exchanged. The memory holds
+    ``deceleration_mps2`` [n], which is a*, and ``predicted_harm`` [n] (m2/s2). Raises ``InvalidInput`` for an unknown
+    mode or count, and, when an episode begins in mode ``coupled``, for another vehicle's script whose command is not
     fixed at the alert.
     """
 
@@ -166,13 +192,20 @@ class EV2XBM:
         self._mode, self._harm_count, self._horizon_s = mode, harm_count, horizon_s
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Choose a* from the worlds at the alert."""
+        """Choose each world's best deceleration a* at the alert and return it in the memory.
+
+        Args:
+            alert: n worlds at the alert.
+            vehicle: index of the controlled vehicle (0 = front).
+            scripts: index of each scripted vehicle -> its script.
+
+        """
         if self._mode == "pairwise":
             closed = optimise_pairwise(alert, vehicle)
             return {"deceleration_mps2": closed.deceleration_mps2, "predicted_harm": closed.harm}
 
         def is_fixed(script: Script) -> bool:
-            """Whether its command does not wait for that of ``vehicle``, which is scripted itself or free to decide."""
+            """Return whether the script's command is fixed at the alert without knowing the choice of ``vehicle``."""
             chooses_first = isinstance(script, EV2XBM) and (script._mode == "pairwise" or vehicle not in scripts)
             return is_state_free(script) or chooses_first
 
@@ -187,12 +220,15 @@ class EV2XBM:
         return {"deceleration_mps2": coupled.deceleration_mps2, "predicted_harm": coupled.harm}
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """``-a*``, [n] m/s2."""
+        """Return the command ``-a*`` chosen at the alert, [n] m/s2, and the unchanged memory."""
         return -memory["deceleration_mps2"], memory
 
 
 def make_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
-    """``e_v2x_bm``, the same as ``e_v2x_bm:coupled``, or ``e_v2x_bm:pairwise``."""
+    """Make E-V2X-BM with the horizon and harm count of ``settings``.
+
+    ``argument`` is ``pairwise``, ``coupled`` or None, which means ``coupled``.
+    """
     if argument not in (None, "coupled", "pairwise"):
         then = "".join(f", then {variant!r}" for variant in variants_of("e_v2x_bm"))
         raise InvalidInput(f"agent {settings.spec!r}: the argument must be 'coupled' or 'pairwise'{then}")

@@ -1,9 +1,9 @@
-"""E-V2X-BM in closed form: the constant deceleration of one vehicle that minimises its pairs' predicted harm.
+"""E-V2X-BM in closed form: the constant deceleration of one vehicle that minimises the predicted harm of its pairs.
 
-The controlled vehicle's neighbours brake at full capacity from their own latencies; its front and its rear pair are
-treated as independent, so each counts its first contact only and no velocity is exchanged. Predicted harm is
-``H(a) = c_front(a)^2 + c_rear(a)^2`` (m2/s2). Between a handful of closed-form breakpoints it is concave in ``a``, so
-its minimum is at one of them: no grid. docs/proofs/constant-deceleration.md derives all of it.
+The neighbours of the controlled vehicle brake at full capacity from their own latencies on. Its front and rear pair are
+treated as independent, so each counts its first contact only and no velocity is exchanged. The predicted harm is
+``H(a) = c_front(a)^2 + c_rear(a)^2`` (m2/s2). It is concave in ``a`` between a few closed-form breakpoints, so its
+minimum is at one of them and no grid is needed. docs/proofs/constant-deceleration.md has the derivation.
 """
 
 from __future__ import annotations
@@ -24,28 +24,38 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats, Worlds
 
-CANDIDATES = 6  # 0, capacity, the two thresholds, and two more where the vehicle may brake before its front neighbour
+CANDIDATES = 6  # 0, capacity, two thresholds, and two more if the vehicle may brake before its front neighbour
 
-_TIE = 1e-12  # harms closer than this, relative to 1 + harm, are one harm
+_TIE = 1e-12  # harms closer than this, relative to 1 + harm, count as equal
 
 
 class PairwiseOptimum(NamedTuple):
-    """The closed-form optimum of each world [n]."""
+    """The closed-form best constant deceleration of one vehicle in each of n worlds."""
 
-    deceleration_mps2: Floats  # a*, in [0, braking capacity]
-    harm: Floats  # predicted H* (m2/s2)
-    spares_front_mps2: Floats  # smallest deceleration that avoids the front vehicle; inf if none
-    spares_rear_mps2: Floats  # largest deceleration that avoids the rear vehicle; inf if all do, -inf if none
+    deceleration_mps2: Floats  # [n] best deceleration a*, in [0, braking capacity]
+    harm: Floats  # [n] predicted harm with a*, called H* (m2/s2)
+    spares_front_mps2: Floats  # [n] smallest deceleration that avoids the vehicle in front; inf if none does
+    spares_rear_mps2: Floats  # [n] largest deceleration that avoids the vehicle behind; inf if all do, -inf if none
     breakpoints_mps2: Floats  # [n, 6] every deceleration at which the harm may have its minimum, unordered
 
 
 @compiled
 def early_breakpoints(gap: float, w: float, onset_l: float, onset_f: float) -> tuple[float, float]:
-    """Kink and jump of the front pair's harm when the follower may brake before the leader; (0, 0) otherwise.
+    """Return two decelerations of the follower at which the harm of the pair has a kink, and a jump. [m/s2]
 
-    Kink: contact exactly at the leader's onset, ``2 (w lead - gap) / lead^2``. Jump: below ``w^2 / (2 gap)`` the
-    follower strikes the coasting leader lightly, above it grazes past and may strike harder once the leader brakes;
-    the lightest contact that still is an impact stands for the open end. [m/s2]
+    Both are 0 unless the follower may brake before the leader (front vehicle) does. ``lead`` is the time in between.
+
+    - Kink: contact exactly when the leader begins to brake, at ``2 (w lead - gap) / lead^2``.
+    - Jump: below ``w^2 / (2 gap)`` the follower strikes the coasting leader lightly. Above, it does not reach it, and
+      may strike harder once the leader brakes. The result is the deceleration just below, with the lightest contact
+      that counts as an impact.
+
+    Args:
+        gap: gap at the present time, m.
+        w: closing speed, follower minus leader, m/s.
+        onset_l: time at which the leader begins to brake, s.
+        onset_f: time at which the follower may begin to brake, s.
+
     """
     lead = onset_l - onset_f
     if lead <= 0.0:
@@ -56,7 +66,11 @@ def early_breakpoints(gap: float, w: float, onset_l: float, onset_f: float) -> t
 
 @compiled
 def front_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats) -> float:
-    """Predicted harm of vehicle ``i``'s front pair when it brakes with ``a``; 0 for the first vehicle."""
+    """Return the predicted harm of vehicle ``i`` with the vehicle in front, m2/s2; 0 for the first vehicle.
+
+    Vehicle ``i`` brakes with ``a``, the one in front with its capacity. ``gap`` [P] m, ``speed`` [N] m/s, ``capacity``
+    [N] m/s2 and ``onset`` [N] s (time until a vehicle may brake) describe one world.
+    """
     if i == 0:
         return 0.0
     return closing_speed_squared(gap[i - 1], speed[i - 1], capacity[i - 1], onset[i - 1], speed[i], a, onset[i])
@@ -64,7 +78,11 @@ def front_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, o
 
 @compiled
 def rear_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats) -> float:
-    """Predicted harm of vehicle ``i``'s rear pair when it brakes with ``a``; 0 for the last vehicle."""
+    """Return the predicted harm of vehicle ``i`` with the vehicle behind, m2/s2; 0 for the last vehicle.
+
+    Vehicle ``i`` brakes with ``a``, the one behind with its capacity. ``gap`` [P] m, ``speed`` [N] m/s, ``capacity``
+    [N] m/s2 and ``onset`` [N] s (time until a vehicle may brake) describe one world.
+    """
     if i == gap.shape[0]:
         return 0.0
     return closing_speed_squared(gap[i], speed[i], a, onset[i], speed[i + 1], capacity[i + 1], onset[i + 1])
@@ -74,7 +92,12 @@ def rear_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, on
 def find_breakpoints(
     at: Floats, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats
 ) -> tuple[float, float]:
-    """Fill ``at`` [6] with the candidates of one world, all inside [0, capacity]; returns both thresholds."""
+    """Write the decelerations of vehicle ``i`` at which its harm may be least to ``at`` [6], all in [0, capacity].
+
+    Returns the smallest deceleration that avoids the vehicle in front, and the largest one that avoids the vehicle
+    behind (may be infinite). ``gap`` [P] m, ``speed`` [N] m/s, ``capacity`` [N] m/s2 and ``onset`` [N] s (time until a
+    vehicle may brake) describe one world.
+    """
     low, high = 0.0, math.inf
     at[:] = 0.0
     at[1] = capacity[i]
@@ -97,7 +120,12 @@ def find_breakpoints(
 def minimise_over(
     at: Floats, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats
 ) -> tuple[float, float]:
-    """Least predicted harm over the candidates, and where: in the middle if the harm is flat between minimisers."""
+    """Return the deceleration of least predicted harm of vehicle ``i``, and this harm (m2/s2).
+
+    Only the candidates ``at`` [6] (m/s2) are compared. If two of them, and the middle between them, have the least
+    harm, the middle is returned. ``gap`` [P] m, ``speed`` [N] m/s, ``capacity`` [N] m/s2 and ``onset`` [N] s (time
+    until a vehicle may brake) describe one world.
+    """
     best, first, last = math.inf, 0.0, 0.0
     for k in range(at.shape[0]):
         if k > 0 and at[k] == 0.0:
@@ -120,7 +148,12 @@ def minimise_over(
 def optimise_worlds(
     gaps: Floats, speeds: Floats, capacity: Floats, onset: Floats, i: int, at: Floats, out: Floats
 ) -> None:
-    """Candidates of every world into ``at`` [n, 6], its optimum into ``out`` [4, n]: a*, H*, and the two thresholds."""
+    """Optimise the deceleration of vehicle ``i`` in n worlds, in closed form.
+
+    Writes the candidates to ``at`` [n, 6], and to ``out`` [4, n]: the best deceleration, its predicted harm, and the
+    two thresholds that ``find_breakpoints`` returns. ``gaps`` [n, P] m, ``speeds`` [n, N] m/s, ``capacity`` [n, N] m/s2
+    and ``onset`` [n, N] s (time until a vehicle may brake) are read.
+    """
     for k in range(gaps.shape[0]):
         low, high = find_breakpoints(at[k], i, gaps[k], speeds[k], capacity[k], onset[k])
         top = min(high, capacity[k, i])
@@ -133,7 +166,11 @@ def optimise_worlds(
 
 @compiled
 def contacts_of_worlds(gaps: Floats, speeds: Floats, deceleration: Floats, onset: Floats, out: Floats) -> None:
-    """Squared closing speed of every pair alone into ``out`` [n, P]."""
+    """Write the squared closing speed at each pair's first impact, or 0, to ``out`` [n, P] m2/s2.
+
+    Each pair is treated on its own. ``gaps`` [n, P] m, ``speeds`` [n, N] m/s, constant ``deceleration`` [n, N] m/s2 and
+    ``onset`` [n, N] s (time until a vehicle may brake) are read.
+    """
     for k in range(gaps.shape[0]):
         for p in range(gaps.shape[1]):
             out[k, p] = closing_speed_squared(
@@ -143,12 +180,12 @@ def contacts_of_worlds(gaps: Floats, speeds: Floats, deceleration: Floats, onset
 
 
 def optimise_pairwise(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
-    """E-V2X-BM of controlled ``vehicle`` (index from 0) in every world, in closed form.
+    """Return E-V2X-BM's optimum for ``vehicle`` (index from 0) in every world, in closed form.
 
-    Minimises ``H(a) = c_front^2 + c_rear^2`` over ``a`` in [0, capacity]. If the decelerations that avoid both
-    neighbours form a non-empty interval, ``a*`` is its middle, else the best breakpoint. The first and the last
-    vehicle of a line have one pair; pairs further away (N > 3) are not looked at. Needs the gaps, speeds,
-    capacities and latencies of the vehicle and its two neighbours, nothing else.
+    Minimises ``H(a) = c_front^2 + c_rear^2`` over ``a`` in [0, capacity]. If some decelerations avoid both neighbours,
+    ``a*`` is the middle of their interval, otherwise the best breakpoint. The first and the last vehicle of a line have
+    one pair; pairs further away (N > 3) are ignored. Uses only the gaps, speeds, capacities and latencies of the
+    vehicle and its two neighbours.
 
     Raises ``InvalidInput`` if ``vehicle`` is not in the line, a vehicle moves backward or brakes build up.
     """
@@ -157,7 +194,7 @@ def optimise_pairwise(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
 
 
 def closed_form(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
-    """The optimum were every acceleration there at once."""
+    """Version of ``optimise_pairwise`` that also accepts brakes that build up, and treats them as acting at once."""
     onset, capacity = onset_s(worlds, vehicle), worlds.vehicles.braking_capacity_mps2
     at, out = np.empty((worlds.n, CANDIDATES)), np.empty((4, worlds.n))
     optimise_worlds(worlds.gaps_m, worlds.speeds_mps, capacity, onset, vehicle, at, out)
@@ -166,11 +203,17 @@ def closed_form(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
 
 
 def pairwise_harm(worlds: Worlds, deceleration_mps2: ArrayLike) -> Floats:
-    """Predicted harm of each pair on its own, [n, P] (m2/s2), under constant decelerations [n, N].
+    """Return the predicted harm of each pair on its own, [n, P] m2/s2.
 
-    Every vehicle coasts to its latency and then brakes to rest. The prediction of E-V2X-BM is the sum over the
-    controlled vehicle's pairs. Raises ``InvalidInput`` for a deceleration that is negative or not finite, and where
-    brakes build up.
+    Every vehicle coasts until its latency has elapsed and then brakes to rest. E-V2X-BM's prediction is the sum over
+    the controlled vehicle's pairs.
+
+    Args:
+        worlds: n worlds.
+        deceleration_mps2: constant deceleration of each vehicle, [n, N] m/s2 or a shape that broadcasts to it.
+
+    Raises ``InvalidInput`` for a deceleration that is negative or not finite, and if brakes build up.
+
     """
     worlds.refuse_build_up("the closed form of E-V2X-BM and planner")
     onset = onset_s(worlds, 0)
@@ -185,7 +228,11 @@ def pairwise_harm(worlds: Worlds, deceleration_mps2: ArrayLike) -> Floats:
 
 
 def onset_s(worlds: Worlds, vehicle: int) -> Floats:
-    """Time from now until each vehicle may brake, [n, N]; checks that the closed form applies."""
+    """Return the time from the worlds' present time until each vehicle may brake, [n, N] s; 0 if it may brake now.
+
+    Raises ``InvalidInput`` if the closed form does not apply: no vehicle has the index ``vehicle``, or a speed is
+    negative.
+    """
     if not 0 <= vehicle < worlds.N:
         raise InvalidInput(f"vehicle {vehicle}: must be an index in 0..{worlds.N - 1}")
     if not np.all(worlds.speeds_mps >= 0.0):

@@ -1,6 +1,6 @@
-"""The coupled search of one world, compiled: an even look, a closer one, borders, minima, one step back.
+"""The coupled search in one world, compiled: even grid, finer grid, borders, local minima, one safety step.
 
-``coupled`` says what is searched for, docs/baselines.md why in these steps.
+``coupled`` says what is searched for; docs/baselines.md gives the reasons for these steps.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.rows import FLAG
 from ethbrake_marl.physics.state import Floats, Ints
 
-GRID = 161  # first look: evenly spaced decelerations from 0 to the capacity
+GRID = 161  # first step: number of evenly spaced decelerations from 0 to the capacity
 
-CELLS = 24  # cells of the grid that are looked into, at most
+CELLS = 24  # largest number of grid cells (intervals between two neighbours of the grid) that are refined
 
-INSIDE = 16  # samples inside such a cell
+INSIDE = 16  # samples inside a refined cell
 
-BORDERS = 6  # borders between two courses of impacts that are located, at most
+BORDERS = 6  # largest number of borders (decelerations at which the number of impacts changes) that are located
 
-MINIMA = 6  # local minima of all samples that are followed
+MINIMA = 6  # number of local minima that are refined
 
-_JUMP = 1e-6  # a change of harm (m2/s2) between decelerations 1e-9 m/s2 apart that only a jump explains
+_JUMP = 1e-6  # change of harm (m2/s2) within 1e-9 m/s2 that only a jump explains
 
 _LOOKED = GRID + CANDIDATES + CELLS * INSIDE
 
@@ -49,32 +49,36 @@ _MOST = _NARROWED + MINIMA
 
 _FEW = 6
 
-# Bounds that are no literals, for each of which all physics would be compiled once more:
+# Loop bounds, not as literals: numba would compile all physics again for each literal.
 _ZERO, _ONE, _FIVE, _GRID_END, _CANDIDATES_END = (cast(int, np.int64(k)) for k in (0, 1, 5, GRID, CANDIDATES))
 
 _SHARES = np.linspace(0.0, 1.0, GRID)
 
 _SHARES_INSIDE = np.arange(1, INSIDE + 1) / (INSIDE + 1)
 
-_FIFTHS = np.arange(1, 5) / 5  # new points between the ends of a border
+_FIFTHS = np.arange(1, 5) / 5  # new samples between the two sides of a border
 
 
 class Room(NamedTuple):
-    """What a search works in, the same for every world of a batch."""
+    """Workspace of a search, reused for every world of a batch.
 
-    one: Samples  # the grid, later what was looked at
-    two: Samples  # what was looked at, at the end with borders and minima
-    new: Samples
-    few: Samples
-    values: Floats
-    cells: Ints  # [CELLS] places in a list of samples
-    borders: Ints  # [BORDERS]
-    minima: Ints  # [MINIMA]
+    A *cell* is the interval between two neighbouring decelerations of the grid. A *border* is a deceleration at which
+    the number of impacts changes.
+    """
+
+    one: Samples  # the grid; later all samples so far
+    two: Samples  # all samples so far; at the end with borders and minima
+    new: Samples  # the samples that a step adds
+    few: Samples  # a handful of samples around one place
+    values: Floats  # one number per sample: bounds or depths
+    cells: Ints  # [CELLS] index of the sample at the left end of each refined cell
+    borders: Ints  # [BORDERS] index of the sample before each border
+    minima: Ints  # [MINIMA] index of each local minimum among the samples
 
 
 @compiled
 def make_room() -> Room:
-    """Room for the search of any world."""
+    """Return uninitialised workspace for searches."""
     return Room(
         make_samples(_MOST), make_samples(_MOST), make_samples(_MOST), make_samples(_FEW), np.empty(_MOST),
         np.empty(CELLS, np.int64), np.empty(BORDERS, np.int64), np.empty(MINIMA, np.int64),
@@ -83,9 +87,17 @@ def make_room() -> Room:
 
 @compiled(apart=True, bare=True)
 def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, out: Floats) -> int:
-    """The best deceleration of a line, its harm and that of the other count into ``out`` [3]; DONE, or what went wrong.
+    """Find the best constant deceleration of a line's controlled vehicle.
 
-    ``breakpoints`` [CANDIDATES] are looked at beside the grid.
+    Args:
+        line: the world, from ``make_line``.
+        room: workspace, overwritten.
+        breakpoints: [CANDIDATES] decelerations that are simulated in addition to an even grid, m/s2.
+        capacity: braking capacity of the vehicle, m/s2.
+        out: [3] receives the deceleration (m/s2), its harm, and its harm under the other count (m2/s2).
+
+    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+
     """
     status = share_start(line)
     if status == FLAG.DONE:
@@ -103,7 +115,11 @@ def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, ou
 
 @compiled(apart=True, bare=True)
 def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) -> int:
-    """Samples on the grid in ``room.one``, and with those at the breakpoints in ``room.two``."""
+    """Step 1: simulate an even grid of decelerations and the ``breakpoints`` [CANDIDATES] (m/s2) in the world ``line``.
+
+    The grid is left in ``room.one``, grid and breakpoints sorted in ``room.two``. ``capacity`` is the largest
+    deceleration, m/s2. Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    """
     grid, new = room.one, room.few
     for k in range(GRID):
         grid.at[k] = capacity * _SHARES[k]
@@ -119,9 +135,11 @@ def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) ->
 
 @compiled(apart=True, bare=True)
 def look_inside(line: Line, room: Room) -> int:
-    """Samples inside the cells of the grid that hold a border, or may hide less harm than any sample so far.
+    """Step 2: simulate more decelerations in the intervals of the grid that may contain the least harm.
 
-    Leaves ``_LOOKED`` samples in ``room.one``: where there are fewer cells, the last one stands for those left.
+    These are intervals in which the number of impacts changes, or whose estimated harm is below every sample so far.
+    Leaves ``_LOOKED`` samples in ``room.one``; if there are fewer, the last one is repeated. Returns a status:
+    ``FLAG.DONE``, or the code of the check of the physics that failed.
     """
     grid, looked, new, cells, bounds = room.one, room.two, room.new, room.cells, room.values
     best = least_harm(looked, GRID + CANDIDATES)
@@ -149,7 +167,7 @@ def look_inside(line: Line, room: Room) -> int:
 
 @compiled(bare=True)
 def _put_in_order(places: Ints, n: int) -> None:
-    """Put the first ``n`` in rising order."""
+    """Sort the first ``n`` entries of ``places`` in place."""
     for k in range(1, n):
         place, to = places[k], k
         while to > 0 and places[to - 1] > place:
@@ -160,9 +178,11 @@ def _put_in_order(places: Ints, n: int) -> None:
 
 @compiled(apart=True, bare=True)
 def locate_borders(line: Line, room: Room) -> int:
-    """Both sides of the borders between courses of impacts that may hide less harm, 1e-9 m/s2 apart.
+    """Step 3: locate the decelerations at which the number of impacts changes, if less harm may be found there.
 
-    In between, harm is smooth, and what falls toward a border is least there. Leaves all samples in ``room.two``.
+    Between two such borders the harm is smooth, so harm that falls towards a border is least there. Each located border
+    ends up between two samples 1e-9 m/s2 apart. Leaves all samples in ``room.two``. Returns a status: ``FLAG.DONE``, or
+    the code of the check of the physics that failed.
     """
     looked, new, few, places, bounds = room.one, room.new, room.few, room.borders, room.values
     best = least_harm(looked, _LOOKED)
@@ -187,7 +207,11 @@ def locate_borders(line: Line, room: Room) -> int:
 
 @compiled(bare=True)
 def _cut(line: Line, few: Samples) -> int:
-    """Bring samples 0 and 5 on both sides of a border together, each time to a fifth."""
+    """Bring samples 0 and 5 of ``few``, on the two sides of a border, to a distance of 1e-9 m/s2.
+
+    A border is a deceleration at which the number of impacts changes. Each round divides the distance by five. Returns
+    a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    """
     while few.at[5] - few.at[0] > NARROWEST_MPS2:
         low, width = few.at[0], few.at[5] - few.at[0]
         for k in range(4):
@@ -200,14 +224,17 @@ def _cut(line: Line, few: Samples) -> int:
             lower = min(few.harm[k], few.harm[k + 1])
             if few.course[k] != few.course[k + 1] and lower < least:
                 border, least = k, lower
-        copy_sample(few, border + 1, few, 5)  # first: it may be sample 1 that moves to 0
+        copy_sample(few, border + 1, few, 5)  # copy this one first: sample 1 may move to 0
         copy_sample(few, border, few, 0)
     return FLAG.DONE
 
 
 @compiled(apart=True, bare=True)
 def narrow_minima(line: Line, room: Room) -> int:
-    """Follow the lowest local minima of the samples down to brackets of 1e-9 m/s2; adds where they end."""
+    """Step 4: locate the lowest local minima of the harm to 1e-9 m/s2, and append them to ``room.two``.
+
+    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    """
     found, minima, last = room.two, room.minima, _NARROWED - 1
     find_minima(found, _NARROWED, room.values, minima)
     for m in range(MINIMA):
@@ -223,9 +250,18 @@ def narrow_minima(line: Line, room: Room) -> int:
 
 @compiled(bare=True)
 def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, to: int) -> int:
-    """Bring ``low`` and ``high`` together around the least harm, which is that of ``found[to]``.
+    """Narrow an interval around a local minimum of the harm to 1e-9 m/s2; return a status.
 
-    Both sides are cut in three each time. Where nothing is lower than the middle, that stays.
+    Both sides are divided in three in each round. If no new sample is lower, the middle stays.
+
+    Args:
+        line: the world.
+        few: workspace.
+        low: lower end of the interval, m/s2.
+        high: upper end, m/s2.
+        found: samples; number ``to`` is the minimum inside the interval, and is replaced by better ones.
+        to: index of this sample.
+
     """
     while high - low > NARROWEST_MPS2:
         middle = found.at[to]
@@ -252,9 +288,20 @@ def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, t
 
 @compiled(apart=True, bare=True)
 def step_back(line: Line, around: Samples, best: float, capacity: float, out: Floats) -> int:
-    """Move a minimum that lies on the very edge of a jump 1e-9 m/s2 to its safe side.
+    """Step 5: if ``best`` (m/s2) lies within 1e-9 m/s2 of a jump of the harm, move it to the lower side.
 
-    Otherwise the last bits, which differ when the same motion is advanced step by step, would decide the harm.
+    An engine advances the same motion step by step, which changes its last bits. Directly at a jump these bits would
+    decide on which side the harm is.
+
+    Args:
+        line: the world.
+        around: workspace.
+        best: best deceleration found, m/s2.
+        capacity: braking capacity of the vehicle, m/s2.
+        out: [3] receives the deceleration, its harm, and its harm under the other count.
+
+    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+
     """
     for k in range(5):
         around.at[k] = min(max(best + NARROWEST_MPS2 * (k - 2.0), 0.0), capacity)

@@ -1,1 +1,1 @@
-"""BenchMARL tasks."""
+"""Scenarios as BenchMARL tasks."""

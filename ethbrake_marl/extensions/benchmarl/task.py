@@ -1,8 +1,9 @@
-"""The line as a TorchRL environment and a BenchMARL task; needs the extra ``marl``.
+"""A scenario as a TorchRL environment and as a BenchMARL task. Needs the extra ``marl``.
 
-Every world of the batch is a row of one engine. The learners are one group, which ends together: ``done`` belongs to
-the world, so nobody's end cuts off the others. The critic's ``state`` is the full state of the line
-(``observations.state``).
+The environment runs ``n`` worlds in one engine. All learners of a world form one group and end together, because
+``done`` belongs to the world. The critic's ``state`` is the full state of the line (``game.full_state.full_state``).
+
+Shapes: ``n`` worlds, ``L`` learners, ``F`` features of an observation, ``S`` features of the state.
 """
 
 from __future__ import annotations
@@ -30,10 +31,18 @@ GROUP = "learners"
 
 
 class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is missing
-    """``n`` worlds of ``scenario``: observation [n, L, F], action and reward [n, L, 1], state [n, S], done [n, 1].
+    """TorchRL environment over ``n`` worlds of ``scenario``.
 
-    ``horizon_is_end``: an episode that the horizon cuts off counts as terminated, as in a recipe. ``shield``: the mode
-    of a shield around the learners, ``step`` for several; None: none.
+    Shapes: observation [n, L, F], action and reward [n, L, 1], state [n, S], done [n, 1].
+
+    Args:
+        scenario: the scenario, which has at least one learner.
+        n: number of worlds.
+        seed: seed of the worlds.
+        reward: reward of the learners, as in the other environments: a name such as ``harm``, or weights.
+        horizon_is_end: count an episode that the horizon cuts off as terminated, as in a training recipe.
+        shield: mode of a shield around the learners (``step`` if there are several learners); None: no shield.
+
     """
 
     def __init__(
@@ -66,7 +75,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
         self.done_spec = Composite(flag, shape=(n,))
 
     def _reset(self, tensordict: Any, **settings: Any) -> Any:
-        """Start an episode in every world, or in those that ``_reset`` names."""
+        """Start a new episode in every world, or only in the worlds that the tensordict's ``_reset`` mask marks."""
         asked = None if tensordict is None else tensordict.get("_reset", None)
         if asked is None:
             self.engine.reset()
@@ -88,7 +97,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
         return TensorDict(content, batch_size=self.batch_size)
 
     def _set_seed(self, seed: int | None) -> None:
-        """Go on with the stream of ``seed``."""
+        """Start new episodes in all worlds, with worlds drawn from ``seed``; None changes nothing."""
         if seed is not None:
             self.engine.reset(seed=seed)
 
@@ -100,70 +109,77 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
 
 
 class LineTask(TaskClass):  # type: ignore[misc]
-    """A scenario as a task.
+    """BenchMARL task for one scenario.
 
-    ``config``: ``scenario`` (a shipped name, a YAML file, its content, or a ``Scenario``), ``reward``,
-    ``horizon_is_end``, and, if wanted, the mode of a ``shield``.
+    Args:
+        name: name of the task in BenchMARL, such as ``PAPER_RANDOM``.
+        config: ``scenario`` (a shipped name, a YAML file, its content, or a ``Scenario``) and the arguments ``reward``,
+            ``horizon_is_end`` and, optionally, ``shield`` of ``LineEnv``.
+
     """
 
     def __init__(self, name: str, config: dict[str, Any]) -> None:
         super().__init__(name, {**config, "scenario": load_scenario(config["scenario"])})
 
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
-        """How to make the worlds."""
+        """Return a function without arguments that makes a ``LineEnv`` with ``num_envs`` worlds.
+
+        ``seed`` is the seed of the worlds (None: 0). BenchMARL also passes ``continuous_actions`` and ``device``, which
+        are unused.
+        """
         config = self.config
         settings = config["reward"], config["horizon_is_end"], config.get("shield")
         return lambda: LineEnv(config["scenario"], num_envs, seed or 0, *settings)
 
     def supports_continuous_actions(self) -> bool:
-        """Yes."""
+        """Return True: actions are continuous."""
         return True
 
     def supports_discrete_actions(self) -> bool:
-        """No."""
+        """Return False: there are no discrete actions."""
         return False
 
     def max_steps(self, env: Any) -> int:
-        """Decisions to the horizon."""
+        """Return the largest number of decisions in an episode; ``env`` is unused."""
         scenario: Scenario = self.config["scenario"]
         return round(scenario.horizon_s / scenario.time_step_s) + 1
 
     def has_render(self, env: Any) -> bool:
-        """Nothing is drawn."""
+        """Return False: the environment draws nothing."""
         return False
 
     def group_map(self, env: Any) -> dict[str, list[str]]:
-        """All learners are one group."""
+        """Return ``{"learners": names}`` with the names of all learners, which form one group; ``env`` is unused."""
         scenario = self.config["scenario"]
         return {GROUP: [scenario.vehicle_names[vehicle] for vehicle in scenario.learners]}
 
     def observation_spec(self, env: Any) -> Any:
-        """What each learner sees."""
+        """Return the TorchRL spec of the learners' observations in ``env``, without the batch of worlds."""
         spec = env.full_observation_spec_unbatched.clone()
         del spec["state"]
         return spec
 
     def info_spec(self, env: Any) -> Any:
-        """None."""
+        """Return None: the environment has no info entries."""
         return None
 
     def state_spec(self, env: Any) -> Any:
-        """What the critic sees."""
+        """Return the TorchRL spec of the critic's state in ``env``, without the batch of worlds."""
         spec = env.full_observation_spec_unbatched.clone()
         del spec[GROUP]
         return spec
 
     def action_spec(self, env: Any) -> Any:
-        """What each learner decides."""
+        """Return the TorchRL spec of the learners' actions in ``env``, without the batch of worlds."""
         return env.full_action_spec_unbatched
 
     def action_mask_spec(self, env: Any) -> Any:
-        """None."""
+        """Return None: every action is allowed."""
         return None
 
     @staticmethod
     def env_name() -> str:
-        """Name of the environment."""
+        """Return the name under which BenchMARL lists the tasks."""
         return "ethbrake"
 
 

@@ -1,8 +1,8 @@
-"""Every shipped scenario in which somebody learns as a task of BenchMARL's own registry; needs the extra ``marl``.
+"""Register every shipped scenario that has a learner as a BenchMARL task. Needs the extra ``marl``.
 
-``python -m ethbrake_marl.extensions.benchmarl.tasks algorithm=mappo task=ethbrake/paper_random`` is BenchMARL's command
-line with these tasks: everything else, Hydra's overrides included, is its own. BenchMARL looks for tasks in its own
-folder only, so that they have to be entered into its tables before it reads its command line.
+``python -m ethbrake_marl.extensions.benchmarl.tasks algorithm=mappo task=ethbrake/paper_random`` is BenchMARL's own
+command line (Hydra overrides included) with these tasks added. BenchMARL looks for tasks only in its own folder, so
+they must be in its tables before it reads the command line.
 """
 
 from __future__ import annotations
@@ -18,15 +18,18 @@ from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 
 
 class _Scenarios(Task):  # type: ignore[misc]  # untyped where the extra is missing
-    """What all tasks share."""
+    """BenchMARL's enumeration of tasks, one for each shipped scenario that has a learner."""
 
     @staticmethod
     def associated_class() -> type[LineTask]:
-        """A scenario as a task."""
+        """Return ``LineTask``, the class that implements all of these tasks."""
         return LineTask
 
     def get_from_yaml(self, path: str | None = None) -> LineTask:
-        """The scenario as it is shipped, or that of the file ``path``; the reward is minus the harm."""
+        """Return the task of this shipped scenario, or of the scenario file ``path`` unless it is None.
+
+        The reward is minus the harm, and there is no shield.
+        """
         return LineTask(self.name, _settings(SCENARIOS[self.name] if path is None else path))
 
 
@@ -46,7 +49,7 @@ EthBrakeTask = _Scenarios("EthBrakeTask", list(SCENARIOS))
 
 
 def register_tasks() -> None:
-    """Enter the tasks, as ``ethbrake/paper_random`` and so on; entering them again changes nothing."""
+    """Add the tasks to BenchMARL's tables as ``ethbrake/paper_random`` and so on. Calling it again changes nothing."""
     store = ConfigStore.instance()
     for task in EthBrakeTask:
         name = task.name.lower()

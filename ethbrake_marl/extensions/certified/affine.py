@@ -1,12 +1,17 @@
-"""Affine forms: numbers that depend on where in a box a world lies, with a bound on what is not linear in it.
+"""Affine arithmetic over a box of worlds, and the motion of single vehicles in it.
 
-A form [W] of a box with K uncertain numbers, W = K + 2, stands for ``c + g_1 e_1 + ... + g_K e_K + r e``: the centre,
-one slope for each uncertain number, and a remainder. ``e_k`` in [-1, 1] says where in the box the world lies, the
-same in every form; ``e`` in [-1, 1] is any, another one in every form. What two forms share in ``e_k`` cancels when
-they are subtracted, which plain intervals cannot do.
+A *box* holds all worlds whose K uncertain numbers lie in given intervals. An *affine form* is an array [W], W = K + 2,
+that stands for ``c + g_1 e_1 + ... + g_K e_K + r e``: a centre, one slope for each uncertain number, and a remainder.
+``e_k`` in [-1, 1] is the position of the world in the box along uncertain number k and is the same in all forms. ``e``
+in [-1, 1] is arbitrary and independent in each form. In a subtraction the common ``e_k`` cancel, which plain intervals
+cannot do.
 
-Each operation encloses: for every world of the box there are values of ``e`` for which the result stands for what the
-operation makes of the operands. Rounding is not part of an operation; ``shield.enclosure`` adds it (``ROUNDING``).
+Every operation is an enclosure: for each world of the box, some value of ``e`` makes the result equal to the exact
+result on the operands. The operations ignore floating-point rounding; ``ROUNDING`` accounts for it once in each piece
+of time.
+
+A *piece* is an interval of time in which no command changes. Letters: ``N`` vehicles, ``P = N - 1`` pairs, ``J``
+pieces.
 """
 
 from __future__ import annotations
@@ -22,7 +27,9 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 @compiled(apart=True)
 def radius(x: Floats) -> float:
-    """Largest distance from the centre."""
+    """Return the largest distance of a value of the affine form ``x`` [W] from its centre: the sum of the sizes of its
+    slopes, plus its remainder.
+    """
     whole: float = x[-1]
     for k in range(1, x.shape[0] - 1):
         whole += abs(x[k])
@@ -31,19 +38,22 @@ def radius(x: Floats) -> float:
 
 @compiled(apart=True)
 def low(x: Floats) -> float:
-    """Least value."""
+    """Return the least value that the affine form ``x`` [W] (centre, slopes, remainder) takes in the box."""
     return float(x[0] - radius(x))
 
 
 @compiled(apart=True)
 def high(x: Floats) -> float:
-    """Largest value."""
+    """Return the largest value that the affine form ``x`` [W] (centre, slopes, remainder) takes in the box."""
     return float(x[0] + radius(x))
 
 
 @compiled(apart=True)
 def add(out: Floats, share: float, x: Floats) -> None:
-    """``out += share * x``; exact but for rounding."""
+    """Add ``share * x`` to ``out`` in place; exact except for rounding.
+
+    ``x`` and ``out`` are affine forms [W] (centre, slopes, remainder), ``share`` is any number.
+    """
     for k in range(x.shape[0] - 1):
         out[k] += share * x[k]
     out[-1] += abs(share) * x[-1]
@@ -51,7 +61,7 @@ def add(out: Floats, share: float, x: Floats) -> None:
 
 @compiled(apart=True)
 def difference(x: Floats, y: Floats) -> Floats:
-    """``x - y``."""
+    """Return the affine form ``x - y`` [W] (centre, slopes, remainder) of two affine forms."""
     out = x.copy()
     add(out, -1.0, y)
     return out
@@ -59,13 +69,15 @@ def difference(x: Floats, y: Floats) -> Floats:
 
 @compiled(apart=True)
 def negative(x: Floats) -> Floats:
-    """``-x``."""
+    """Return the affine form ``-x`` [W] (centre, slopes, remainder) of an affine form."""
     return linear(x, -1.0, 0.0, 0.0)
 
 
 @compiled(apart=True)
 def between(least: float, most: float, width: int) -> Floats:
-    """The form [width] of any number in an interval."""
+    """Return the affine form [width] (centre, slopes, remainder) of an arbitrary number between ``least`` and ``most``.
+    ``width`` is the length W of the form.
+    """
     out = np.zeros(width)
     out[0], out[-1] = 0.5 * (least + most), 0.5 * (most - least)
     return out
@@ -73,7 +85,10 @@ def between(least: float, most: float, width: int) -> Floats:
 
 @compiled(apart=True)
 def product(x: Floats, y: Floats) -> Floats:
-    """``x * y``: what is of second order goes to the remainder."""
+    """Return an affine form [W] (centre, slopes, remainder) that encloses ``x * y``, for two affine forms.
+
+    The second-order part of the product goes to the remainder.
+    """
     out = np.empty_like(x)
     for k in range(x.shape[0] - 1):
         out[k] = x[0] * y[k] + y[0] * x[k]
@@ -84,7 +99,10 @@ def product(x: Floats, y: Floats) -> Floats:
 
 @compiled(apart=True)
 def square(x: Floats) -> Floats:
-    """``x * x``: its part of second order is at least 0, which halves the remainder."""
+    """Return an affine form [W] (centre, slopes, remainder) that encloses ``x * x``.
+
+    Its remainder is half of that of ``product(x, x)``, because a square is never negative.
+    """
     out = np.empty_like(x)
     for k in range(x.shape[0] - 1):
         out[k] = 2.0 * x[0] * x[k]
@@ -96,7 +114,9 @@ def square(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def linear(x: Floats, slope: float, start: float, error: float) -> Floats:
-    """``start + slope * x``, and an error of at most ``error`` on either side."""
+    """Return the affine form [W] (centre, slopes, remainder) of ``start + slope * x``, widened by ``error`` on either
+    side.
+    """
     out = np.empty_like(x)
     for k in range(x.shape[0] - 1):
         out[k] = slope * x[k]
@@ -107,9 +127,11 @@ def linear(x: Floats, slope: float, start: float, error: float) -> Floats:
 
 @compiled(apart=True)
 def square_root(x: Floats) -> Floats:
-    """Square root wherever ``x >= 0``; nothing is said where it is below. ``high(x) >= 0``.
+    """Return an affine form [W] (centre, slopes, remainder) that encloses the square root of ``x`` where ``x >= 0``.
+    Needs ``high(x) >= 0``.
 
-    On [a, b] the root lies between its chord, of slope 1 / (sqrt a + sqrt b), and the parallel tangent.
+    Where ``x`` is negative the result means nothing. On [a, b] the root lies between its chord, with slope 1 / (sqrt a
+    + sqrt b), and the parallel tangent.
     """
     least, most = math.sqrt(max(low(x), 0.0)), math.sqrt(high(x))
     if most <= 0.0:
@@ -122,7 +144,10 @@ def square_root(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def reciprocal(x: Floats) -> Floats:
-    """``1 / x`` for ``low(x) > 0``: between the chord, of slope -1 / (a b), and the parallel tangent."""
+    """Return an affine form [W] (centre, slopes, remainder) that encloses ``1 / x``. Needs ``low(x) > 0``.
+
+    On [a, b] it lies between its chord, with slope -1 / (a b), and the parallel tangent.
+    """
     least, most = low(x), high(x)
     slope = -1.0 / (least * most)
     chord = 1.0 / least + 1.0 / most
@@ -132,7 +157,10 @@ def reciprocal(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def positive_part(x: Floats) -> Floats:
-    """``max(x, 0)``: between its chord and the parallel line through 0."""
+    """Return an affine form [W] (centre, slopes, remainder) that encloses ``max(x, 0)``.
+
+    The function lies between its chord and the parallel line through 0.
+    """
     least, most = low(x), high(x)
     if least >= 0.0:
         return x.copy()
@@ -145,84 +173,109 @@ def positive_part(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def cut(x: Floats, least: float, most: float) -> Floats:
-    """A form of the same number, known to lie in an interval: that interval where it says more than the form."""
+    """Return an affine form [W] (centre, slopes, remainder) of the same number as ``x``, if that number is known to lie
+    between ``least`` and ``most``.
+
+    The result is the form of that interval if the interval is tighter than ``x``, else ``x`` itself.
+    """
     inside_low, inside_high = max(low(x), least), min(high(x), most)
     if inside_high - inside_low < radius(x):
         return between(min(inside_low, inside_high), max(inside_low, inside_high), x.shape[0])
     return x
 
 
-MOVES, MAY_STOP, STANDS = 0, 1, 2  # in this piece of time
+MOVES, MAY_STOP, STANDS = 0, 1, 2  # state of a vehicle in a piece
 
-FREE, TOUCHES, PARTS = 0, 1, 2  # what a pair does; the last: it was in contact when this piece of time began
+FREE, TOUCHES, PARTS = 0, 1, 2  # state of a pair; PARTS: it was in contact when the piece began and opens in it
 
-ROUNDING = 1e-12  # of a number and of 1: added to the remainders in each piece of time, far above the engine's own
+ROUNDING = 1e-12  # relative and absolute allowance for rounding in each piece, far above the engine's own rounding
 
-# columns of Path.touch, of a pair in contact: by how much it opens and closes at most (m/s), its largest gap (m), least
-# and largest pressing acceleration (m/s2) since it is pressed together, and the time since then (s); the largest speed
-# of the rear one in the worlds that creep (m/s, 0: none do); in this piece the largest difference of speeds, and gap
+# Columns of Path.touch, the state of a pair in contact.
+# OPENING, CLOSING: largest speed at which the pair opens and closes (m/s). WIDE: its largest gap (m).
+# SOFTEST, HARDEST: least and largest closing acceleration since the commands press it together (m/s2).
+# SINCE: time since then (s). CREEP: largest speed of the rear vehicle in worlds that creep (m/s; 0: no world creeps).
+# SPREAD, REACH: largest difference of speeds (m/s) and largest gap (m) in the present piece.
 OPENING, CLOSING, WIDE, SOFTEST, HARDEST, SINCE, CREEP, SPREAD, REACH = range(9)
 
 TOUCH_WIDTH = 9
 
 
 class Forces(NamedTuple):
-    """Accelerations that brakes and engines call for where these build up: in ``late``, and then in piece after piece.
+    """Accelerations of brakes and engines that build up, as affine forms, for every vehicle and time interval.
 
-    Impacts do not change them, so they are the same on every path.
+    Index 0 of the second axis is the time from the alert to the first piece (time interval of constant command); index
+    j + 1 is piece j. Impacts do not change these accelerations, so they hold for every sequence of impacts.
     """
 
-    mean: Floats  # [N, J + 1, W] over the piece
-    rise: Floats  # [N, J + 1, W] of the speed in the piece
-    gain: Floats  # [N, J + 1, W] of the way, beyond what the speed at its start gives
-    swing: Floats  # [N, J + 1, 2] by how much it may differ from the mean within the piece as it falls, and as it rises
-    build: Bools  # [N] whether the vehicle's command builds up; of the other vehicles nothing is said here
+    mean: Floats  # [N, J + 1, W] mean acceleration of the piece, m/s2
+    rise: Floats  # [N, J + 1, W] change of speed in the piece, m/s
+    gain: Floats  # [N, J + 1, W] distance in the piece beyond initial speed times length, m
+    # [N, J + 1, 2] largest deviation from the mean (m/s2): column 0 where the acceleration falls, column 1 where it
+    # rises
+    swing: Floats
+    build: Bools  # [N] True where the vehicle's command builds up; the other arrays are 0 for all other vehicles
 
 
 class Cell(NamedTuple):
-    """A box of worlds of one line, what is commanded in it, and the pieces of time."""
+    """A box of worlds as affine forms [W], with the commands and the pieces (time intervals of constant command).
 
-    speed: Floats  # [N, W] at the first piece
-    gap: Floats  # [P, W]
-    brake: Floats  # [N, W] capacities
-    drive: Floats  # [W] of the shielded vehicle
-    share: Floats  # [P, 2, W] of a pair's change of relative speed that is the front's, and the rear's; together 1
-    onset: Floats  # [N, W] of the other vehicles' commands, s after the first decision
-    constant: Floats  # [N] command of each other vehicle; NaN: full braking
-    limit: Floats  # [N] speed limits
-    vehicle: int
-    restitution: float
-    times: Floats  # [J + 1] s after the first decision
-    action: Floats  # [J] of the shielded vehicle
-    forces: Forces
-    moving: bool  # whether some vehicle's command builds up
+    An *affine form* stands for a number that depends on the world: a centre, a slope for each uncertain number of the
+    box, and a remainder.
+    """
+
+    speed: Floats  # [N, W] speeds at the start of the first piece, m/s
+    gap: Floats  # [P, W] gaps at the start of the first piece, m
+    brake: Floats  # [N, W] braking capacities, m/s2
+    drive: Floats  # [W] driving capacity of the shielded vehicle, m/s2
+    # [P, 2, W] fraction of an impact's change of relative speed that the front (0) and the rear (1) vehicle take; both
+    # sum to 1
+    share: Floats
+    onset: Floats  # [N, W] time after the first decision at which a vehicle's command takes effect, s
+    constant: Floats  # [N] command of each other vehicle, m/s2; NaN: full braking
+    limit: Floats  # [N] speed limits, m/s
+    vehicle: int  # index of the shielded vehicle
+    restitution: float  # coefficient of restitution, 0 to 1
+    times: Floats  # [J + 1] start of each piece and end of the last one, s after the first decision
+    action: Floats  # [J] action of the shielded vehicle in each piece, -1 (full braking) to 1
+    forces: Forces  # accelerations of vehicles whose command builds up
+    moving: bool  # True if the command of any vehicle builds up
 
 
 class Path(NamedTuple):
-    """Worlds of a cell that have gone one way so far."""
+    """Worlds of a box (``Cell``) that had the same sequence of impacts and contacts so far, with their present state.
 
-    forms: Floats  # [N + P + 1, W] speeds, gaps, harm so far
-    # [P, TOUCH_WIDTH] of pairs in contact, else meaningless. Their two speeds are that of their common centre of mass,
-    # from which their neighbours' gaps are counted
+    An affine form [W] is a number that depends on the world: a centre, a slope for each uncertain number of the box,
+    and a remainder.
+    """
+
+    forms: Floats  # [N + P + 1, W] affine forms of the speeds (m/s), the gaps (m) and the harm so far (m2/s2)
+    # [P, TOUCH_WIDTH] state of each pair in contact (columns ``OPENING`` to ``REACH``); meaningless for other pairs.
+    # Both speeds of a pair in contact are the speed of its centre of mass, and the gaps to its neighbours are measured
+    # from there.
     touch: Floats
-    marks: Ints  # [2 P + 1] 1 where the pair had an impact; FREE, TOUCHES or PARTS; number of the piece of time
+    # [2 P + 1] first P: 1 if the pair had an impact, else 0; next P: the pair is FREE (not in contact), TOUCHES (in
+    # contact) or PARTS (it opens in the present piece); last: index of the present piece
+    marks: Ints
 
 
 class Motion(NamedTuple):
-    """Each vehicle on its own through one piece of time: filled by ``move_alone``."""
+    """Motion of each vehicle, as if alone, through one piece (time interval of constant command).
 
-    pull: Floats  # [N, W] acceleration of its command
-    onward: Floats  # [N, W] speed at the end if nothing but the command acted, not even standstill
-    reach: Floats  # [N, W] way likewise
-    speed: Floats  # [N, W] speed at the end
-    way: Floats  # [N, W]
+    Each [W] is an affine form: centre, a slope for each uncertain number of the box, remainder.
+    """
+
+    pull: Floats  # [N, W] acceleration by the command, m/s2
+    onward: Floats  # [N, W] speed at the end under the command alone, m/s, as if the vehicle never stopped
+    reach: Floats  # [N, W] distance under the command alone, m, as if the vehicle never stopped
+    speed: Floats  # [N, W] speed at the end, m/s
+    way: Floats  # [N, W] distance travelled, m
     rest: Ints  # [N] MOVES, MAY_STOP or STANDS
-    vague: Floats  # [N] by how much its acceleration may differ from ``pull`` within the piece
+    vague: Floats  # [N] largest deviation of the acceleration from ``pull`` within the piece, m/s2
 
 
 @compiled(apart=True)
 def new_motion(N: int, width: int) -> Motion:
-    """Room for ``move_alone``."""
+    """Return a ``Motion`` of zeros for ``N`` vehicles and affine forms of length ``width``."""
     return Motion(
         np.zeros((N, width)), np.zeros((N, width)), np.zeros((N, width)), np.zeros((N, width)), np.zeros((N, width)),
         np.zeros(N, np.int64), np.zeros(N),
@@ -231,7 +284,16 @@ def new_motion(N: int, width: int) -> Motion:
 
 @compiled(apart=True)
 def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
-    """Every vehicle through one piece of time under its command, as if it were alone."""
+    """Compute the motion of every vehicle through one piece under its command, as if it were alone on the road.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        piece: index of the piece, 0 to J - 1.
+        motion: receives the result.
+
+    """
     for i in range(cell.speed.shape[0]):
         command(cell, i, piece, motion)
     for i in range(cell.speed.shape[0]):
@@ -248,7 +310,7 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
             add(onward, length, pull)
             add(reach, 0.5 * length * length, pull)
         if high(motion.pull[i]) + motion.vague[i] > 0.0:
-            # by how much a vehicle in contact with another one may be faster than its form within the piece
+            # how much faster than its form a vehicle in contact may be within the piece
             P, most = cell.gap.shape[0], 0.0
             for p in range(max(i - 1, 0), min(i + 1, P)):
                 if path.marks[P + p] == TOUCHES:
@@ -258,7 +320,7 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
                         most += length * (abs(motion.pull[k, 0]) + radius(motion.pull[k]) + motion.vague[k])
             fastest = high(speed) + length * (high(motion.pull[i]) + motion.vague[i]) + most
             if fastest > cell.limit[i]:
-                # the speed limit may end its drive anywhere within the piece: it gives any part of it then
+                # the speed limit may end the driving at any time: any acceleration from none to full is possible
                 drive, least = high(motion.pull[i]) + motion.vague[i], min(low(motion.pull[i]) - motion.vague[i], 0.0)
                 motion.onward[i] = between_shifted(motion.onward[i], -length * drive)
                 motion.reach[i] = between_shifted(motion.reach[i], -0.5 * length * length * drive)
@@ -278,9 +340,17 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
-    """A vehicle that may stand while its brakes are released in this piece: they hold it until its force is above 0.
+    """Widen the motion of vehicle ``i``, in place, for brakes that hold it at rest while they are released in a piece.
 
-    By as much as it would have been below 0 it is then faster, and further on.
+    The vehicle may stand until its force is above 0. It is then faster, and further on, by at most the negative speed
+    that it would have reached.
+
+    Args:
+        speed: affine form [W] (centre, slopes, remainder) of the speed at the start of the piece, m/s.
+        i: index of the vehicle.
+        length: length of the piece (time interval of constant command), s.
+        motion: motion of all vehicles in the piece; ``onward`` and ``reach`` of vehicle ``i`` are changed.
+
     """
     least, most = low(motion.pull[i]) - motion.vague[i], high(motion.pull[i]) + motion.vague[i]
     slowest = low(speed) + least * length
@@ -291,7 +361,9 @@ def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
 
 @compiled(apart=True)
 def between_shifted(x: Floats, shift: float) -> Floats:
-    """A number between what ``x`` stands for and that plus ``shift``."""
+    """Return the affine form [W] (centre, slopes, remainder) of any number between the affine form ``x`` and ``x +
+    shift``.
+    """
     out = x.copy()
     add(out, 1.0, between(min(shift, 0.0), max(shift, 0.0), x.shape[0]))
     return out
@@ -299,7 +371,19 @@ def between_shifted(x: Floats, shift: float) -> Floats:
 
 @compiled(apart=True)
 def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
-    """``pull`` of vehicle ``i``, 0 before its latency has elapsed."""
+    """Set ``motion.pull`` of vehicle ``i`` to the acceleration by its command in a piece; 0 before its latency has
+    elapsed.
+
+    ``motion.rest`` and ``motion.vague`` of the vehicle are set too.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        i: index of the vehicle.
+        piece: index of the piece, 0 to J - 1.
+        motion: receives the result.
+
+    """
     pull = motion.pull[i]
     pull[:] = 0.0
     motion.rest[i], motion.vague[i] = MOVES, 0.0
@@ -320,7 +404,18 @@ def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
-    """``onward`` and ``reach`` of a vehicle whose command begins somewhere within this piece, or after it."""
+    """Set the motion of vehicle ``i`` in a piece if its command may take effect only within the piece or after it.
+
+    Changes ``onward``, ``reach``, ``pull`` and ``vague`` of the vehicle in ``motion``, in place.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        i: index of the vehicle.
+        piece: index of the piece, 0 to J - 1.
+        motion: motion of each vehicle in the present piece; changed in place.
+
+    """
     pull = motion.pull[i]
     if pull[0] == 0.0 and radius(pull) == 0.0:
         return
@@ -338,7 +433,11 @@ def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def since(cell: Cell, i: int, time: float) -> Floats:
-    """How long a command has acted at a time, s."""
+    """Return for how long the command of vehicle ``i`` has acted at ``time``, as an affine form [W] (centre, slopes,
+    remainder), in s, at least 0.
+
+    ``time`` counts from the first decision, in s. ``cell`` is the box of worlds.
+    """
     since = negative(cell.onset[i])
     since[0] += time
     return positive_part(since)
@@ -346,7 +445,16 @@ def since(cell: Cell, i: int, time: float) -> Floats:
 
 @compiled(apart=True)
 def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> None:
-    """A braking vehicle that stops in this piece, or may: it stands from then on."""
+    """Set speed and distance of a braking vehicle that stops, or may stop, within a piece and then stands.
+
+    Args:
+        moving: True if the command of any vehicle builds up.
+        speed: affine form [W] (centre, slopes, remainder) of the speed at the start of the piece, m/s.
+        i: index of the vehicle.
+        length: length of the piece (time interval of constant command), s.
+        motion: receives ``rest``, ``speed`` and ``way`` of vehicle ``i``; its other fields are read.
+
+    """
     pull, vague, width = motion.pull[i], motion.vague[i], speed.shape[0]
     beyond = negative(motion.onward[i])
     least, most = max(low(beyond), 0.0), max(high(beyond), 0.0)
@@ -363,7 +471,13 @@ def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> 
 
 @compiled(apart=True)
 def deceleration(pull: Floats, vague: float) -> Floats:
-    """Mean deceleration along any part of a way, of a vehicle whose acceleration differs from ``pull`` by ``vague``."""
+    """Return the affine form [W] (centre, slopes, remainder) of the mean deceleration over any part of a piece, m/s2.
+
+    Args:
+        pull: affine form [W] of the mean acceleration in the piece (time interval of constant command), m/s2.
+        vague: largest deviation of the acceleration from ``pull``, m/s2.
+
+    """
     out = negative(pull)
     out[-1] += vague
     return out

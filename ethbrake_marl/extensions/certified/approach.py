@@ -1,6 +1,7 @@
-"""Impacts of a box of worlds within one piece of time, and pairs that stay in contact.
+"""Impacts in a box of worlds: when and how fast a pair of vehicles may meet within one piece of time.
 
-What is said here of "the worlds" of a path holds for all that really go that way; others may be among them.
+A path is a set of worlds (``affine.Path``). Statements about "the worlds" of a path hold for all worlds that really
+take it; the affine forms may also cover other worlds.
 """
 
 from __future__ import annotations
@@ -35,23 +36,35 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.motion import BOUND
 from ethbrake_marl.physics.state import Floats
 
-NEVER = 1e-9  # a gap (m) above this, or a squared closing speed (m2/s2) below minus this: certainly no contact
+NEVER = 1e-9  # no contact is possible above this gap (m), or below minus this squared closing speed (m2/s2)
 
-SLOWEST = 0.05  # mean closing speed (m/s) below which the time of an impact is any within the piece
+SLOWEST = 0.05  # below this mean closing speed (m/s) an impact is assumed possible at any time of the piece
 
 
 class Approach(NamedTuple):
-    """How a pair may meet within a piece of time."""
+    """The way a pair may come into contact within one piece (time interval of constant command), as affine forms
+    (centre, slopes, remainder).
+    """
 
-    closing: Floats  # [W] at its start
-    squared: Floats  # [W] closing speed at contact, squared
-    time: Floats  # [W] of contact, s after the start of the piece
-    front_stands: bool  # at contact
+    closing: Floats  # [W] closing speed at the start of the piece, m/s
+    squared: Floats  # [W] squared closing speed at contact, m2/s2
+    time: Floats  # [W] time of contact, s after the start of the piece
+    front_stands: bool  # True if the front vehicle stands at contact
 
 
 @compiled(apart=True)
 def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
-    """By how much speeds (or gap) of a pair may differ in this piece because a neighbouring pair is in contact."""
+    """Return by how much, at most, bounces of neighbouring pairs may change the relative speed (m/s) or the gap (m) of
+    pair ``p``.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        of_gap: True for the gap, False for the relative speed.
+
+    """
     P, most = cell.gap.shape[0], 0.0
     if p > 0 and path.marks[P + p - 1] != FREE:
         most += high(cell.share[p - 1, 1]) * path.touch[p - 1, REACH] if of_gap else blur(cell, path, p - 1, 1)
@@ -62,7 +75,11 @@ def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
 
 @compiled(apart=True)
 def pressing(motion: Motion, p: int) -> tuple[float, float]:
-    """Least and largest closing acceleration of a pair within the piece, whether or not one of them stops."""
+    """Return the least and the largest closing acceleration of pair ``p`` in a piece, m/s2.
+
+    Either vehicle may stop in it. ``motion`` is the motion of all vehicles in the piece (time interval of constant
+    command).
+    """
     front_low, front_high = low(motion.pull[p]) - motion.vague[p], high(motion.pull[p]) + motion.vague[p]
     rear_low, rear_high = low(motion.pull[p + 1]) - motion.vague[p + 1], high(motion.pull[p + 1]) + motion.vague[p + 1]
     if motion.rest[p] != MOVES:
@@ -74,7 +91,17 @@ def pressing(motion: Motion, p: int) -> tuple[float, float]:
 
 @compiled(apart=True)
 def may_meet(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> bool:
-    """Whether a pair may have a contact in this piece in which it closes."""
+    """Return whether pair ``p`` may come into contact in this piece while it closes.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        length: length of the piece, s.
+
+    """
     N = cell.speed.shape[0]
     gap = path.forms[N + p]
     softest, hardest = pressing(motion, p)
@@ -96,10 +123,22 @@ def may_meet(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> b
 def approach(
     cell: Cell, path: Path, motion: Motion, p: int, length: float, front_stands: bool
 ) -> tuple[Approach, bool]:
-    """How a pair meets, its front standing at contact or not; and whether it may do so at all in this piece.
+    """Return how a pair meets, and whether it can meet in this piece at all.
 
-    ``w^2 + 2 b g`` is the squared closing speed at contact for closing speed w, closing acceleration b and gap g, and
-    ``2 g / (w + w')`` the time until then, w' being the speed at contact. A front that stops first adds its way to g.
+    With closing speed w, closing acceleration b and gap g, the squared closing speed at contact is ``w^2 + 2 b g``. The
+    time until contact is ``2 g / (w + w')`` with the closing speed w' at contact. If the front vehicle stops first, its
+    stopping distance is added to g.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        length: length of the piece, s.
+        front_stands: True: consider the worlds in which the front vehicle stands at contact; False: those in which it
+            moves.
+
     """
     N, width = cell.speed.shape[0], cell.speed.shape[1]
     slack, vague = noise(cell, path, p, False), motion.vague[p] + motion.vague[p + 1]
@@ -116,7 +155,7 @@ def approach(
             add(press, -1.0, motion.pull[p])
     squared = square(closing)
     add(squared, 2.0, product(press, gap))
-    if vague > 0.0:  # the way there and back
+    if vague > 0.0:  # the gap may first open, then close again
         opening = max(-low(closing), 0.0) + length * (vague + radius(press) + abs(press[0]))
         if cell.moving:
             opening = max(length * max(vague - low(press), 0.0) - low(closing), 0.0)
@@ -136,7 +175,7 @@ def approach(
     speed = square_root(squared)
     time, whole = between(0.0, length, width), closing.copy()
     add(whole, 1.0, speed)
-    if cell.moving:  # twice by how much its mean differs from that of both ends
+    if cell.moving:  # twice the deviation of the mean closing speed from the mean of both ends
         whole[-1] += 0.5 * vague * length
     if low(whole) > SLOWEST and (vague == 0.0 or cell.moving) and slack == 0.0:
         time = product(gap, reciprocal(whole))
@@ -149,7 +188,16 @@ def approach(
 
 @compiled(apart=True)
 def _stopping_way(moving: bool, speed: Floats, pull: Floats, vague: float, length: float) -> Floats:
-    """Way of a braking vehicle until it stands, which it does within the piece."""
+    """Return the stopping distance, an affine form [W] in m, of a braking vehicle that stops within a piece.
+
+    Args:
+        moving: True if the command of any vehicle builds up.
+        speed: affine form [W] (centre, slopes, remainder) of the speed at the start of the piece, m/s.
+        pull: affine form [W] of the mean acceleration, m/s2.
+        vague: largest deviation of the acceleration from ``pull``, m/s2.
+        length: length of the piece, s.
+
+    """
     if not high(pull) + vague < 0.0 or (vague > 0.0 and not moving):
         fastest = max(high(speed), 0.0) + max(high(pull) + vague, 0.0) * length
         return between(0.0, fastest * length, speed.shape[0])

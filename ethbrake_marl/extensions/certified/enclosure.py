@@ -1,4 +1,8 @@
-"""Branch and bound: an upper bound on the harm of a plan over a box, refined where it is largest."""
+"""Upper bound on the harm of a plan over a box of worlds, by branch and bound.
+
+A *plan* holds one action for each decision up to the horizon. The box is halved again and again where its bound is
+largest. ``Q`` numbers describe a box, ``K`` of them are uncertain, ``L`` is the length of a plan.
+"""
 
 from __future__ import annotations
 
@@ -40,27 +44,35 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 
-# groups of the numbers of a box, N of each but P gaps
+# groups of a box's numbers: N numbers in each group, P in the last one
 BRAKING, DRIVING, LATENCY, MASS, BRAKE_RATE, RELEASE_RATE, SPEED, GAP = range(8)
 
-LONGEST_PIECE_S = 0.25  # before the first decision
+LONGEST_PIECE_S = 0.25  # longest piece of time before the first decision
 
 
 class Known(NamedTuple):
-    """What is certain about the worlds of a box."""
+    """Quantities that are the same in all worlds of a box."""
 
-    vehicle: int
-    constant: Floats  # [N] command of each other vehicle; NaN: full braking
-    limit: Floats  # [N]
-    restitution: float
-    begin_s: float  # of the worlds
-    time_step_s: float
-    horizon_s: float
+    vehicle: int  # index of the shielded vehicle
+    constant: Floats  # [N] command of each other vehicle, m/s2; NaN: full braking
+    limit: Floats  # [N] speed limits, m/s
+    restitution: float  # coefficient of restitution, 0 to 1
+    begin_s: float  # time at which the worlds begin, s
+    time_step_s: float  # time between two decisions, s
+    horizon_s: float  # time at which the episode ends, s
 
 
 @compiled(apart=True)
 def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
-    """The form of number ``which`` of a box whose uncertain ones are ``free`` [K]."""
+    """Return the affine form [K + 2] (centre, slopes, remainder) of one number of a box.
+
+    Args:
+        low_: [Q] least values of the box.
+        high_: [Q] largest values of the box.
+        which: index of the number in the box.
+        free: [K] indices of the uncertain numbers, each with a slope of its own.
+
+    """
     out = np.zeros(free.shape[0] + 2)
     out[0] = 0.5 * (low_[which] + high_[which])
     half = 0.5 * (high_[which] - low_[which])
@@ -74,10 +86,20 @@ def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
 
 @compiled(apart=True)
 def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats) -> tuple[Cell, Floats]:
-    """The cell of a box [Q], its worlds at the alert, and how long after it the first piece of time begins (s).
+    """Return the cell of a box, and the time from the alert to the first piece (s) as an affine form [W].
 
-    The first decision falls at another time in each world where the shielded vehicle's latency is uncertain: time is
-    counted from it, and the first piece begins as long before it as the earliest one comes after the alert.
+    A *cell* is the box as affine forms, with the commands cut into pieces (time intervals of constant command). Time
+    counts from the first decision, because that decision falls at a different time in each world if the shielded
+    vehicle's latency is uncertain. The first piece starts before it by the shortest time that any world needs from the
+    alert to the first decision.
+
+    Args:
+        low_: [Q] least values of the box.
+        high_: [Q] largest values of the box.
+        free: [K] indices of the uncertain numbers.
+        known: the certain quantities.
+        plan: [L] action of the shielded vehicle at each decision.
+
     """
     N, W = known.limit.shape[0], free.shape[0] + 2
     P, v = N - 1, known.vehicle
@@ -105,7 +127,7 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
     times, action = pieces(known, onset, earliest, plan)
     first[0] -= earliest
     build = np.zeros(N, np.bool_)
-    for i in range(N):  # others only brake, or only drive
+    for i in range(N):  # another vehicle only brakes or only drives, so only one of its rates matters
         down, up = low_[BRAKE_RATE * N + i] < math.inf, low_[RELEASE_RATE * N + i] < math.inf
         build[i] = (up and (i == v or known.constant[i] > 0.0)) or (down and not known.constant[i] >= 0.0)
     J, moving = times.shape[0] if build.any() else 0, bool(build.any())
@@ -126,9 +148,19 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
 
 @compiled(apart=True)
 def build_up(cell: Cell, i: int, late: Floats, rates: Floats) -> None:
-    """The forces of a vehicle in ``late`` and in every piece; 0 at the alert. ``rates`` [2, W] of braking, release."""
+    """Compute ``cell.forces`` of vehicle ``i``, in place, for the time before the first piece and for every piece.
+
+    The force is 0 at the alert. A *piece* is a time interval of constant command.
+
+    Args:
+        cell: the box of worlds; only its ``forces`` change.
+        i: index of the vehicle.
+        late: affine form [W] (centre, slopes, remainder) of the time from the alert to the first piece, s.
+        rates: [2, W] rates at which the brakes build up (0) and release (1), m/s3.
+
+    """
     forces, own, force, wanted = cell.forces, i == cell.vehicle, np.zeros_like(late), np.zeros_like(late)
-    last, there = 0.0, True  # action, and whether the force is that of it
+    last, there = 0.0, True  # last action; whether the force has reached it
     for j in range(cell.times.shape[0]):
         begin, end = cell.times[j - 1], cell.times[j]
         duration = between(end - begin, end - begin, late.shape[0])
@@ -169,11 +201,24 @@ def ramp(
     force: Floats, wanted: Floats, duration: Floats, longest: float, rates: Floats, rise: Floats, gain: Floats,
     swing: Floats,
 ) -> bool:  # fmt: skip
-    """A force that moves towards another one for a while: ``force`` becomes that at its end.
+    """Move a force towards its target during a time, and add its effect on speed and distance.
 
-    With a difference d at the start and e at the end, and the time m for which it moves, it adds ``m (d + e) / 2`` to
-    the speed that ``wanted`` gives after t, and ``m t (d + e) / 2 - m^2 (d + 2 e) / 6`` to the way. ``swing`` [2]
-    becomes by how much it may differ from its mean. Returns whether it is there at the end in every world.
+    For a difference d to ``wanted`` at the start and e at the end, and a time m during which the force changes, the
+    speed changes by ``m (d + e) / 2`` more than under ``wanted`` alone in the duration t, and the distance by ``m t (d
+    + e) / 2 - m^2 (d + 2 e) / 6``. Returns whether the force has reached ``wanted`` at the end in every world.
+
+    Args:
+        force: affine form [W] (centre, slopes, remainder) of the acceleration at the start, m/s2; becomes the
+            acceleration at the end.
+        wanted: affine form [W] of the acceleration that the command asks for, m/s2.
+        duration: affine form [W] of the time for which the command acts, s.
+        longest: upper limit of ``duration``, s.
+        rates: [2, W] rates at which the brakes build up (0) and release (1), m/s3.
+        rise: affine form [W] of the change of speed, m/s; increased in place.
+        gain: affine form [W] of the distance beyond the starting speed times the time, m; increased in place.
+        swing: [2] receives the largest deviation of the acceleration from its mean where it falls (0) and rises (1),
+            m/s2.
+
     """
     start, there = difference(force, wanted), True
     force[:] = wanted
@@ -204,7 +249,12 @@ def ramp(
 
 @compiled(apart=True)
 def wait(cell: Cell, late: Floats) -> bool:
-    """Move a cell's worlds on by ``late`` (s), each by its own; False where that may not be all that happens."""
+    """Advance the speeds and gaps of a cell, in place, from the alert to the first piece (time interval of constant
+    command).
+
+    Returns False if something may disturb the motion until then: a contact, a stop, the speed limit, or a command that
+    takes effect on the way. ``late`` [W] is the time from the alert to the first piece, s.
+    """
     if high(late) <= 1e-12:
         return True
     if low(late) < -1e-12:
@@ -235,11 +285,16 @@ def wait(cell: Cell, late: Floats) -> bool:
 
 @compiled(apart=True)
 def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
-    """Acceleration of a vehicle until ``late`` after the alert; False where it may begin within that time."""
+    """Return the acceleration of vehicle ``i`` from the alert until ``late``, and whether it is certain.
+
+    The acceleration is an affine form [W] (centre, slopes, remainder) in m/s2; it is 0 for the shielded vehicle. It is
+    not certain if the vehicle's command may take effect within that time. ``cell`` is the box of worlds; ``late`` [W]
+    is the time from the alert to the first piece (time interval of constant command), s.
+    """
     pull = np.zeros_like(late)
     if i == cell.vehicle:
         return pull, True
-    acts = cell.onset[i].copy()  # after the alert
+    acts = cell.onset[i].copy()  # becomes the time from the alert
     add(acts, 1.0, late)
     acts[0] -= cell.times[0]
     if high(acts) > 1e-12:
@@ -252,7 +307,17 @@ def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
 
 @compiled(apart=True)
 def pieces(known: Known, onset: Floats, earliest: float, plan: Floats) -> tuple[Floats, Floats]:
-    """Where commands may change, s after the first decision, and the shielded vehicle's action between."""
+    """Return the J pieces (time intervals of constant command): their limits [J + 1], and the action in each, [J].
+
+    The limits are in s after the first decision.
+
+    Args:
+        known: the certain quantities.
+        onset: [N, W] time after the first decision at which each vehicle's command takes effect, s.
+        earliest: earliest possible time of the first decision, s.
+        plan: [L] action of the shielded vehicle at each decision.
+
+    """
     N = onset.shape[0]
     before = earliest - known.begin_s
     first = math.ceil(before / LONGEST_PIECE_S) if before > 0.0 else 0
@@ -285,9 +350,24 @@ def bound_of(
     low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, stack: Stack, motion: Motion, out: Floats,
     most: float,
 ) -> float:  # fmt: skip
-    """Upper bound on the harm of a plan over one box, unless it is above ``most``."""
+    """Return an upper bound on the harm of a plan over one box, m2/s2.
+
+    A result above ``most`` is no bound; it only says that the harm may exceed ``most``.
+
+    Args:
+        low_: [Q] least values of the box.
+        high_: [Q] largest values of the box.
+        free: [K] indices of the uncertain numbers.
+        known: the certain quantities.
+        plan: [L] action of the shielded vehicle at each decision.
+        stack: memory for the sets of worlds that are followed separately.
+        motion: memory for the motion of each vehicle.
+        out: [K + 2] receives the affine form of the harm that reaches the bound.
+        most: harm above which the search stops, m2/s2.
+
+    """
     cell, late = cell_of(low_, high_, free, known, plan)
-    # of all worlds whose first piece of time begins ``late`` after the alert
+    # rough bound for all worlds, whose first piece begins ``late`` after the alert
     N, P, width = cell.speed.shape[0], cell.gap.shape[0], cell.speed.shape[1]
     path = Path(np.zeros((N + P + 1, width)), np.zeros((P, TOUCH_WIDTH)), np.zeros(2 * P + 1, np.int64))
     for i in range(N):
@@ -308,10 +388,21 @@ def bound_of(
 def bound_box(
     low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, enough: float, cells: int, only_enough: bool
 ) -> tuple[float, int]:
-    """Upper bound on the harm of a plan [L] over a box [Q], and the cells looked at.
+    """Return an upper bound on the harm of a plan over a box (m2/s2), and the number of parts of the box that were
+    examined.
 
-    The box is halved where the bound is largest, until that is at most ``enough`` or ``cells`` were looked at. With
-    ``only_enough`` a part is given up once its harm is above ``enough``: a larger result is then no bound.
+    The part with the largest bound is halved until the bound is at most ``enough`` or ``cells`` parts were examined.
+
+    Args:
+        low_: [Q] least values of the box.
+        high_: [Q] largest values of the box.
+        free: [K] indices of the uncertain numbers.
+        known: the certain quantities.
+        plan: [L] action of the shielded vehicle at each decision.
+        enough: bound that needs no refinement, m2/s2.
+        cells: largest number of parts to examine.
+        only_enough: True: stop in a part once its harm is above ``enough``; a result above ``enough`` is then no bound.
+
     """
     N, K, Q = known.limit.shape[0], free.shape[0], low_.shape[0]
     stack, motion = new_stack(N, K + 2), new_motion(N, K + 2)
@@ -339,13 +430,13 @@ def bound_box(
 
 MOST_VEHICLES = 3
 
-CELLS_AT_ALERT, CELLS = 200, 40  # looked at for the bound at the alert, and for one later certificate
+CELLS_AT_ALERT, CELLS = 200, 40  # most cells to examine: for the bound at the alert, and for one later certificate
 
-NEAR = 1.02  # times the largest harm in a corner: a bound this good is not refined any further
+NEAR = 1.02  # a bound below this multiple of the largest harm in a corner is not refined further
 
-NEARLY_NOTHING = 0.1  # m2/s2, likewise
+NEARLY_NOTHING = 0.1  # m2/s2; added to that limit
 
-CORNERS, INTERIOR = "corners", "interior"  # which worlds of a box robust mode certifies
+CORNERS, INTERIOR = "corners", "interior"  # worlds that mode robust certifies: the corners of a box, or the whole box
 
 CERTAINTIES = (CORNERS, INTERIOR)
 
@@ -353,24 +444,33 @@ SCRIPTS = ("full_brake", "coast", "constant")
 
 
 class Boxes(NamedTuple):
-    """The boxes of n worlds: each uncertain number from ``low`` to ``high``."""
+    """The boxes of ``n`` worlds: each number of a world lies between ``low`` and ``high``. ``Q = 8 N - 1`` numbers."""
 
-    low: Floats  # [n, Q] braking, driving, latency, mass, rates, speed of each vehicle, then the gaps
-    high: Floats  # [n, Q]
-    limit: Floats  # [n, N] m/s
-    restitution: Floats  # [n]
-    begin_s: Floats  # [n]
-    constant: Floats  # [n, N] m/s2; NaN: full braking
-    vehicle: int
-    time_step_s: float
-    horizon_s: float
+    # [n, Q] least values: braking and driving capacity, latency, mass, brake rate, release rate and speed of each
+    # vehicle, then the gaps
+    low: Floats
+    high: Floats  # [n, Q] largest values, in the same order
+    limit: Floats  # [n, N] speed limits, m/s
+    restitution: Floats  # [n] coefficient of restitution, 0 to 1
+    begin_s: Floats  # [n] time at which the worlds begin, s
+    constant: Floats  # [n, N] command of each other vehicle, m/s2; NaN: full braking
+    vehicle: int  # index of the shielded vehicle
+    time_step_s: float  # time between two decisions, s
+    horizon_s: float  # time at which the episode ends, s
 
     @staticmethod
     def check_possible(robust: str, scenario: Scenario, harm_count: HarmCount, others: Mapping[int, Script]) -> None:
-        """Raise ``InvalidInput`` for a setting that interior mode cannot certify, whatever its worlds.
+        """Raise ``InvalidInput`` for a setting that ``robust="interior"`` cannot certify in any world.
 
-        That is: total harm, more than three vehicles, an obstacle ahead, or others that do anything else than brake
-        fully, coast, or hold one deceleration.
+        Such settings are: total harm; more than three vehicles; an obstacle ahead; another vehicle whose script is not
+        to brake fully, to coast, or to hold one deceleration.
+
+        Args:
+            robust: ``corners`` (never raises) or ``interior``.
+            scenario: the scenario of the worlds.
+            harm_count: ``first`` or ``total``.
+            others: script of each other vehicle, by its index.
+
         """
         if robust != INTERIOR:
             return
@@ -393,11 +493,19 @@ class Boxes(NamedTuple):
     def of(
         cls, possible: Worlds, problem: ProfileProblem, n: int, scenario: Scenario, others: Mapping[int, Script]
     ) -> Boxes:
-        """The boxes of n worlds at the alert, their members being ``possible`` [n * M], as in the ``problem``.
+        """Return the boxes of ``n`` worlds at the alert.
 
-        Raises ``InvalidInput`` for worlds that interior mode cannot certify: with an obstacle ahead, or in which
-        another vehicle's command is not the same in the whole box. ``check_possible`` says what no world of a scenario
-        changes.
+        Raises ``InvalidInput`` for worlds that interior mode cannot certify: an obstacle ahead, a braking profile in
+        pieces, brakes that began to build up before the alert, or another vehicle whose command differs within the box.
+        ``check_possible`` covers what does not depend on the worlds.
+
+        Args:
+            possible: [n * M] worlds, M consecutive ones for each box: the reported world and the corners of its box.
+            problem: the same worlds as columns of numbers, with the commands of the other vehicles.
+            n: number of boxes.
+            scenario: the scenario of the worlds.
+            others: script of each other vehicle, by its index.
+
         """
         v, N, vehicle, members = possible.vehicles, possible.N, int(problem.vehicles[0]), possible.n // n
         if possible.obstacle_ahead.any():
@@ -431,12 +539,19 @@ class Boxes(NamedTuple):
         )  # fmt: skip
 
     def take(self, rows: Ints) -> Boxes:
-        """The boxes of some worlds."""
+        """Return the boxes of the worlds with the indices ``rows`` [m]."""
         arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._fields[:6]}
         return self._replace(**arrays)
 
     def placed(self, old: Boxes | None, rows: Ints) -> Boxes:
-        """The boxes of a batch in which these ones begin in these rows: all of them, or some of the ``old`` ones."""
+        """Return the boxes of all running episodes after new episodes begin in ``rows``.
+
+        Args:
+            old: boxes of all episodes before; None at the first start.
+            rows: [m] indices of the new episodes; this object holds their boxes. If they cover all episodes, ``old`` is
+                unused.
+
+        """
         if old is None or len(rows) >= len(old.low):
             return self.take(np.argsort(rows))
         arrays: dict[str, Any] = {name: getattr(old, name).copy() for name in self._fields[:6]}
@@ -445,16 +560,30 @@ class Boxes(NamedTuple):
         return self._replace(**arrays)
 
     def at_alert(self, plans: Floats, harm: Floats) -> Floats:
-        """Upper bound on the harm of each plan [n, L], ``harm`` being its largest in a corner, [n] m2/s2."""
+        """Return an upper bound on the harm of each world's plan at the alert, [n] m2/s2.
+
+        Args:
+            plans: [n, L] action of the shielded vehicle at each decision, for each world.
+            harm: [n] largest harm of the plan in a corner of the box, m2/s2; a bound close to it is not refined.
+
+        """
         return self.bound(np.arange(len(plans)), plans, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)
 
     def bound(
         self, rows: Ints, plans: Floats, enough: Floats, cells: int = CELLS, *, only_enough: bool = False
     ) -> Floats:
-        """Upper bound on the harm of each plan [m, L], from the alert on, over all worlds of a box [m], m2/s2.
+        """Return an upper bound on the harm of each plan over all worlds of its box, [m] m2/s2.
 
-        A bound at most ``enough`` [m] is not refined any further, and no more than ``cells`` parts of a box are looked
-        at. With ``only_enough`` what is above ``enough`` is no bound: it says that none at most that was found.
+        The harm counts from the alert on.
+
+        Args:
+            rows: [m] indices of the boxes.
+            plans: [m, L] action of the shielded vehicle at each decision, for each box.
+            enough: [m] bound that needs no refinement, m2/s2.
+            cells: largest number of parts of a box to examine.
+            only_enough: True: a result above ``enough`` is no bound; it only says that no bound of at most ``enough``
+                was established.
+
         """
         bounds = np.empty(len(rows))
         for j, k in enumerate(rows.tolist()):
@@ -476,7 +605,10 @@ def _refusal(what: str) -> InvalidInput:
 
 
 def checked_robust(robust: object, where: str) -> str:
-    """``corners`` or ``interior``; raises ``UnknownName`` for anything else."""
+    """Return ``robust`` if it is ``corners`` or ``interior``; raise ``UnknownName`` otherwise.
+
+    ``where`` names the setting at the start of the error message.
+    """
     if robust not in CERTAINTIES:
         raise unknown_name(f"{where}: robust", robust, CERTAINTIES)
     return str(robust)

@@ -1,11 +1,15 @@
-"""The world that one vehicle believes in: what it received, moved on by the scripts, and ranges for all the rest.
+"""The estimated world of one vehicle: what it received, extrapolated by the scripts, with ranges for all the rest.
 
-Of a vehicle that it knows (its message, or sight, has arrived) it has capacities, mass and own latency, and the newest
-state that it was told. That state is moved on to the present by the script which that vehicle follows: with the command
-from then on, if one was in force then, else from the moment at which it is expected to react. Of a vehicle that is not
-known it has what the scenario declares: every quantity in the middle of its distribution (the median), or anywhere in
-its range, and the script from the alert on. Its own state, its own way since the alert, and impacts with whom it knows
-are measured. Nothing else of the line is read, so nothing that was not received can change a believed world.
+A vehicle is *known* if its message has arrived or it is in sight. The estimate takes three sources:
+
+* Of a known vehicle: its capacities, mass and own latency, and its newest received state. The script that the vehicle
+  follows extrapolates this state to the present: from the time of the state if a command was in force then, else from
+  the time at which the vehicle is expected to react.
+* Of a vehicle that is not known: what the scenario declares. Each quantity is the median of its distribution, or any
+  value of its range. Its script runs from the alert.
+* Of the vehicle itself: measurements of its own state, its distance since the alert, and impacts with known neighbours.
+
+Nothing else of the line is read, so information that was not received cannot change an estimated world.
 """
 
 from __future__ import annotations
@@ -27,32 +31,44 @@ from ethbrake_marl.physics.state import Bools, Floats, Vehicles, Worlds
 from ethbrake_marl.scenario.sampling import middle_world
 from ethbrake_marl.scenario.schema import Scenario
 
-TOUCHING_M = 1e-9  # a gap below this is a contact: places are told with rounding
+TOUCHING_M = 1e-9  # a gap below this counts as contact, because received positions are rounded
 
-OF_OTHERS = ("place", "speeds_mps", "braking_capacity_mps2", "mass_t", "latency_s", "news_s")  # what may be uncertain
+OF_OTHERS = (
+    "place",
+    "speeds_mps",
+    "braking_capacity_mps2",
+    "mass_t",
+    "latency_s",
+    "news_s",
+)  # quantities that may be uncertain
 
 
 class Told(NamedTuple):
-    """What has reached one vehicle of the others by now; columns of who is not known mean nothing."""
+    """Information that one vehicle has received about the others by now. Columns of unknown vehicles are meaningless.
 
-    known: Bools  # [n, N] it acts on news of this vehicle; of itself always
-    at_s: Floats  # [n, N] when the state was true
-    place_m: Floats  # [n, N] then, ahead of where this vehicle is now
-    speed_mps: Floats  # [n, N] then
-    command_mps2: Floats  # [n, N] in force then
-    obstacle_m: Floats  # [n] place of the obstacle, ahead of where this vehicle is now; infinite: none is known
-    obstacle_hit: Bools  # [n]
-    hit: Bools  # [n, P] an own pair, with somebody who is known, has had an impact
+    A vehicle is *known* if its message has arrived or it is in sight.
+    """
+
+    known: Bools  # [n, N] True for known vehicles; always True for the vehicle itself
+    at_s: Floats  # [n, N] time of the received state, s
+    place_m: Floats  # [n, N] position at that time, relative to the receiving vehicle's present position, m
+    speed_mps: Floats  # [n, N] speed at that time, m/s
+    command_mps2: Floats  # [n, N] command in force at that time, m/s2
+    obstacle_m: Floats  # [n] distance of the obstacle from the vehicle's present position, m; infinite: none is known
+    obstacle_hit: Bools  # [n] True if an impact with the obstacle is known
+    hit: Bools  # [n, P] True for an own pair with a known neighbour that had an impact
 
     @property
     def reacts(self) -> Bools:
-        """Who is known to have a command in force, [n, N]."""
+        """True for vehicles that are known to have a command in force, [n, N]."""
         reacts: Bools = self.known & (self.command_mps2 != 0.0)
         return reacts
 
     @classmethod
     def to(cls, worlds: Worlds, vehicle: int) -> Told:
-        """What has reached ``vehicle``."""
+        """Return the information that the vehicle with index ``vehicle`` has received in ``worlds`` by their present
+        time.
+        """
         n, N = worlds.speeds_mps.shape
         known = worlds.vehicles.known_from_s[:, vehicle] <= worlds.time_s[:, np.newaxis]
         known[:, vehicle] = True
@@ -73,7 +89,11 @@ class Told(NamedTuple):
         return told
 
     def _hear_messages(self, worlds: Worlds, vehicle: int, periodic: Bools) -> None:
-        """What is known is as old as the newest message, or the present of who is in sight."""
+        """Replace, in place, the present state of other vehicles by their newest message, except where they are in
+        sight.
+
+        ``periodic`` [n] is True for worlds in which vehicles send messages periodically.
+        """
         newest = Messages.of(worlds).newest_told(vehicle)
         other = periodic[:, np.newaxis] & (np.arange(worlds.N) != vehicle)
         stale = other & (newest.at_s < worlds.time_s[:, np.newaxis])
@@ -88,7 +108,10 @@ class Told(NamedTuple):
 
 
 def _places_of(worlds: Worlds, vehicle: int) -> Floats:
-    """Where all vehicles are ahead of one, [n, N] m; direct neighbours to the bits of their gaps."""
+    """Return the position of each vehicle ahead of ``vehicle``, [n, N] m; negative behind it.
+
+    The positions come from the gaps of ``worlds``. Direct neighbours are exactly one gap away.
+    """
     ahead = np.concatenate([np.zeros((worlds.n, 1)), -np.cumsum(worlds.gaps_m, axis=1)], axis=1)
     place: Floats = ahead - ahead[:, [vehicle]]
     for j, step in ((vehicle - 1, -1), (vehicle + 1, 1)):
@@ -99,24 +122,27 @@ def _places_of(worlds: Worlds, vehicle: int) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Ranges:
-    """What a scenario declares of who is not known to ``vehicle``: the middle, the least and the largest, each [N].
+    """Ranges that a scenario declares for the vehicles that ``vehicle`` does not know.
 
-    ``place`` is ahead of where it was at the alert (m), ``latency_s`` the own part of a latency, ``news_s`` the time at
-    which a vehicle has heard of the emergency, before which it does not react; 0 without a channel.
+    Keys of the mappings: ``place`` (position ahead of the vehicle's own position at the alert, m), ``speeds_mps``,
+    ``braking_capacity_mps2``, ``mass_t``, ``latency_s`` (a vehicle's own part of the latency) and ``news_s`` (time at
+    which a vehicle has received the alert, before which it does not react; 0 without a channel). Each value is [N].
     """
 
-    vehicle: int
-    others: Mapping[int, Script]  # the scripts that the others are known to follow; without one they brake fully
-    middle: Mapping[str, Floats]
-    low: Mapping[str, Floats]
-    high: Mapping[str, Floats]
-    obstacle_gap_m: float  # infinite: there is none
+    vehicle: int  # index of the estimating vehicle
+    others: Mapping[int, Script]  # scripts of the other vehicles, by index; a vehicle without a script brakes fully
+    middle: Mapping[str, Floats]  # median of each quantity, [N] each
+    low: Mapping[str, Floats]  # least value of each quantity, [N] each
+    high: Mapping[str, Floats]  # largest value of each quantity, [N] each
+    obstacle_gap_m: float  # gap of vehicle_1 to the obstacle, m; infinite without an obstacle
 
     @classmethod
     def of(cls, scenario: Scenario, vehicle: int, others: Mapping[int, Script] | None = None) -> Ranges:
-        """Those of a scenario as ``vehicle`` needs them; ``others`` of None: the scenario's scripts.
+        """Return the ranges that ``scenario`` declares for all vehicles, as the vehicle with index ``vehicle`` sees
+        them.
 
-        Raises ``InvalidInput`` for a mixture, which does not say what a vehicle is.
+        ``others`` are the scripts of the other vehicles by index; None: the scenario's scripts. Raises ``InvalidInput``
+        for a mixture of scenarios, because an unknown vehicle could belong to any of them.
         """
         if scenario.members:
             names = ", ".join(member.name for member in scenario.members)
@@ -128,7 +154,9 @@ class Ranges:
         low, high = ({key: np.array(scenario.bounds(key)).T[k] for key in ("gaps_m", *OF_OTHERS[1:5])} for k in (0, 1))
         named = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps")
         one, N = np.ones((1, scenario.vehicles)), scenario.vehicles
-        heard = Vehicles.at_once(one, one, np.zeros((1, N)), one, one, np.zeros(1))  # no latency but that of the news
+        heard = Vehicles.at_once(
+            one, one, np.zeros((1, N)), one, one, np.zeros(1)
+        )  # no latency except that of the alert message
         if scenario.v2x.by_link:
             heard = scenario.v2x.with_news(heard, np.full((1, scenario.v2x.width(N)), 0.5), scenario.equipped())
         middle = {
@@ -146,7 +174,15 @@ class Ranges:
         return cls(vehicle, others, middle, low, high, float(world.obstacle_gap_m[0]))
 
     def at(self, share: Mapping[tuple[str, int], float] | None, key: str) -> Floats:
-        """A quantity of every vehicle [N]: its middle, or where ``share`` says, 0 the least value and 1 the largest."""
+        """Return a value of one quantity for every vehicle, [N]: its median, unless ``share`` selects a point of its
+        range.
+
+        Args:
+            share: maps (quantity, vehicle index) to a position in the range: 0 is the least value, 1 the largest. None:
+                all medians.
+            key: the quantity, a key of ``middle``.
+
+        """
         value = self.middle[key].copy()
         for (name, j), part in () if share is None else share.items():
             if name == key:
@@ -155,7 +191,7 @@ class Ranges:
 
     @property
     def uncertain(self) -> tuple[tuple[str, int], ...]:
-        """The numbers that are not fixed by the scenario: quantity and vehicle."""
+        """Pairs (quantity, vehicle index) of all numbers of other vehicles that the scenario leaves open."""
         others = [j for j in range(len(self.middle["place"])) if j != self.vehicle]
         return tuple((key, j) for j in others for key in OF_OTHERS if self.low[key][j] < self.high[key][j])
 
@@ -166,14 +202,15 @@ class Ranges:
         share: Mapping[tuple[str, int], float] | None = None,
         foretold: tuple[Worlds, Bools] | None = None,
     ) -> Worlds:
-        """The worlds as the vehicle believes them to be now, at their time.
+        """Return the estimated worlds of the vehicle at the present time, [n].
 
         Args:
-            worlds: as they are; of them only what the vehicle received is read.
-            way_m: [n] the vehicle's own way since the alert, m.
-            share: where in its range each uncertain number lies, 0 to 1; None: in the middle.
-            foretold: how these worlds were expected to be by now, with the impacts on the way, and of whom [n, N] that
-                tells better than a message from before.
+            worlds: the true worlds; only what the vehicle received is read.
+            way_m: [n] the vehicle's own distance since the alert, m.
+            share: maps (quantity, vehicle index) to a position in its range, 0 to 1; None: the median of every
+                quantity.
+            foretold: the worlds as they were predicted for now (impacts included), and a mask [n, N] of the vehicles
+                for which this prediction is better than their last message. None: no prediction.
 
         """
         worlds.refuse_build_up(":believed")
@@ -227,18 +264,32 @@ class Ranges:
 
 
 def _places(ahead_m: Floats, behind_m: Floats, vehicle: int) -> Floats:
-    """Where all vehicles are ahead of one [N], by the gaps [P] in front of it and behind it."""
+    """Return the position of each vehicle ahead of ``vehicle``, [N] m; negative behind it.
+
+    Args:
+        ahead_m: [P] gaps; used for the pairs in front of the vehicle.
+        behind_m: [P] gaps; used for the pairs behind the vehicle.
+        vehicle: index of the vehicle at position 0.
+
+    """
     front = np.cumsum(ahead_m[:vehicle][::-1])[::-1]
     return np.concatenate([front, [0.0], -np.cumsum(behind_m[vehicle:])])
 
 
 def _in_order(place: Floats, known: Bools, vehicle: int) -> Floats:
-    """Places [n, N] of vehicles in a line: nobody stands behind the next one, and who is known stands where it is."""
+    """Correct positions so that the vehicles stand in line order; return the corrected array, [n, N] m.
+
+    Args:
+        place: [n, N] position of each vehicle ahead of ``vehicle``, m; changed in place.
+        known: [n, N] True for vehicles whose position is certain; they keep it.
+        vehicle: index of the vehicle at position 0.
+
+    """
     N = place.shape[1]
-    for way in (-1, 1):
+    for way in (-1, 1):  # first the vehicles ahead, then those behind
         side = np.arange(vehicle + way, -1 if way < 0 else N, way)
         limit = np.full(len(place), np.inf)
-        for j in side[::-1]:  # from the far end on: at most as far as the next one beyond that is known
+        for j in side[::-1]:  # from the far end: no farther away than the next known vehicle beyond
             far = np.where(known[:, j], -way * place[:, j], np.minimum(-way * place[:, j], limit))
             limit = np.where(known[:, j], np.minimum(far, limit), limit)
             place[:, j] = -way * far

@@ -1,10 +1,10 @@
-"""Shields over a believed world: what is certified is certified on what was received, and nothing else is looked at.
+"""Shields in the estimated world: they certify on what the vehicle received and read nothing else.
 
-``step``: every action is certified in the world that the vehicle believes in, with what is not known in the middle of
-its range. That promises nothing of the world as it is. ``robust``: in every corner of the ranges of what is not
-known. If the world is such a corner, its harm up to the horizon is at most the first bound: what is heard later
-leaves those corners standing that it agrees with, and the plan that was held is held on unless a better one for them
-is found.
+*Estimated world*: see ``estimated``. Mode ``step`` certifies every action in the estimated world with the median of
+everything unknown; it promises nothing about the true world. Mode ``robust`` certifies in every corner of the ranges of
+everything unknown. If the true world is such a corner, its harm up to the horizon is at most the first bound: later
+messages only remove corners that contradict them, and the held plan is replaced only by a better plan for the
+remaining corners.
 """
 
 from __future__ import annotations
@@ -35,40 +35,49 @@ from ethbrake_marl.shield.rollouts import Proposer
 from ethbrake_marl.shield.running import put
 from ethbrake_marl.shield.step import StepShield
 
-PER_WORLD = ("predicted_harm", "interventions", "_heard", "_asked_s", "_wanted", "_impact_s")  # arrays [n, ...]
+PER_WORLD = ("predicted_harm", "interventions", "_heard", "_asked_s", "_wanted", "_impact_s")  # attributes [n, ...]
 
-SURPRISE = 1e-6  # by more than this (m, m/s) what is measured is not what was foretold
+SURPRISE = 1e-6  # tolerance (m, m/s) between a measurement and its prediction
 
 
 def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
-    """Where it began anew, count the members' harm so far, and hold the old plan's rest if that harms no more."""
-    running, old = shield.running, before.running
+    """After a restart of the shield in ``rows``, restore the harm so far, and keep the old plan where it is no worse.
+
+    ``shield`` was just restarted and is changed; ``before`` is its copy from before the restart.
+    """
+    (running, backup), (old, held) = shield.memory[:2], before.memory[:2]
     assert running is not None and old is not None
-    at, plan, width = running.rows_of(rows), shield.backup.plan[rows].copy(), before.backup.plan.shape[1]
+    at, plan, width = running.rows_of(rows), backup.plan[rows].copy(), held.plan.shape[1]
     N, states = running.problem.mass.shape[1], running.states.copy()
     states[at, 3 * N - 2 : 5 * N - 4] = old.states[at, 3 * N - 2 : 5 * N - 4]  # harm
-    shield.running = running._replace(states=states)
+    running = running._replace(states=states)
     column = np.arange(width) + old.steps[rows, np.newaxis]
-    rest = np.take_along_axis(before.backup.plan[rows], np.minimum(column, width - 1), axis=1)
+    rest = np.take_along_axis(held.plan[rows], np.minimum(column, width - 1), axis=1)
     rest = np.where(column < width, rest, -1.0)  # full braking after the plan
-    part = shield.running.take(rows)
+    part = running.take(rows)
     harm, still = plan_harm(part, plan), plan_harm(part, rest)
     plan[still <= harm] = rest[still <= harm]
-    shield.backup = shield.backup._replace(
-        plan=put(shield.backup.plan, rows, plan), harm=put(shield.backup.harm, rows, np.minimum(still, harm))
-    )
+    backup = backup._replace(plan=put(backup.plan, rows, plan), harm=put(backup.harm, rows, np.minimum(still, harm)))
+    shield.memory = shield.memory._replace(running=running, backup=backup)
 
 
 class BelievedShield:
-    """A ``StepShield`` that certifies what one vehicle proposes on what was really received.
+    """``StepShield`` that certifies the proposed actions of one vehicle in its estimated world.
 
-    It begins at the first decision, and anew whenever another vehicle is heard for the first time, is heard to react,
-    or moves otherwise than was foretold; what is left of its plan is a candidate for the next one. After the first
-    decision ``predicted_harm`` [n] is the first bound; infinite where the vehicle had an impact before, whose harm
-    nobody told it. ``robust`` says in which worlds it certifies: None in the middle of what is not known, ``corners``
-    also in all corners of its range, and ``interior`` in all worlds of the box around them, once, at the first
-    decision. Raises ``InvalidInput`` for a mixture, a scenario with more than ``MOST_CORNERS`` corners, and what
-    interior mode cannot certify. ``others`` are scripts of the other vehicles, by index; None: those of the scenario.
+    It starts at the first decision, and again whenever another vehicle becomes known, is known to react, or moves
+    otherwise than predicted. The rest of the previous plan is then a candidate for the new plan. After the first
+    decision ``predicted_harm`` [n] is the first bound; it is infinite where the vehicle had an impact before, because
+    its harm is unknown.
+
+    Args:
+        scenario: the scenario of the worlds; a mixture raises ``InvalidInput``.
+        vehicle: index of the shielded vehicle.
+        harm_count: ``first`` or ``total`` impacts.
+        robust: worlds to certify. None: the median of everything unknown. ``corners``: also all corners of the ranges;
+            more than ``MOST_CORNERS`` raise ``InvalidInput``. ``interior``: all worlds of the box around the corners,
+            once, at the first decision.
+        others: scripts of the other vehicles by index; None: the scenario's scripts.
+
     """
 
     def __init__(
@@ -84,15 +93,15 @@ class BelievedShield:
         self.robust = None if robust is None else checked_robust(robust, "believed")
         self.predicted_harm: Floats = np.zeros(0)
         self.interventions: Ints = np.zeros(0, np.int64)  # [n] so far in the running episodes
-        self.decision: Decision | None = None  # the last one
+        self.decision: Decision | None = None  # last decision
         self._harm_count: HarmCount = harm_count
         self._others = script_agents(scenario, except_for=vehicle) if others is None else others
         self._odometer: tuple[Floats, ...] = ()  # an ``Odometer``
-        self._heard: Floats = np.zeros((0, 0))  # what the shield began on; NaN where it has not begun
+        self._heard: Floats = np.zeros((0, 0))  # [n, 2 N] news on which the shield began; NaN where it has not begun
         self._asked_s: Floats = np.zeros(0)  # [n] time of the last decision
-        self._wanted: Floats = np.zeros(0)  # [n] actions
-        self._totals: Floats = np.zeros((0, 0, 0))  # [n, M, pairs] foretold total harm at the last decision (m2/s2)
-        self._impact_s: Floats = np.zeros((0, 0))  # [n, N] last time at which an impact of this vehicle was foretold
+        self._wanted: Floats = np.zeros(0)  # [n] last certified actions
+        self._totals: Floats = np.zeros((0, 0, 0))  # [n, M, pairs] predicted total harm at the last decision (m2/s2)
+        self._impact_s: Floats = np.zeros((0, 0))  # [n, N] time of the last predicted impact of each vehicle
         self._ranges = Ranges.of(scenario, vehicle, self._others)
         numbers = len(self._ranges.uncertain)
         if self.robust is not None and 2**numbers > MOST_CORNERS:
@@ -110,11 +119,11 @@ class BelievedShield:
 
     @property
     def members(self) -> int:
-        """Worlds that are certified for each one: the middle, and all corners."""
+        """Number of worlds that are certified for each true world: 1 for the median, plus 1 for each corner."""
         return 1 + len(self._corners())
 
     def __copy__(self) -> BelievedShield:
-        """One that goes on apart: what it decides leaves this one as it is."""
+        """Return an independent copy: its decisions do not change this shield."""
         apart = object.__new__(BelievedShield)
         apart.__dict__.update(self.__dict__)
         apart.shield = copy.copy(self.shield)
@@ -123,9 +132,9 @@ class BelievedShield:
         return apart
 
     def take(self, rows: Ints) -> BelievedShield:
-        """The shield of some rows, which goes on apart."""
+        """Return an independent shield for the episodes with the indices ``rows``."""
         apart = copy.copy(self)
-        if self.shield.running is not None:
+        if self.shield.memory.running is not None:
             apart.shield = self.shield.take(rows)
         apart._odometer = take_memory(self._odometer, rows)
         for name in (*PER_WORLD, *(("_totals",) if len(self._totals) else ())):
@@ -133,7 +142,10 @@ class BelievedShield:
         return apart
 
     def begin(self, worlds: Worlds, rows: Ints) -> None:
-        """Remember where these episodes start; nothing has been received yet."""
+        """Start episodes in the batch at indices ``rows``; ``worlds`` [m] are their worlds at the alert.
+
+        The certification itself starts at the first decision, with the information received by then.
+        """
         if len(rows) >= len(self._wanted):
             self.shield, self._wanted, self._totals = self._make(), np.zeros(0), np.zeros((0, 0, 0))
         n, N, fresh = len(rows), worlds.N, self._wanted.size == 0
@@ -148,15 +160,17 @@ class BelievedShield:
     def decide(
         self, worlds: Worlds, proposed: Floats, proposer: Proposer | None = None, *, only: Bools | None = None
     ) -> Floats:
-        """The certified actions [n], 0 before the vehicle's latency has elapsed; the same if asked again.
+        """Return the certified actions, [n], from -1 (full braking) to 1; 0 before the vehicle's latency has elapsed.
+
+        A repeated call at the same time returns the same actions. Raises ``InvalidInput`` for an episode without
+        ``begin``.
 
         Args:
-            worlds: as they are; of them only what the vehicle received is read.
-            proposed: actions [n].
-            proposer: is rolled out in the believed worlds where nothing else certifies a proposal.
-            only: worlds that decide now; None: all.
-
-        Raises ``InvalidInput`` if an episode never began.
+            worlds: the true worlds; only what the vehicle received is read.
+            proposed: [n] proposed actions.
+            proposer: the policy and its memory. Where nothing else certifies a proposal, its rollout in the estimated
+                worlds is tried. None: no rollout.
+            only: [n] True for worlds that decide now; None: all.
 
         """
         shield, vehicle = self.shield, self.vehicle
@@ -179,13 +193,21 @@ class BelievedShield:
         return self._wanted.copy()
 
     def _begin_anew(self, worlds: Worlds, believed: Worlds, way_m: Floats, due: Bools) -> None:
-        """Let the shield begin where it has not, or where what was heard was not foretold."""
+        """Restart the inner shield in worlds where it has not started, or where a message contradicts the prediction.
+
+        Args:
+            worlds: the true worlds.
+            believed: the estimated worlds.
+            way_m: [n] the vehicle's distance since the alert, m.
+            due: [n] True for worlds that decide now.
+
+        """
         shield, vehicle = self.shield, self.vehicle
         told = Told.to(worlds, vehicle)
         heard = np.concatenate([told.known, told.reacts], axis=1).astype(np.float64)
-        fresh, begun = np.isnan(self._heard[:, 0]), shield.running is not None
+        fresh, begun = np.isnan(self._heard[:, 0]), shield.memory.running is not None
         keeps, anew = np.zeros_like(told.known), fresh
-        if self.robust != INTERIOR:  # its plans are certified from the first decision on, whatever is heard later
+        if self.robust != INTERIOR:  # in interior mode, plans are certified once, at the first decision
             if begun:
                 self._note_impacts(worlds)
             keeps = self._keeps(told, worlds.time_s)
@@ -200,34 +222,50 @@ class BelievedShield:
         self._begin_shield(worlds.take(rows), believed.take(rows), way_m[rows], rows, keeps[rows], before)
         if before is not None and (held_before := rows[~fresh[rows]]).size:
             _hold_better(shield, held_before, before)
-        rows = rows[due[rows]]  # the others begin anew at their own first decision
+        rows = rows[due[rows]]  # the other worlds begin again at their own first decision
         first, self._heard[rows] = rows[fresh[rows]], heard[rows]
         felt = worlds.pair_hit[first, max(vehicle - 1, 0) : vehicle + 1].any(axis=1)
         felt |= worlds.obstacle_hit[first] & (vehicle == 0)
-        self.predicted_harm[first] = np.where(felt, np.inf, shield.backup.harm[first])
+        self.predicted_harm[first] = np.where(felt, np.inf, shield.memory.backup.harm[first])
 
     def _begin_shield(
         self, worlds: Worlds, believed: Worlds, way_m: Floats, rows: Ints, keeps: Bools, before: StepShield | None
     ) -> None:
-        """Begin in ``rows``: in the middle of what is open, and for a robust shield in its corners."""
+        """Start the inner shield in ``rows``, with the median of everything unknown and, if robust, the corners of its
+        ranges.
+
+        Args:
+            worlds: the true worlds of these rows.
+            believed: their estimated worlds.
+            way_m: the vehicle's distance since the alert in each of them, m.
+            rows: indices of the episodes in the batch.
+            keeps: mask of vehicles, [rows, N], whose predicted state is better than their received state.
+            before: the inner shield before the restart; None at the first start.
+
+        """
         parts = []
         for m, share in enumerate([None, *self._corners()]):
             foretold = None
             if before is not None:
-                assert before.running is not None
-                expected = worlds_at(believed, before.running.states[rows * before.running.members + m])
+                running = before.memory.running
+                assert running is not None
+                expected = worlds_at(believed, running.states[rows * running.members + m])
                 known = keeps.any(axis=1, keepdims=True)
                 foretold = (replace(expected, pair_hit=expected.pair_hit & known), keeps)
             parts.append(self._believe(worlds, way_m, share, foretold))
         self.shield.begin(parts[0], rows, possible=Uncertainty.interleaved(parts))
 
     def _keeps(self, told: Told, time_s: Floats) -> Bools:
-        """Whose foretold state tells more than what was told, [n, N]: nobody told anything, or not since an impact."""
-        running = self.shield.running
+        """Return a mask [n, N] of the vehicles whose predicted state is better than their received state.
+
+        These are unknown vehicles, and known vehicles without a message since their last predicted impact or contact.
+        ``told`` is the received information, ``time_s`` [n] the present time.
+        """
+        running = self.shield.memory.running
         if running is None:
             return np.zeros(told.known.shape, np.bool_)
         n, N = told.known.shape
-        whole = running.problem.mass.shape[1]  # vehicles of the columns, an obstacle ahead included
+        whole = running.problem.mass.shape[1]  # number of vehicles in the columns, counting an obstacle ahead
         gaps = running.states.reshape(n, running.members, -1)[:, :, whole : 2 * whole - 1]
         touching: Bools = np.any(gaps == 0.0, axis=1)
         pressed = np.zeros((n, whole), np.bool_)
@@ -238,8 +276,10 @@ class BelievedShield:
         return keeps
 
     def _note_impacts(self, worlds: Worlds) -> None:
-        """Write down which vehicles met in some member since the last decision."""
-        running = self.shield.running
+        """Store the present time of ``worlds`` for vehicles that had an impact in any certified world since the last
+        decision.
+        """
+        running = self.shield.memory.running
         assert running is not None
         pairs = running.problem.mass.shape[1] - 1
         totals = running.states[:, 4 * pairs + 1 : 5 * pairs + 1].reshape(worlds.n, running.members, pairs)
@@ -251,11 +291,18 @@ class BelievedShield:
         self._totals = totals.copy()
 
     def _is_surprised(self, believed: Worlds, heard: Bools) -> Bools:
-        """Where somebody of whom was ``heard`` [n, N] is not within what the shield foretold, [n]."""
-        assert self.shield.running is not None
+        """Return a mask [n] of the worlds in which a vehicle is outside the range of its predicted states.
+
+        Args:
+            believed: the estimated worlds now, [n].
+            heard: [n, N] True for vehicles whose received state is compared.
+
+        """
+        running = self.shield.memory.running
+        assert running is not None
         seen, wrong = seen_columns(Packed.of(believed)), np.zeros(believed.n, np.bool_)
         first = (seen.shape[1] + 4) // 5 - believed.N  # 1: an obstacle ahead is vehicle 0 of the columns
-        foretold = self.shield.running.states[:, : seen.shape[1]].reshape(believed.n, self.shield.running.members, -1)
+        foretold = running.states[:, : seen.shape[1]].reshape(believed.n, running.members, -1)
         outside: Bools = (seen < foretold.min(axis=1) - SURPRISE) | (seen > foretold.max(axis=1) + SURPRISE)
         for i in range(believed.N):
             wrong |= heard[:, i] & outside[:, first + i]

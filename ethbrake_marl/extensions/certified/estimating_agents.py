@@ -1,4 +1,4 @@
-"""Agents that decide on what was really received: any agent that reads the line, shown a believed world instead."""
+"""Agents that decide in the estimated world: what their vehicle received, with the scenario's ranges for the rest."""
 
 from __future__ import annotations
 
@@ -18,19 +18,23 @@ from ethbrake_marl.shield.paper_hybrid import HybridAgent
 
 
 class Odometer(NamedTuple):
-    """A vehicle's own way since the alert, from its own speed and command at its decisions."""
+    """Distance of a vehicle since the alert, computed from its own speed and command at its decisions."""
 
-    way_m: Floats  # [n]
-    time_s: Floats  # [n] of the last decision
-    speed_mps: Floats  # [n] then
+    way_m: Floats  # [n] distance since the alert, m
+    time_s: Floats  # [n] time of the last decision, s
+    speed_mps: Floats  # [n] speed at the last decision, m/s
 
     @classmethod
     def begun(cls, alert: Worlds, vehicle: int) -> Odometer:
-        """Where episodes start."""
+        """Return the odometer of vehicle ``vehicle`` (index) at the start of episodes in the worlds ``alert``, [n]."""
         return cls(np.zeros(alert.n), alert.time_s.copy(), alert.speeds_mps[:, vehicle].copy())
 
     def look(self, worlds: Worlds, vehicle: int) -> Odometer:
-        """The way up to now: exact under a constant command, also to a stop; the mean speed counts elsewhere."""
+        """Return the odometer after the time since the last decision; ``worlds`` [n] are the present ones.
+
+        The distance is exact under a constant command, also if the vehicle stops. In other cases the mean speed is
+        used.
+        """
         speed, command, before = worlds.speeds_mps[:, vehicle], worlds.command_mps2[:, vehicle], self.speed_mps
         way = 0.5 * (before + speed) * (worlds.time_s - self.time_s)
         stopped = (speed == 0.0) & (before > 0.0) & (command < 0.0)
@@ -39,37 +43,56 @@ class Odometer(NamedTuple):
 
 
 class Believing(AgentAround):
-    """Drives by ``policy``, any agent that reads the line, in the world that its vehicle believes in.
+    """Agent that lets another agent, ``policy``, control its vehicle in the estimated world.
 
-    The policy begins when it is first asked, from what was received by then. It begins anew in the worlds in which it
-    hears what nothing foretold: of another vehicle for the first time or, over a channel, that one reacts. The others
-    follow the scenario's scripts, as far as is believed. ``predicted_harm`` [n] is what the policy expected when it was
-    first asked. ``shows``: the policy is shown the believed world at every decision, not only where it begins. Raises
-    ``InvalidInput`` for a mixture.
+    The policy starts when it is first asked, on the information received by then. It starts again in worlds where
+    another vehicle becomes known, or where a message over a channel says that it reacts. In the estimate, the others
+    follow the scenario's scripts. ``predicted_harm`` [n] is the harm that the policy expected when it was first asked.
+
+    Args:
+        policy: any agent that reads the state of the line.
+        scenario: declares the ranges of everything unknown; a mixture raises ``InvalidInput``.
+        shows: True: the policy sees the estimated world at every decision. False: only where it starts.
+
     """
 
     def __init__(self, policy: Agent, scenario: Scenario, *, shows: bool = False) -> None:
         super().__init__(policy, f"{policy.name}:believed")
         self.scenario, self._shows = scenario, shows
-        self._ranges: dict[int, Ranges] = {}  # by own vehicle
+        self._ranges: dict[int, Ranges] = {}  # by the agent's vehicle
         Ranges.of(scenario, 0, {})  # refuses a mixture at once
 
     @property
     def knows(self) -> Knowledge:
-        """What it received, and the model of the line filled in from the scenario."""
+        """Information that the agent uses: received messages, completed by the scenario's model of the line."""
         return Knowledge((Source.BELIEFS,))
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Where these episodes start; nothing has been received yet, so the policy has not begun."""
+        """Return the memory at the start of episodes, as a mapping. The policy has not started, because nothing was
+        received yet.
+
+        Args:
+            alert: the worlds at the alert, [n].
+            vehicle: index of the agent's vehicle.
+            scripts: scripts of the other vehicles; not used.
+
+        """
         return {
             "way": Odometer.begun(alert, vehicle),
-            "heard": np.full((alert.n, 2 * alert.N), np.nan),  # that the policy began on; NaN: it has not
+            "heard": np.full((alert.n, 2 * alert.N), np.nan),  # news on which the policy began; NaN: not begun
             "predicted_harm": np.full(alert.n, np.nan),
             "policy": None,
         }
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """The policy's command, [n] m/s2."""
+        """Return the policy's command, [n] m/s2, and the new memory.
+
+        Args:
+            worlds: the true worlds; only what the vehicle received is read.
+            memory: memory from ``begin`` or the previous ``act``.
+            vehicle: index of the agent's vehicle.
+
+        """
         way, heard = Odometer(*memory["way"]).look(worlds, vehicle), self._heard(worlds, vehicle)
         policy, predicted = memory["policy"], memory["predicted_harm"]
         rows = np.flatnonzero((heard != memory["heard"]).any(axis=1))
@@ -77,7 +100,7 @@ class Believing(AgentAround):
             believed = self._believe(worlds.take(rows), vehicle, way.way_m[rows])
             others = self._ranges[vehicle].others
             begun = begin_script(self.policy, self._shown_at_first(believed), vehicle, others)
-            policy = begun if policy is None else renew_memory(policy, rows, begun)  # first of all in every row
+            policy = begun if policy is None else renew_memory(policy, rows, begun)  # the first call covers all rows
             if isinstance(policy, Mapping) and "predicted_harm" in policy:
                 predicted = np.where(np.isnan(memory["heard"][:, 0]), policy["predicted_harm"], predicted)
         shown = self._believe(worlds, vehicle, way.way_m) if self._shows else worlds
@@ -88,9 +111,13 @@ class Believing(AgentAround):
         return believed
 
     def _heard(self, worlds: Worlds, vehicle: int) -> Floats:
-        """What the policy begins anew for when it changes, [n, 2 N]: who is known, and who reacts."""
+        """Return flags [n, 2 N], 0 or 1: whether ``vehicle`` knows each vehicle, and whether a message says that this
+        vehicle reacts already.
+
+        Where a flag changes, the policy starts again. ``worlds`` are the true worlds now.
+        """
         told = Told.to(worlds, vehicle)
-        unforetold = told.reacts & self.scenario.v2x.by_link  # without a channel the own latencies tell
+        unforetold = told.reacts & self.scenario.v2x.by_link  # without a channel a reaction is predicted by its latency
         return np.concatenate([told.known, unforetold], axis=1).astype(np.float64)
 
     def _believe(self, worlds: Worlds, vehicle: int, way_m: Floats) -> Worlds:
@@ -100,17 +127,23 @@ class Believing(AgentAround):
 
 
 class BelievingHybrid(Believing):
-    """Algorithm 1 on what was received: at the first decision policy and E-V2X-BM are compared as is believed."""
+    """The paper's Algorithm 1 in the estimated world: the first decision chooses between the policy and E-V2X-BM, the
+    best constant deceleration.
+
+    The one that predicts less harm controls the vehicle for the whole episode.
+    """
 
     policy: HybridAgent
 
     @property
     def knows(self) -> Knowledge:
-        """What the policy knows, which drives by what it observes, and what the comparison adds."""
+        """Information that the agent uses: the policy's information, and the estimated world for the comparison."""
         return Knowledge.of(self.policy.policy, also=Source.BELIEFS)
 
     def _shown_at_first(self, believed: Worlds) -> Worlds:
-        """The comparison is a rollout, which begins at t = 0 without impacts: the same line, its clock put back."""
+        """Return the estimated worlds with their clock at 0 and without past impacts, because the rollouts that compare
+        the policy with E-V2X-BM start there.
+        """
         v, n = believed.vehicles, believed.n
         latency = np.maximum(v.latency_s - believed.time_s[:, np.newaxis], 0.0)
         vehicles = Vehicles.at_once(

@@ -1,4 +1,7 @@
-"""Guards of the modes that certify what is not known: an uncertainty, or a world that is estimated from messages."""
+"""Guards of the modes for incomplete knowledge: against an uncertainty, or in a world estimated from messages.
+
+A *guard* connects a shield with a running engine.
+"""
 
 from __future__ import annotations
 
@@ -16,24 +19,31 @@ from ethbrake_marl.shield.guard import StepGuard
 
 
 class RobustMode(IntEnum):
-    """The code ``shield_mode`` of mode ``robust`` in the infos, beside ``eb.ShieldMode``."""
+    """Number that stands for mode ``robust`` in the info ``shield_mode``; ``eb.ShieldMode`` has the other modes."""
 
     ROBUST = 2
 
 
 class RobustGuard(StepGuard):
-    """Mode ``robust``: a ``StepGuard`` around a ``RobustShield``."""
+    """Guard of mode ``robust``: lets a ``RobustShield`` decide on the actions in each step of a running engine."""
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """What the infos say of a certified step, and in how many worlds for each one it is certified."""
-        return super().tell(memory, ruling) | {"members": memory.shield.running.members}
+        """Return the infos of a step as a mapping, with ``members``: the number of certified worlds for each world.
+
+        Args:
+            memory: shield and policies after the step.
+            ruling: decision of the step; None at the reset.
+
+        """
+        return super().tell(memory, ruling) | {"members": memory.shield.memory.running.members}
 
 
 class BelievedGuard(ShieldGuard):
-    """Modes ``step`` and ``robust`` on what was received: a ``BelievedShield`` that is shown the engine's worlds.
+    """Guard of modes ``step`` and ``robust`` in the estimated world: lets a ``BelievedShield`` decide on the actions in
+    each step of a running engine.
 
-    Its bound is known once the first decision is made, and holds in the estimated world. What happens is not compared
-    with the forecast: an estimate may be wrong without anybody's fault.
+    Its bound on harm exists from the first decision on and holds in the estimated world. The motion is not compared
+    with the prediction, because an estimate may be wrong without a fault of the system.
     """
 
     def _started(self, shield: BelievedShield, alert: Worlds, rows: Ints) -> BelievedShield:
@@ -41,7 +51,14 @@ class BelievedGuard(ShieldGuard):
         return shield
 
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
-        """Apply what is certified in the estimated worlds."""
+        """Return the proposed actions and the actions to apply, which the shield certifies in the estimated worlds.
+
+        Args:
+            running: the engine before the step.
+            memory: shield and policies before the step.
+            proposed: [n, 1] proposed actions.
+
+        """
         worlds = running.worlds
         proposed, memories = self._asked(worlds, memory.policies, proposed)
         after = copy.copy(memory.shield)
@@ -51,9 +68,10 @@ class BelievedGuard(ShieldGuard):
         return Ruling(proposed, applied, stepped_in, ~running.ended, after.decision, Guarded(after, memories))
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """What the infos say of a step that is certified in the estimated worlds.
+        """Return, as a mapping, the infos of a step that is certified in the estimated worlds.
 
-        ``trusted``: something is promised of the real world.
+        ``trusted`` is true if the mode is ``robust``, so that the bound also says something about the true world.
+        ``memory`` holds the shield after the step, ``ruling`` its decision (None at the reset).
         """
         estimated: BelievedShield = memory.shield
         robust, shield = estimated.robust is not None, estimated.shield
@@ -61,7 +79,7 @@ class BelievedGuard(ShieldGuard):
         infos |= {"bound_harm": np.inf, "settles": False, "believed": True, "trusted": robust}
         if ruling is not None:
             infos["bound_harm"] = np.where(np.isfinite(estimated.predicted_harm), shield.bound, np.inf)
-            infos["settles"] = shield.settles
+            infos["settles"] = shield.memory.settles
         if robust:
             infos["members"] = estimated.members
         return infos

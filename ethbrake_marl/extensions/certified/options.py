@@ -1,4 +1,4 @@
-"""The settings of mode ``robust``, and of ``believed``, checked; and the guards that they make."""
+"""Checked settings of mode ``robust`` and of ``believed``, and the shields and guards that they make."""
 
 from __future__ import annotations
 
@@ -22,16 +22,18 @@ from ethbrake_marl.shield.options import ShieldOptions, check_mode, misplaced, o
 
 @dataclass(frozen=True)
 class RobustOptions(ShieldOptions):
-    """``eb.ShieldOptions`` with what guards against the unknown.
+    """``eb.ShieldOptions`` with settings for incomplete knowledge.
 
     Args:
-        mode: also ``robust``: ``step`` against an uncertainty. None: ``robust`` with an uncertainty, else ``step``.
-        uncertainty: what mode ``robust`` does not know, such as ``"gaps_m=0.5"``.
-        robust: what mode ``robust`` certifies of an uncertainty: its ``corners`` (fast), or its whole ``interior``.
-        believed: certify on what the vehicle received, mode ``robust`` against all that it did not. Modes ``step`` and
-            ``robust`` of one learner, without ``uncertainty``, ``allowance``, ``cap``, ``logging`` and ``shares``.
+        mode: a mode of ``eb.ShieldOptions``, or ``robust``: ``step`` against an uncertainty. None: ``robust`` with an
+            uncertainty, else ``step``.
+        uncertainty: uncertainty for mode ``robust``, such as ``"gaps_m=0.5"``.
+        robust: worlds of the uncertainty that mode ``robust`` certifies: its ``corners`` (fast) or whole ``interior``.
+        believed: certify in the estimated world, on what the vehicle received; in mode ``robust`` against everything
+            that it did not receive. For modes ``step`` and ``robust`` with one learner, and not together with
+            ``uncertainty``, ``allowance``, ``cap``, ``logging`` and ``shares``.
 
-    Raises ``InvalidInput`` and ``UnknownName`` as that does.
+    Raises ``InvalidInput`` and ``UnknownName`` as ``eb.ShieldOptions`` does.
 
     >>> import ethbrake_marl as eb
     >>> eb.ShieldOptions(uncertainty="gaps_m=0.5").mode
@@ -66,19 +68,24 @@ class RobustOptions(ShieldOptions):
 
     @property
     def written(self) -> str:
-        """The mode as it stands behind an agent's ``+``."""
+        """Text of the mode in an agent spec, after the ``+``: ``robust:interior:believed`` in
+        ``ppo+robust:interior:believed``.
+        """
         robust = "" if self.robust == CORNERS else f":{self.robust}"
         return f"{self.mode}{robust}{':believed' if self.believed else ''}"
 
     @property
     def adds(self) -> Source:
-        """What the shield knows of the line beside what a policy knows."""
+        """Source of information that the shield uses in addition to the policy's information."""
         return Source.BELIEFS if self.believed else super().adds
 
     def shield(
         self, scenario: Scenario, vehicle: int | tuple[int, ...], others: Mapping[int, Script] | None = None
     ) -> Any:
-        """The shield of one vehicle before any episode."""
+        """Return a new shield for ``vehicle`` (an index; several for modes that shield several), before any episode.
+
+        ``others`` are the scripts of the other vehicles by index; None: the scenario's scripts.
+        """
         if self.believed:
             assert isinstance(vehicle, int)
             robust = self.robust if self.mode == "robust" else None
@@ -91,15 +98,26 @@ class RobustOptions(ShieldOptions):
         return super().shield(scenario, vehicle, others)
 
     def check_in(self, scenario: Scenario, *, several: bool) -> None:
-        """Raise ``InvalidInput`` at once where the shield of a driver refuses the scenario."""
+        """Raise ``InvalidInput`` if a shield with these settings refuses the scenario.
+
+        ``several`` is True for one shield of all learners together.
+        """
         one = one_learner(scenario)
-        if self.believed:  # without one learner nobody knows whose scripts count
+        if self.believed:  # the scenario's scripts apply only if it has exactly one learner
             self.shield(scenario, one or 0, {} if one is None else None)
         else:
             super().check_in(scenario, several=several)
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent], *, several: bool = False, **how: Any) -> ShieldGuard:
-        """The guard of these settings, for all learners of an engine."""
+        """Return the guard that connects a shield with these settings to an engine.
+
+        Args:
+            engine: the engine whose learners are shielded.
+            policies: agents that propose the actions, by vehicle index.
+            several: True: one shield for several learners.
+            how: further keyword arguments of ``StepGuard``.
+
+        """
         scenario, scripts, where = as_scenario(engine.scenario), engine.scripts, self.where
         if self.believed:
             if len(engine.learners) > 1:
@@ -118,7 +136,11 @@ class RobustOptions(ShieldOptions):
 
 
 def checked_uncertainty(given: object) -> Uncertainty | None:
-    """An ``Uncertainty``, given as such or in its written form; None stays None. Raises ``InvalidInput`` otherwise."""
+    """Return ``given`` as an ``Uncertainty``: an object, its written form such as ``"gaps_m=0.5"``, or None, which
+    stays None.
+
+    Raises ``InvalidInput`` for anything else.
+    """
     if given is None or isinstance(given, Uncertainty):
         return given
     if isinstance(given, str):
@@ -127,7 +149,11 @@ def checked_uncertainty(given: object) -> Uncertainty | None:
 
 
 def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None:
-    """The uncertainty that goes with a mode: needed by ``robust``, refused by every other one with ``InvalidInput``."""
+    """Return the checked uncertainty for a shield mode, or None if there is none.
+
+    Raises ``InvalidInput`` if mode ``robust`` has none, or another mode has one; ``where`` begins the message.
+    ``given`` is an ``Uncertainty``, its written form, or None.
+    """
     uncertainty = checked_uncertainty(given)
     if (mode == "robust") != (uncertainty is not None):
         what = "needs an uncertainty" if uncertainty is None else "takes no uncertainty; robust does"

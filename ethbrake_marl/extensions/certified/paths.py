@@ -1,4 +1,7 @@
-"""Impacts of a box of worlds: a path branches off, in which a pair has its impact in this piece of time."""
+"""Paths of a box of worlds: in each piece, the worlds in which a pair has an impact branch off as a path of their own.
+
+A *path* is a set of worlds with the same sequence of impacts (``affine.Path``); a *cell* is a box with its commands.
+"""
 
 from __future__ import annotations
 
@@ -56,21 +59,21 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.motion import BOUND
 from ethbrake_marl.physics.state import Floats, Ints
 
-STACK = 256  # most paths that wait to be followed
+STACK = 256  # largest number of waiting paths
 
 
 class Stack(NamedTuple):
-    """Paths that are still to be followed."""
+    """Stack of paths that wait to be followed. A *path* is a set of worlds with the same impacts so far."""
 
-    forms: Floats  # [STACK, N + P + 1, W]
-    touch: Floats  # [STACK, P, TOUCH_WIDTH]
-    marks: Ints  # [STACK, 2 P + 1]
-    size: Ints  # [1]
+    forms: Floats  # [STACK, N + P + 1, W] ``Path.forms`` of each path
+    touch: Floats  # [STACK, P, TOUCH_WIDTH] ``Path.touch`` of each path
+    marks: Ints  # [STACK, 2 P + 1] ``Path.marks`` of each path
+    size: Ints  # [1] number of paths on the stack
 
 
 @compiled(apart=True)
 def new_stack(N: int, width: int) -> Stack:
-    """An empty one."""
+    """Return an empty stack of paths for ``N`` vehicles and affine forms of length ``width``."""
     P = N - 1
     return Stack(
         np.zeros((STACK, N + P + 1, width)),
@@ -82,7 +85,11 @@ def new_stack(N: int, width: int) -> Stack:
 
 @compiled(apart=True)
 def keep_worst(harm: Floats, worst: float, out: Floats) -> float:
-    """The larger harm; its form goes to ``out``."""
+    """Return the larger of ``worst`` and the largest value of the affine form ``harm`` [W] (centre, slopes, remainder),
+    m2/s2.
+
+    If ``harm`` reaches a new maximum, it is copied to ``out`` [W].
+    """
     if not high(harm) <= worst:
         out[:] = harm
         return high(harm)
@@ -91,7 +98,18 @@ def keep_worst(harm: Floats, worst: float, out: Floats) -> float:
 
 @compiled(apart=True)
 def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
-    """``keep_worst`` of a path that is not followed any further."""
+    """Record a bound on the harm of a path that is not followed any further; return the largest harm recorded so far.
+
+    The bound is ``rough_harm``, which uses only the largest speeds that are still possible.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        worst: largest harm recorded so far, m2/s2.
+        out: [W] receives the affine form of the harm if it is a new largest one.
+
+    """
     return keep_with(np.zeros(cell.speed.shape[1]), rough_harm(cell, path, -1), worst, out)
 
 
@@ -99,9 +117,24 @@ def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
 def branch(
     cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, how: Approach, worst: float, out: Floats
 ) -> float:
-    """The worlds in which pair ``p`` has an impact in this piece: their harm where it is final, else a path of its own.
+    """Record the harm of the worlds in which pair ``p`` has an impact in the present piece, or follow them as a new
+    path.
 
-    Where such a path cannot be followed, what is certain without it.
+    If no other impact can follow, their harm is final and recorded. Else they are put on the stack as a path of their
+    own. Where that path cannot be followed, ``rough_harm`` is recorded instead: a bound from the largest speeds that
+    are still possible. Returns the largest harm recorded so far.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        stack: paths that wait to be followed; new paths are put on top.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        how: closing speed and time of the contact (from ``approach``).
+        worst: largest harm recorded so far, m2/s2.
+        out: [W] receives the affine form of the harm if it is a new largest one.
+
     """
     P = cell.gap.shape[0]
     harm = path.forms[-1].copy()
@@ -134,7 +167,11 @@ def branch(
 
 @compiled(apart=True)
 def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
-    """``keep_worst`` of a harm to which at most ``rest`` is added."""
+    """Record the affine form ``harm`` [W] (centre, slopes, remainder), to which at most ``rest`` (m2/s2) will be added;
+    return the largest harm recorded, m2/s2.
+
+    ``worst`` is the largest harm recorded so far; ``out`` [W] receives the affine form of a new largest harm.
+    """
     whole = harm.copy()
     whole[0] += rest
     return keep_worst(whole, worst, out)
@@ -142,12 +179,26 @@ def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
 
 @compiled(apart=True)
 def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats, time: Floats, length: float) -> Floats:
-    """Closing speed of the other one of two pairs that meets in the same piece, after pair ``p``; 0: it does not."""
+    """Return the closing speed of the other pair of three vehicles if it may meet in the same piece after pair ``p``.
+
+    The result is an affine form [W] (centre, slopes, remainder) in m/s; it is 0 if that pair cannot meet.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        speed: affine form [W] of the closing speed at the impact of pair ``p``, m/s.
+        time: affine form [W] of the time of that impact, s after the start of the piece.
+        length: length of the piece, s.
+
+    """
     N, other = cell.speed.shape[0], 1 - p
-    push = product(cell.share[p, other], speed)  # of the middle vehicle, towards the other pair's second one
+    push = product(cell.share[p, other], speed)  # change of the middle vehicle's speed, towards the other pair
     push *= 1.0 + cell.restitution
     softest, hardest = pressing(motion, other)
-    hold = max(pressing(motion, p)[1], 0.0) * length  # what pair p, pressing on, adds to the push
+    hold = max(pressing(motion, p)[1], 0.0) * length  # further change while pair p presses on
     hold *= max(1.0, (1.0 + cell.restitution) * high(cell.share[p, other]))
     begin, after = path.forms[N + other], path.forms[N + other].copy()
     add(after, 1.0, motion.way[other])
@@ -165,7 +216,23 @@ def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats,
 def strike(
     cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, how: Approach, speed: Floats, harm: Floats
 ) -> bool:
-    """Put the path of the worlds in which pair ``p`` has its impact in this piece on the stack; False if it cannot."""
+    """Put the worlds in which pair ``p`` has its impact in the present piece on the stack as a new path.
+
+    Returns False, and puts nothing on the stack, if the stack is full or the rear vehicle may move backwards
+    (``thrown_back``).
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        stack: paths that wait to be followed; new paths are put on top.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        how: closing speed and time of the contact (from ``approach``).
+        speed: affine form [W] (centre, slopes, remainder) of the closing speed at the impact, m/s.
+        harm: affine form [W] of the harm including this impact, m2/s2.
+
+    """
     N, P, width = cell.speed.shape[0], cell.gap.shape[0], cell.speed.shape[1]
     size = stack.size[0]
     if size >= STACK or thrown_back(cell, path, motion, p, how, speed):
@@ -184,7 +251,7 @@ def strike(
     bounces = cell.restitution if high(speed) >= BOUND.PLASTIC_SPEED_MPS else 0.0
     returns = cell.restitution if low(speed) >= BOUND.PLASTIC_SPEED_MPS else 0.0
     _, most = pressing(motion, p)
-    # drive of a front vehicle that ceases because an impact pushes it beyond its speed limit; 0: it does not
+    # driving acceleration that a front vehicle loses if the impact pushes it beyond its speed limit; else 0
     drive = high(motion.pull[p]) + motion.vague[p]
     pushed = (1.0 + cell.restitution) * high(speed) + 2.0 * max(pressing(motion, p)[1], 0.0) * length
     fastest = high(motion.onward[p])
@@ -196,7 +263,7 @@ def strike(
         jump[-1] = abs(jump[-1]) + (bounces - returns) * BOUND.PLASTIC_SPEED_MPS
         spring_apart(cell, path, motion, p, how, jump, left, after, way)
     else:
-        most_apart, touch = bounces * high(speed), after.touch[p]  # by so much its impact opens the pair at most
+        most_apart, touch = bounces * high(speed), after.touch[p]  # largest opening speed after the impact
         least, hardest = pressing_together(motion, p)
         begin_touch(touch)
         touch[CLOSING] = max(hardest, 0.0) * length
@@ -231,9 +298,18 @@ def strike(
 
 @compiled(apart=True)
 def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int, how: Approach) -> bool:
-    """Whether a pair may have come to gap 0 at closing speed 0 just when it begins to be pressed together.
+    """Return whether pair ``p`` may reach gap 0 with closing speed 0 exactly when it begins to be pressed together.
 
-    Before, it was not: so a command changed, or a force moves.
+    This needs a change in how the pair is pressed: a command changes, or a force builds up.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        how: closing speed and time of the contact (from ``approach``).
+
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     softest, hardest = pressing(motion, p)
@@ -254,13 +330,34 @@ def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int, how: Approach
 
 @compiled(apart=True)
 def may_turn(cell: Cell, motion: Motion, p: int, piece: int) -> bool:
-    """Whether forces that move may press a pair together harder and harder: its front's falls, or its rear's rises."""
+    """Return whether forces that build up may press pair ``p`` together harder within a piece.
+
+    That is so if the front vehicle's acceleration may fall or the rear vehicle's may rise.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        piece: index of the piece, 0 to J - 1.
+
+    """
     return may_move(cell, motion, p, piece, 0) or may_move(cell, motion, p + 1, piece, 1)
 
 
 @compiled(apart=True)
 def may_move(cell: Cell, motion: Motion, i: int, piece: int, which: int) -> bool:
-    """Whether an acceleration may fall (0), or rise (1), in the piece, in a cell in which some force moves."""
+    """Return whether brake build-up may lower (``which`` 0) or raise (``which`` 1) an acceleration within a piece.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        i: index of the vehicle.
+        piece: index of the piece, 0 to J - 1.
+        which: 0 or 1.
+
+    """
     if not cell.forces.build[i] or motion.vague[i] > cell.forces.swing[i, piece + 1].max():
         return cell.moving and motion.vague[i] > 0.0
     return bool(cell.forces.swing[i, piece + 1, which] > 0.0)
@@ -268,9 +365,20 @@ def may_move(cell: Cell, motion: Motion, i: int, piece: int, which: int) -> bool
 
 @compiled(apart=True)
 def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, length: float) -> bool:
-    """Beside the path on top that of the worlds in which pair ``p`` met, stayed in contact, and had no impact.
+    """Push a second path: the worlds in which pair ``p`` met and stayed in contact without an impact.
 
-    Where forces move it may open and have its first impact within the piece: that is on the path on top.
+    With brake build-up the pair may open and have its first impact within the piece; the path below on the stack covers
+    these worlds. Returns False if the stack is full.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        stack: paths that wait to be followed; new paths are put on top.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        length: length of the piece, s.
+
     """
     size = stack.size[0]
     if size >= STACK:
@@ -292,9 +400,19 @@ def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, len
 
 @compiled(apart=True)
 def thrown_back(cell: Cell, path: Path, motion: Motion, p: int, how: Approach, speed: Floats) -> bool:
-    """Whether the striking vehicle may move backwards after the impact, and be met again.
+    """Return whether the rear vehicle may move backwards after the impact of pair ``p``, so that it could be hit again.
 
-    The last one of a line, if it never drives, meets nobody then: it may as well stand.
+    False for the last vehicle of the line if it never drives: nobody is behind it, so it may as well stand.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        how: closing speed and time of the contact (from ``approach``).
+        speed: affine form [W] (centre, slopes, remainder) of the closing speed at the impact, m/s.
+
     """
     P, share = cell.gap.shape[0], (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0
     slowest = 0.0
@@ -305,14 +423,23 @@ def thrown_back(cell: Cell, path: Path, motion: Motion, p: int, how: Approach, s
     return share * high(speed) > slowest and not last
 
 
-MOST_PATHS = 4000  # of one cell
+MOST_PATHS = 4000  # most paths to follow in one cell
 
 
 @compiled(apart=True)
 def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float) -> float:
-    """Upper bound on the harm of every world of the cell (m2/s2), unless it is above ``most``.
+    """Return an upper bound on the harm of every world of the cell, m2/s2.
 
-    ``out`` [W] becomes the form that reaches it.
+    A result above ``most`` is no bound: the search then stopped early.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        stack: memory for paths (sets of worlds with the same impacts).
+        motion: memory for the motion of each vehicle.
+        out: [W] receives the affine form of the harm that reaches the bound.
+        most: harm above which the search stops, m2/s2.
+
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     worst, paths = -math.inf, 0
@@ -333,14 +460,25 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float
             for k in range(stack.size[0]):
                 worst = keep_rough(cell, Path(stack.forms[k], stack.touch[k], stack.marks[k]), worst, out)
             return worst
-    return worst if worst >= 0.0 else math.inf  # each world goes some way
+    return worst if worst >= 0.0 else math.inf  # every world takes some path, so no path at all is an error
 
 
 @compiled(apart=True)
 def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
-    """Follow a path to its end; the larger one of ``worst`` and its harm and that of the paths that end with it."""
+    """Follow a path to its end. Return the maximum of ``worst``, its harm, and the harm that branches off on the way.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; changed in place.
+        stack: paths that wait to be followed; new paths are put on top.
+        motion: memory for the motion of each vehicle.
+        worst: largest harm recorded so far, m2/s2.
+        out: [W] receives the affine form of the harm if it is a new largest one.
+
+    """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
-    quiet = 0  # the piece of time from which on nobody drives
+    quiet = 0  # first piece from which on no vehicle drives
     for j in range(cell.action.shape[0]):
         if cell.action[j] > 0.0:
             quiet = j + 1
@@ -363,7 +501,17 @@ def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, o
 
 @compiled(apart=True)
 def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
-    """Whether a pair that touched without an impact may open in this piece and meet again, which would be its first."""
+    """Return whether a pair in contact, without an impact so far, may have its first impact in the present piece.
+
+    For this the pair must open first.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+
+    """
     P = cell.gap.shape[0]
     for p in range(P):
         if path.marks[P + p] == TOUCHES and path.marks[p] == 0:
@@ -375,13 +523,27 @@ def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
 
 @compiled(apart=True)
 def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
-    """Pairs in contact, and those that may come into contact, in one piece of time; ``worst`` as ``follow``."""
+    """Move the pairs in contact through the present piece, and branch off the worlds in which a pair has an impact.
+
+    Pairs in contact move as one from here on, or separate. The worlds with an impact are recorded or put on the stack
+    (``branch``). Returns the largest harm recorded so far.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; changed in place.
+        stack: paths that wait to be followed; new paths are put on top.
+        motion: motion of each vehicle in the present piece; changed in place.
+        worst: largest harm recorded so far, m2/s2.
+        out: [W] receives the affine form of the harm if it is a new largest one.
+
+    """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     length = cell.times[path.marks[2 * P] + 1] - cell.times[path.marks[2 * P]]
     for p in range(P):
         again = path.marks[P + p] == FREE and path.marks[p] == 1 and (P == 1 or path.marks[2 * P - 1 - p] == FREE)
         if again and may_meet(cell, path, motion, p, length) and is_blurred(path, motion, N, p, length):
-            # what may or may not be in contact is taken as a pair that is
+            # treat a pair that may or may not be in contact as a pair in contact
             front, rear, gap = path.forms[p].copy(), path.forms[p + 1].copy(), path.forms[N + p]
             closing = difference(rear, front)
             touch = path.touch[p]
@@ -399,9 +561,11 @@ def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out
             move_together(cell, path, motion, p, length)
     for p in range(P):
         if path.marks[P + p] == FREE and may_meet(cell, path, motion, p, length):
-            # its impacts in this piece of time, its front moving then or standing
+            # impacts of the pair in this piece, with a moving or a standing front vehicle
             for i in range(p, p + 2):
-                motion.way[i, -1] += BOUND.TOUCH_SPEED_MPS * length  # by a touch, which is no impact
+                motion.way[i, -1] += (
+                    BOUND.TOUCH_SPEED_MPS * length
+                )  # a contact below the impact speed may change the speed by this
                 if (
                     motion.rest[i] == MOVES
                     or high(motion.speed[i]) > 0.0
@@ -418,7 +582,15 @@ def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out
 
 @compiled(apart=True)
 def go_on(cell: Cell, path: Path, motion: Motion) -> bool:
-    """Move on without an impact in this piece; False if no world can."""
+    """Advance the path to the end of the present piece without an impact. Return False if every world has an impact.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; changed in place.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+
+    """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     for p in range(P):
         if path.marks[P + p] == TOUCHES:

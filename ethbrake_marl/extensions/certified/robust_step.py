@@ -1,14 +1,14 @@
-"""A step shield for uncertain worlds: it certifies in the corners of an uncertainty, or in its whole interior.
+"""Step shield for uncertain worlds: it certifies the corners of an uncertainty, or its whole interior.
 
-``StepShield`` proves its bound for the members of a world, and takes them as a list. Here they are the corners of an
-``Uncertainty``. ``interior`` also bounds the harm of every plan over the whole box around the corners
-(``enclosure.Boxes``), at the alert and in every decision.
+The *members* of a world are the worlds in which ``StepShield`` certifies a plan for it. Here they are the corners of an
+``Uncertainty``. With ``robust="interior"`` the harm of every plan is also bounded over the whole box around the corners
+(``enclosure.Boxes``), at the alert and at every decision.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -24,19 +24,23 @@ from ethbrake_marl.shield.certify import Backup, Decision, certify
 from ethbrake_marl.shield.reasons import NO_CERTIFICATE
 from ethbrake_marl.shield.running import Running
 from ethbrake_marl.shield.step import StepShield
+from ethbrake_marl.shield.step_memory import StepMemory
 
 
 class RobustShield(StepShield):
-    """A ``StepShield`` whose bound holds for every corner of an uncertainty, or for its whole interior.
+    """``StepShield`` whose bound holds in every corner of an uncertainty, or in its whole interior.
 
     Args:
-        scenario: of all worlds.
-        vehicle: index of the shielded vehicle; one, since several are not covered.
-        uncertainty: what is not known; None: ``begin`` is given the ``possible`` worlds.
-        robust: ``corners``, or ``interior``.
+        scenario: the scenario of all worlds.
+        vehicle: index of the shielded vehicle. An uncertainty allows only one.
+        uncertainty: intervals around the reported quantities; None: ``begin`` receives the ``possible`` worlds.
+        robust: worlds to certify: ``corners`` or ``interior``.
+        harm_count: ``first`` or ``total`` impacts.
+        others: scripts of the other vehicles by index; None: the scenario's scripts.
         settings: further keywords of ``StepShield``.
 
-    Raises ``InvalidInput`` as that does, for several vehicles, and for what ``interior`` cannot certify.
+    Raises ``InvalidInput`` as ``StepShield`` does, for several vehicles or a cap with an uncertainty, and for settings
+    that ``interior`` cannot certify.
 
     """
 
@@ -56,43 +60,68 @@ class RobustShield(StepShield):
             what = "several vehicles" if self.cap is None else "a cap"
             raise InvalidInput(f"shield: uncertainty: {what} with it: not covered; mode robust shields one vehicle")
         self.uncertainty, self.robust = uncertainty, checked_robust(robust, "shield")
-        self.boxes: Boxes | None = None  # of ``interior``, once episodes have begun
         Boxes.check_possible(self.robust, scenario, harm_count, self._others)
 
     @property
     def possible_are(self) -> str:  # type: ignore[override]  # a constant there
-        """What messages say of a world's members."""
+        """Words for a world's members (possible worlds) in error messages, for instance "uncertainty: gaps_m=0.5"."""
         return f"uncertainty: {self.uncertainty}"
 
     def members_of(self, worlds: Worlds) -> Worlds:
-        """The members of worlds at the alert, [n * M]: each world, then its corners."""
+        """Return the members of worlds at the alert, [n * M]: each world followed by the corners of its uncertainty."""
         return worlds if self.uncertainty is None else self.uncertainty.members(worlds)
 
-    def take(self, rows: Ints) -> Self:
-        """The shield of some rows, which goes on apart."""
-        part = super().take(rows)
-        part.boxes = None if self.boxes is None else self.boxes.take(rows)
-        return part
+    @property
+    def boxes(self) -> Boxes | None:
+        """The boxes of mode ``interior`` (range of every number of each world), once episodes have begun; else None."""
+        boxes: Boxes | None = self.memory.enclosure
+        return boxes
 
     def _bound_at_alert(
         self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
-    ) -> Floats:
-        """In interior mode the bound over all worlds of each box."""
-        if possible.n == len(rows) or self.robust != INTERIOR:
-            return harm
-        boxes = Boxes.of(possible, problem, len(rows), self.scenario, self._others)
-        self.boxes = boxes.placed(self.boxes, rows)
-        return boxes.at_alert(plan, harm)
+    ) -> tuple[Floats, Boxes | None]:
+        """Return the bound on the harm of each plan at the alert, [m] m2/s2, and the boxes of all episodes (None in
+        corners mode).
 
-    def _also_certified(self, now: Running, held: Backup, budget: Floats, decision: Decision, asked: Bools) -> Decision:
-        """In interior mode what is certified for all worlds of each box."""
-        return decision if self.boxes is None else certify_inside(self.boxes, now, held, budget, decision, asked)
+        In interior mode the bound covers all worlds of each box, else only its members (the reported world and the
+        corners of its box).
+
+        Args:
+            possible: [m * M] members of the new worlds, M consecutive ones for each.
+            problem: the same worlds as columns of numbers.
+            rows: [m] indices of the new episodes.
+            plan: [m, L] action at each decision.
+            harm: [m] largest harm of the plan in a member, m2/s2.
+
+        """
+        if possible.n == len(rows) or self.robust != INTERIOR:
+            return harm, self.boxes
+        boxes = Boxes.of(possible, problem, len(rows), self.scenario, self._others)
+        return boxes.at_alert(plan, harm), boxes.placed(self.boxes, rows)
+
+    def _also_certified(
+        self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
+    ) -> Decision:
+        """Return the decision; in interior mode, plans that are not certified for all worlds of their box are replaced.
+
+        Args:
+            now: state of the members (the corners of the boxes) before the decision.
+            memory: memory of the shield.
+            budget: [n] largest harm that a new plan may have, m2/s2.
+            decision: the decision, certified in the members only.
+            asked: [n] True for episodes that decide now.
+
+        """
+        boxes = memory.enclosure
+        return decision if boxes is None else certify_inside(boxes, now, memory.backup, budget, decision, asked)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Worlds [n] that may leave the range of their members.
+        """Return a mask [n] of the worlds that may leave the range spanned by their members (the reported world and the
+        corners of its uncertainty), now in the states ``running``.
 
-        Also those in which the own latency is uncertain (a decision falls at another time in each world of the box), or
-        one uncertain number moves several quantities (friction).
+        Besides the worlds of ``StepShield``: worlds whose own latency is uncertain, because a decision then falls at a
+        different time in each world of the box, and all worlds if one uncertain number moves several quantities
+        (friction).
         """
         leaves, boxes = super()._leaves_range(running), self.boxes
         if boxes is not None:
@@ -106,13 +135,20 @@ class RobustShield(StepShield):
 def certify_inside(
     boxes: Boxes, running: Running, held: Backup, budget: Floats, decision: Decision, asked: Bools
 ) -> Decision:
-    """A decision that the corners allow, refused where its plan is not certified for every world of the box.
+    """Replace each plan of a decision that is not certified for every world of its box by the held plan.
 
-    ``held`` is the backup before it. A plan without a certificate never replaces the held one. Episodes end at the
-    horizon: that all corners rest does not mean that every world does.
+    Args:
+        boxes: range of every number of each world.
+        running: state of the members (corners of the boxes) before the decision.
+        held: plans and bounds from before the decision.
+        budget: [n] largest harm that a new plan may have, m2/s2.
+        decision: the decision, certified in the corners only.
+        asked: [n] True for episodes that decide now. Such an episode counts as ended only at the horizon, because a box
+            may hold moving worlds when all its corners are at rest.
+
     """
     plan, other = decision.backup.plan.copy(), (decision.backup.plan != held.plan).any(axis=1)
-    bound = np.where(asked & ~other, held.harm, decision.bound)  # of the corners alone, where the plan is the same
+    bound = np.where(asked & ~other, held.harm, decision.bound)  # an unchanged plan keeps its bound
     changed = np.flatnonzero(asked & other)
     found = boxes.bound(changed, plan[changed], budget[changed], only_enough=True)
     least = np.where(decision.intervened, held.harm, budget)[changed]
@@ -124,7 +160,7 @@ def certify_inside(
     plan[bad], bound[bad] = held.plan[bad], held.harm[bad]
     decision = decision._replace(bound=bound, backup=decision.backup._replace(plan=plan, harm=bound))
     refused = bad[~decision.intervened[bad]]
-    if refused.size:  # the held plan's action instead
+    if refused.size:  # apply the action of the held plan instead
         part, plan = running.take(refused), held.plan[refused]
         action, harm = plan[np.arange(len(plan)), part.steps], held.harm[refused]
         with renumbered(refused):

@@ -1,13 +1,13 @@
-"""A bound on harm that needs no path: by the speeds that the vehicles of a line may still have.
+"""Rough bound on harm that follows no path, from the speeds that the vehicles of a line can still reach.
 
-Where a path cannot be followed, this is what is said of the worlds that go it, so that no bound is ever infinite.
+It is used for the worlds of a path that cannot be followed, so no bound is ever infinite.
 
-A vehicle on its own is at most as fast as it is, or as it drives up to its limit. In an impact of a pair whose
-closing speed is w each one's speed changes by its share of (1 + e) w. Let u be the largest of all own speeds, e
-restitution, and nobody move backwards yet. A rear vehicle is slowed by an impact, and left with at least -e times its
-speed; a front one that was at rest has at most (1 + e) times the rear one's. So the middle one of three is between -e
-u and (1 + e) u until its second pair meets. (Three that touch are one cluster, in which each ends with P + e (P - v)
-for a mean P of their speeds v: between the same bounds.)
+A vehicle alone is at most as fast as it is now, or as it becomes by driving up to its limit. An impact with closing
+speed w changes each vehicle's speed by its share of (1 + e) w, with restitution e. Let u be the largest speed of any
+vehicle, and let no vehicle move backwards yet. An impact slows the rear vehicle, to no less than -e times its speed;
+a front vehicle at rest gains at most (1 + e) times the rear one's speed. So the middle one of three vehicles stays
+between -e u and (1 + e) u until its second pair meets. (Three vehicles in contact are one cluster: each leaves with
+P + e (P - v) for a weighted mean P of the speeds v, which lies between the same bounds.)
 """
 
 from __future__ import annotations
@@ -22,13 +22,17 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(apart=True)
 def driven(cell: Cell, i: int, speed: float, since: float) -> float:
-    """Largest speed of a vehicle that is at most as fast as this at a time, by its own drive from then on."""
+    """Return the largest speed (m/s) that vehicle ``i`` can reach by driving if it has at most ``speed`` at time
+    ``since``.
+
+    ``since`` counts from the first decision, in s. ``cell`` holds the box of worlds and the commands.
+    """
     drive, rest = 0.0, cell.times[-1] - since
     if i == cell.vehicle:
         for j in range(cell.action.shape[0]):
             if cell.times[j + 1] > since:
                 drive = max(drive, cell.action[j] * high(cell.drive))
-                if cell.forces.build[i]:  # what it had before may still be released
+                if cell.forces.build[i]:  # an earlier driving force may not be released yet
                     drive = max(drive, high(cell.forces.mean[i, j + 1]) + cell.forces.swing[i, j + 1].max())
     elif cell.constant[i] > 0.0:
         drive = cell.constant[i]
@@ -37,9 +41,16 @@ def driven(cell: Cell, i: int, speed: float, since: float) -> float:
 
 @compiled(apart=True)
 def rough_harm(cell: Cell, path: Path, hit: int) -> float:
-    """Upper bound on the harm of all worlds of a path, from the present piece on, if pair ``hit`` was hit by now.
+    """Return an upper bound on the harm of all worlds of a path, from the present piece on, m2/s2.
 
-    ``hit`` -1: by the marks of the path.
+    It uses only the largest speeds that the vehicles can still reach.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        hit: index of a pair that counts as hit already; -1: only the pairs marked in the path.
+
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     since = cell.times[path.marks[2 * P]]
@@ -56,17 +67,27 @@ def rough_harm(cell: Cell, path: Path, hit: int) -> float:
 
 @compiled(apart=True)
 def rough_rest(cell: Cell, own: Floats, backwards: float, since: float, path: Path, hit: int) -> float:
-    """Largest sum of the squared closing speeds of first impacts that are still to come."""
+    """Return the largest sum of squared closing speeds of the first impacts that are still to come, m2/s2.
+
+    Args:
+        cell: the box of worlds.
+        own: [N] largest speed of each vehicle without an impact, m/s.
+        backwards: largest backward speed of any vehicle now, m/s.
+        since: present time, s after the first decision.
+        path: marks the pairs that had an impact.
+        hit: index of a further pair that counts as hit; -1: none.
+
+    """
     P, e = cell.gap.shape[0], cell.restitution
     first = path.marks[0] == 1 or hit == 0
     if P == 1:
         return float(0.0 if first else own[1] * own[1])
     second = path.marks[1] == 1 or hit == 1
     fastest = max(own[1], own[2])
-    ahead = driven(cell, 1, (1.0 + e) * fastest, since)  # closing speed of the front pair, its rear one pushed
+    ahead = driven(cell, 1, (1.0 + e) * fastest, since)  # closing speed of the front pair after a push from behind
     back: float = own[2] + max(
         e * driven(cell, 1, fastest, since), backwards
-    )  # of the rear pair, its front one thrown back
+    )  # closing speed of the rear pair after its front vehicle is thrown back
     if first and second:
         return 0.0
     if first:

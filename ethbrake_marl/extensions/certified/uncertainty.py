@@ -1,9 +1,10 @@
-"""Uncertainty as intervals around the quantities of a world, and the members that stand for them.
+"""Uncertainty: an interval around each quantity of a world, and the members that represent the worlds in it.
 
-A quantity of one vehicle (or pair) that was told as x lies in [x - h, x + h], h being a number in its unit or a share
-of x, cut to what is possible (no latency, speed or gap below 0, no speed above the vehicle's limit). The *members* of
-a world are the world as it was told, and every corner of the box of all these intervals: 2^d of them, for d uncertain
-numbers. What robust mode proves, it proves for the members (``docs/shield-intervals.md``).
+A quantity of one vehicle (or pair) with the reported value x lies in [x - h, x + h]. The half-width h is a number in
+the quantity's unit or a share of x. The interval is cut to possible values: no latency, speed or gap below 0, no speed
+above the vehicle's limit. The *members* of a world are the reported world and every corner of the box of all these
+intervals: 2^d corners for d uncertain numbers. Mode ``robust`` proves its bound for the members
+(``docs/shield-intervals.md``).
 """
 
 from __future__ import annotations
@@ -28,11 +29,17 @@ OF_VEHICLES = (  # fields of ``Vehicles``
 
 QUANTITIES = (*OF_VEHICLES, "speeds_mps", "gaps_m", "friction")
 
-POSITIVE = ("braking_capacity_mps2", "mass_t", "friction", "brake_rate_mps3", "release_rate_mps3")  # must stay above 0
+POSITIVE = (
+    "braking_capacity_mps2",
+    "mass_t",
+    "friction",
+    "brake_rate_mps3",
+    "release_rate_mps3",
+)  # quantities that must stay above 0
 
-_OF_FRICTION = (0.0, 0.125, 0.25, 0.375, 0.625, 0.75, 0.875, 1.0)  # shares of its interval; told is 0.5
+_OF_FRICTION = (0.0, 0.125, 0.25, 0.375, 0.625, 0.75, 0.875, 1.0)  # shares of the interval; the reported value is 0.5
 
-MOST_CORNERS = 1024  # of one world: each costs as much as the world itself
+MOST_CORNERS = 1024  # most corners of one world; each costs as much as the world itself
 
 UNCERTAINTY_EXAMPLE = "braking_capacity_mps2=5%,latency_s=0.1,gaps_m.pair_1=0.5"
 
@@ -47,12 +54,12 @@ _NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """How far one quantity may be from what was told, of one vehicle or pair, or (``place`` None) of each."""
+    """Half-width of one quantity's interval, for one vehicle or pair, or for each of them."""
 
     quantity: str  # one of QUANTITIES
     half_width: float  # in the quantity's unit, or a share of its value below 1
-    relative: bool = False
-    place: int | None = None  # index from 0
+    relative: bool = False  # True: ``half_width`` is a share of the value
+    place: int | None = None  # index of the vehicle or pair from 0; None: all of them
 
     def __post_init__(self) -> None:
         if self.quantity not in QUANTITIES:
@@ -72,17 +79,17 @@ class Interval:
         return f"{self.quantity}{where}={width}"
 
 
-_Side = tuple[str, int, Floats, Floats]  # an uncertain number of every world: quantity, place, least and largest value
+_Side = tuple[str, int, Floats, Floats]  # one uncertain number: quantity, place, least and largest value, each [n]
 
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """Intervals around what was told about a world; see the module. ``parse_uncertainty`` reads the written form.
+    """Intervals around the reported quantities of a world. ``parse_uncertainty`` reads the written form.
 
-    Raises ``InvalidInput`` without an interval, or for a quantity of one vehicle or pair that is given twice.
+    Raises ``InvalidInput`` if there is no interval, or if two intervals cover the same quantity of a vehicle or pair.
     """
 
-    intervals: tuple[Interval, ...]
+    intervals: tuple[Interval, ...]  # one entry for each uncertain quantity
 
     def __post_init__(self) -> None:
         if not isinstance(self.intervals, tuple) or not all(isinstance(each, Interval) for each in self.intervals):
@@ -102,16 +109,18 @@ class Uncertainty:
 
     @property
     def moves_together(self) -> bool:
-        """Whether one uncertain number moves several quantities: then gaps and speeds have no extremes in corners."""
+        """True if one uncertain number (friction) changes several quantities; gaps and speeds are then not extreme in
+        corners.
+        """
         return any(each.quantity == "friction" and each.half_width > 0.0 for each in self.intervals)
 
     def members(self, worlds: Worlds) -> Worlds:
-        """The members [n * M] of worlds at the alert: for each world itself, then its corners, the next world's after.
+        """Return the members of worlds at the alert, [n * M]: each world followed by the corners of its box.
 
-        Corners come in the order of binary numbers, the first interval's bit being the lowest; intervals of no
-        width make none. Friction moves all capacities together, and harm is not monotone in it: it has eight instead
-        of two ends. Raises ``InvalidInput`` for a vehicle that is not there, a capacity or mass that may be 0, or
-        more than ``MOST_CORNERS`` corners.
+        The *box* of a world is the set of all values in its intervals. Corners come in the order of binary numbers; the
+        first interval is the lowest bit. Intervals of width 0 add no corners. Friction changes all capacities together
+        and harm is not monotone in it, so it has eight values instead of two ends. Raises ``InvalidInput`` for a
+        vehicle that does not exist, a capacity or mass that may be 0, or more than ``MOST_CORNERS`` corners.
         """
         sides = self._sides(worlds)
         ends = [_OF_FRICTION if name == "friction" else (0.0, 1.0) for name, *_ in reversed(sides)]
@@ -127,12 +136,21 @@ class Uncertainty:
 
     @staticmethod
     def interleaved(parts: list[Worlds]) -> Worlds:
-        """The worlds [n] of all M parts as one list [n * M]: the first one of each part, then the second ones."""
+        """Merge M lists of n worlds each into one list [n * M]: world 0 of each list, then world 1 of each list, and so
+        on.
+        """
         order = np.arange(parts[0].n * len(parts)).reshape(len(parts), parts[0].n).T.ravel()
         return Worlds.concatenate(parts).take(order)
 
     def draw(self, worlds: Worlds, rng: np.random.Generator, *, corners: bool = False) -> Worlds:
-        """One world [n] out of each box: evenly from its inside, or one of its ``corners``."""
+        """Draw one world from the box of intervals around each of ``worlds``, [n].
+
+        Args:
+            worlds: the reported worlds, [n].
+            rng: source of randomness.
+            corners: True: draw one of the corners; False: draw uniformly from the inside.
+
+        """
         sides = self._sides(worlds)
         shares = rng.random((len(sides), worlds.n))
         if corners:
@@ -140,7 +158,9 @@ class Uncertainty:
         return _placed(worlds, sides, lambda k: shares[k])
 
     def _sides(self, worlds: Worlds) -> list[_Side]:
-        """The uncertain numbers of these worlds."""
+        """Return the uncertain numbers of ``worlds``: quantity, index of vehicle or pair, least and largest value [n]
+        of each.
+        """
         sides: list[_Side] = []
         for interval in self.intervals:
             every, name = _values(worlds, interval.quantity), interval.quantity
@@ -175,11 +195,11 @@ class Uncertainty:
 
 
 def parse_uncertainty(text: str) -> Uncertainty:
-    """Read ``quantity=half-width`` entries with commas between them, for instance ``UNCERTAINTY_EXAMPLE``.
+    """Parse a text of ``quantity=half-width`` entries separated by commas, for instance ``UNCERTAINTY_EXAMPLE``.
 
     A half-width is a number in the quantity's unit, or a percentage of its value. ``.vehicle_2`` or ``.pair_1`` after
-    the quantity limits it to that one. Blanks around entries and ``=`` change nothing. Raises ``InvalidInput`` for
-    anything else.
+    the quantity limits the entry to one vehicle or pair. Blanks around entries and ``=`` are ignored. Raises
+    ``InvalidInput`` for anything else.
     """
     entries = [entry.strip() for entry in text.split(",")]
     if "" in entries:
@@ -200,7 +220,10 @@ def parse_uncertainty(text: str) -> Uncertainty:
 
 
 def _values(worlds: Worlds, quantity: str) -> Floats:
-    """What was told, [n, N], [n, P] or, of the road, [n, 1]; capacities as they are on a dry road."""
+    """Return the reported values of one of ``QUANTITIES``: [n, N], for gaps [n, P], for friction [n, 1].
+
+    Capacities are those on a dry road.
+    """
     if quantity.endswith("_rate_mps3"):
         return np.asarray(getattr(worlds.vehicles, quantity), np.float64)
     return QUANTITY.declared[quantity].of(worlds)
@@ -212,10 +235,17 @@ def _of(quantity: str, place: int) -> str:
 
 
 def _placed(worlds: Worlds, sides: list[_Side], share: Callable[[int], Floats | float]) -> Worlds:
-    """The worlds with each uncertain number at ``share(k)`` of its interval: 0 its least value, 1 its largest.
+    """Return the worlds with each uncertain number at a position in its interval.
 
-    Without a channel an uncertain latency is also what others are told, and when the news is known. With one, only the
+    Without a V2X channel an uncertain latency also changes what others receive and when. With a channel, only the
     reaction is uncertain. Friction limits the capacities of all vehicles together.
+
+    Args:
+        worlds: the reported worlds, [n].
+        sides: the uncertain numbers, from ``_sides``.
+        share: maps the index of an uncertain number to its position, a number or [n]: 0 is the least value, 1 the
+            largest.
+
     """
     changed: dict[str, Any] = {}
     for k, (quantity, place, low, high) in enumerate(sides):

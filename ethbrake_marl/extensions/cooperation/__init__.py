@@ -1,1 +1,1 @@
-"""Levels of cooperation, compared: ``ethbrake study ablate``."""
+"""Compare levels of cooperation: ``ethbrake study ablate``."""

@@ -1,4 +1,4 @@
-"""An ablation as a whole: what is left to do, and doing it."""
+"""Run an ablation, a comparison of trainings at several levels of cooperation, and estimate its cost."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections import Counter
 from functools import partial
 from pathlib import Path
 
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.extensions.cooperation.joint_optimum import measure, questions
 from ethbrake_marl.extensions.cooperation.levels import Json, Plan, common_worlds
 from ethbrake_marl.extensions.cooperation.page import write_ablation
@@ -22,10 +22,17 @@ from ethbrake_marl.training.team import load_team
 def run_ablation(
     plan: Plan, jobs: int = 1, machine: str = "", tell: OnProgress | None = None
 ) -> tuple[Json, list[Path]] | None:
-    """Bring every training to its end, ``jobs`` at a time, measure, and write all files, replacing earlier ones.
+    """Run all trainings of an ablation, measure the trained policies, and write all files, replacing existing ones.
 
-    What ``ablation.json`` holds; page, Markdown and figures. None when Ctrl-C stopped the trainings. Raises what
-    ``StudyFolder.work``, ``train_all`` and ``measure`` raise.
+    Args:
+        plan: settings of the ablation.
+        jobs: number of trainings at once.
+        machine: description of this machine, which is recorded.
+        tell: called with the progress; None: silent.
+
+    Returns the content of ``ablation.json``, and the paths of page, Markdown and figures. Returns None if Ctrl-C
+    stopped the trainings. Raises the exceptions of ``StudyFolder.work``, ``train_all`` and ``measure``.
+
     """
     with plan.study_folder().work():
         if not train_all([training for _, _, training in plan.trainings()], jobs, tell):
@@ -34,11 +41,14 @@ def run_ablation(
 
 
 def ablation_cost(plan: Plan) -> str:
-    """What is left to do, in seconds of one core, and a line for each damaged part of a search.
+    """Return a text for users that estimates the remaining work of an ablation in time of one core.
 
-    A short training of each level and recipe, an evaluation and a search are timed; other work on the machine
-    counts as well, for seconds are of the clock. Raises as ``TrainingJob.steps_left``, and what ``load_team``
-    raises for a finished training that cannot drive.
+    To estimate it, a short training of each level and recipe, an evaluation and a search are timed by the wall clock,
+    so other work on the machine makes the estimate larger. If results of earlier searches for the joint optimum are
+    damaged, the text has a line for each of them.
+
+    Raises the exceptions of ``TrainingJob.steps_left``, and those of ``load_team`` for a finished training whose
+    policies cannot be loaded.
     """
     left = [(level, algorithm, training, training.steps_left()) for level, algorithm, training in plan.trainings()]
     decisions: Counter[tuple[str, str]] = Counter()
@@ -54,7 +64,7 @@ def ablation_cost(plan: Plan) -> str:
     level, _, first, _ = left[0]
     worlds_s = [each.world_s for each in short.values()] or [first.world_seconds(samples[level.name])]
     driving_s = sum(worlds_s) / len(worlds_s) * plan.episodes * (len(left) + len(plan.levels))
-    for level in plan.levels if plan.shield else ():  # learners that brake fully are replaced most often
+    for level in plan.levels if plan.shield else ():  # timed with full braking, which the shield replaces most often
         if level.scenario.learners:
             task, often = Task(level.scenario, level.scenario.learners), plan.seeds * len(plan.recipes)
             shielded = partial(drive_shielded, make_agent("full_brake"), task=task)

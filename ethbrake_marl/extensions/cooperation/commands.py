@@ -1,4 +1,4 @@
-"""The command ``study ablate``: levels of cooperation, compared."""
+"""The command ``study ablate``: train and compare levels of cooperation."""
 
 from __future__ import annotations
 

@@ -1,6 +1,9 @@
-"""The comparison of levels: harm of each, what each step is worth, who pays, the distance to the joint optimum.
+"""Compare levels of cooperation: harm per level, change from level to level, who pays, distance to the joint optimum.
 
-Intervals hold for other training seeds and other worlds: both are drawn anew (``evaluation.statistics``).
+A *level* is a scenario; the *ladder* is the sequence of levels, each compared with the one before. The *joint optimum*
+is the least known harm that all learners of a level can achieve together.
+
+Confidence intervals cover other training seeds and other worlds: both are resampled (``evaluation.seeds``).
 """
 
 from __future__ import annotations
@@ -19,12 +22,18 @@ from ethbrake_marl.shield.episodes import Shielded
 
 
 def compare(measured: Sequence[Measured], searched: int) -> Json:
-    """Plain data for JSON: ``levels``, ``steps`` of the ladder, ``channels``; see docs/ablate-cooperation.md.
+    """Return the comparison of all levels as plain data for JSON; docs/ablate-cooperation.md describes it.
 
-    ``undertrained`` has a sentence for each level in which everybody braking fully does better than what was trained.
+    Keys: ``levels`` (results of each level), ``steps`` (each level against the one before), ``channels`` (each level
+    with a worse V2X channel against the level that it varies), and ``undertrained`` (a sentence for each level whose
+    trained policies do worse than full braking). Steps are compared for one algorithm at a time; a level without
+    learners counts in the comparison of every algorithm.
 
-    The joint optimum is known in the first ``searched`` worlds; what stands beside it is of these worlds too. Each
-    algorithm has a ladder of its own; levels in which nobody learns are in all of them.
+    Args:
+        measured: results of ``measure``.
+        searched: number of worlds, from the first on, in which the joint optimum was searched. Figures compared with it
+            cover the same worlds.
+
     """
     algorithms = [m.algorithm for m in measured if m.algorithm is not None]
     steps, channels = [], []
@@ -51,9 +60,9 @@ def _undertrained(one: Measured, goal: Goal) -> str:
 
 
 def _level(one: Measured, searched: int) -> Json:
-    """What one level reached under one algorithm; harm (m2/s2) in all worlds, and in the ``searched`` ones.
+    """Return the results of one level with one algorithm: harm (m2/s2) in all worlds, and in the first ``searched``.
 
-    There also the joint optimum, and the share of its reduction that is realised.
+    The ``searched`` part also has the joint optimum and the share of the possible reduction.
     """
     scenario = one.level.scenario
     found: Json = {
@@ -93,7 +102,15 @@ def _level(one: Measured, searched: int) -> Json:
 
 
 def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: int) -> Json:
-    """The same teams in the same worlds behind the shield that guards this count, beside what they do without it."""
+    """Return the results of a level's teams behind a shield as plain data, compared with those without a shield.
+
+    Args:
+        one: results of the level without a shield.
+        shielded: results of the same teams in the same worlds, behind a shield that bounds the harm ``harm_count``.
+        harm_count: impacts that harm counts: each pair's first one (``first``) or all (``total``).
+        searched: number of worlds, from the first on, over which the part ``searched`` of the result averages.
+
+    """
     before, after = one.reached.vehicle[harm_count], shielded.vehicle_harm
     actions = shielded.decisions * shielded.replaced.shape[2]
     return {
@@ -114,11 +131,15 @@ def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: 
 
 
 def _change(before: Measured, after: Measured, algorithm: str) -> Json:
-    """From one level to another on the same worlds: positive is more harm."""
+    """Return the change of harm from level ``before`` to level ``after`` on the same worlds; positive: more harm.
+
+    The result has the form ``{"from": name, "to": name, "algorithm": name, "first": changes, "total": changes}``, with
+    the changes of the whole line and of each vehicle under each count of harm. ``algorithm`` is only recorded in it.
+    """
     found: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
     for harm_count in HARM_COUNTS:
         pairs = zip(_columns(after.reached, harm_count), _columns(before.reached, harm_count), strict=True)
-        # seed k against seed k, or against the only one
+        # compares seed k with seed k, or with the only seed
         old, new = before.reached.vehicle[harm_count], after.reached.vehicle[harm_count]
         worse = new > old + TOLERANCE
         found[harm_count] = {
@@ -131,5 +152,5 @@ def _change(before: Measured, after: Measured, algorithm: str) -> Json:
 
 
 def _columns(harms: Harms, harm_count: HarmCount) -> list[Floats]:
-    """[seeds, worlds] of each vehicle."""
+    """Return the harm of each vehicle, front to rear, as arrays [seeds, worlds]."""
     return [harms.vehicle[harm_count][:, :, i] for i in range(harms.vehicle[harm_count].shape[2])]

@@ -1,4 +1,4 @@
-"""The figures of an ablation: harm level by level, what each step changes, who pays."""
+"""Figures of an ablation: harm per level, change by each step, and who pays."""
 
 from __future__ import annotations
 
@@ -29,26 +29,28 @@ from ethbrake_marl.extensions.report.style import (
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 
-LINEAR = 0.1  # m2/s2; axes are linear up to there and logarithmic beyond: harm falls to a hundredth
+LINEAR = 0.1  # m2/s2; axes are linear up to this harm and logarithmic beyond, because harm varies by a factor of 100
 
-_LEAST_IN = 2.6  # height of a figure with few rows: titles and caption need it
+_LEAST_IN = 2.6  # least height of a figure, for titles and caption
 
 _LEAST_TICKS = 4
 
-_BESIDE = 0.42  # of a worse channel, right of its clear one
+_BESIDE = 0.42  # offset of a level with a worse channel, to the right of its level
 
 Json = dict[str, Any]
 
 
 def ablation_figures(found: Json, caption: str) -> list[Figure]:
-    """What an ablation found: harm level by level, what each step changes, and who pays.
+    """Return three figures of an ablation: harm per level, change from level to level, and change for each vehicle.
 
-    Above each, in red: which levels are not trained enough.
+    ``found`` is the content of ``ablation.json``; ``caption`` is the text below each figure.
+
+    Red text above a figure names the levels that are not trained enough.
     """
     figures = [_harm_curve(found, caption), _change_figure(found, caption), _who_pays(found, caption)]
     for figure in figures if found["undertrained"] else ():
         text = "\n".join(textwrap.fill(line, int(figure.get_figwidth() * 13.0)) for line in found["undertrained"])
-        for legend in figure.legends:  # a title of the figure would stand on it
+        for legend in figure.legends:  # the text goes into the legend, because a figure title would overlap it
             legend.set_title(text, prop=FontProperties(size=9))
             legend.set_alignment("left")
             legend.get_title().set_color(ALARM)
@@ -58,9 +60,10 @@ def ablation_figures(found: Json, caption: str) -> list[Figure]:
 
 
 def _harm_curve(found: Json, caption: str) -> Figure:
-    """Harm level by level under both counts, with full braking above and the joint optimum, its limit, below.
+    """Draw first-impact and total harm at each level, between full braking and the joint optimum.
 
-    All of it in the worlds in which the joint optimum was searched.
+    All values are over the worlds in which the joint optimum was searched. ``found`` is the content of
+    ``ablation.json``; ``caption`` is the text below.
     """
     figure, panels = new_panels((10.5, 4.8), columns=2)
     ladder = list(dict.fromkeys(level["level"] for level in found["levels"] if level["clear"] is None))
@@ -70,7 +73,7 @@ def _harm_curve(found: Json, caption: str) -> Figure:
             ("best_known", "joint optimum", COLOURS[3]),
         ):
             shown = [level for level in found["levels"] if level[harm_count]["searched"][key] is not None]
-            for number, level in enumerate(shown):  # short lines; shorter ones beside for worse channels
+            for number, level in enumerate(shown):  # short lines; even shorter lines for worse channels
                 x, half = _place(level, ladder), 0.3 if level["clear"] is None else 0.07
                 value, name = level[harm_count]["searched"][key]["value"], "" if number else label
                 axes.hlines(value, x - half, x + half, color=colour, linewidth=2.0, label=name)
@@ -87,7 +90,10 @@ def _harm_curve(found: Json, caption: str) -> Figure:
 
 
 def _change_figure(found: Json, caption: str) -> Figure:
-    """What each step and each worse channel changes, with its interval: left of the line is less harm."""
+    """Draw the change of harm from level to level, and by each worse V2X channel, with intervals; left: less harm.
+
+    ``found`` is the content of ``ablation.json``; ``caption`` is the text below.
+    """
     changes = found["steps"] + found["channels"]
     figure, panels = new_panels((10.5, max(_LEAST_IN, 1.6 + 0.6 * len(changes))), columns=2, sharey=True)
     for axes, harm_count in zip(panels, HARM_COUNTS, strict=True):
@@ -115,7 +121,10 @@ def _change_figure(found: Json, caption: str) -> Figure:
 
 
 def _who_pays(found: Json, caption: str) -> Figure:
-    """How harm moved between the vehicles from level to level: a matrix of changes, blue is less."""
+    """Draw the change of each vehicle's harm from level to level as a matrix; blue is less harm.
+
+    ``found`` is the content of ``ablation.json``; ``caption`` is the text below.
+    """
     changes = found["steps"] + found["channels"]
     figure = new_figure(10.5, max(_LEAST_IN, 1.8 + 0.42 * len(changes)))
     grids = {
@@ -141,7 +150,10 @@ def _who_pays(found: Json, caption: str) -> Figure:
 
 
 def signed_ticks(low: float, high: float) -> list[float]:
-    """Round numbers from ``low`` to ``high``, 0 among them, for an axis that is linear up to ``LINEAR``: a few."""
+    """Return a few round numbers, and 0, between ``low`` and ``high`` as ticks.
+
+    They are for an axis that is linear between -0.1 and 0.1 and logarithmic beyond (``LINEAR``).
+    """
     first = -1 if max(-low, high) > LINEAR else -3
     found: list[float] = []
     for steps in ((1,), (1, 3), (1, 2, 5)):
@@ -153,14 +165,29 @@ def signed_ticks(low: float, high: float) -> list[float]:
 
 
 def _place(level: Json, ladder: Sequence[str]) -> float:
-    """Where a level stands: its number in the ladder, a worse channel to the right of its clear one."""
+    """Return the x position of a level: its index in ``ladder``, the names of the compared levels in order.
+
+    A level with a worse V2X channel stands to the right of the level that it varies.
+    """
     return ladder.index(level["clear"] or level["level"]) + (0.0 if level["clear"] is None else _BESIDE)
 
 
 def _reached(
     axes: Axes, levels: Sequence[Json], ladder: Sequence[str], harm_count: HarmCount, algorithm: str, number: int
 ) -> None:
-    """One algorithm: its ladder, and its worse channels beside their clear ones, each seed a dot."""
+    """Draw the harm that one algorithm reaches at each level, and over worse V2X channels beside it.
+
+    Each training seed is a dot.
+
+    Args:
+        axes: axes to draw on.
+        levels: results of all levels, from ``ablation.json``.
+        ladder: names of the levels, in order of their x positions.
+        harm_count: harm to draw.
+        algorithm: name of the algorithm.
+        number: index of the algorithm, which chooses colour and offset.
+
+    """
     own = [level for level in levels if level["algorithm"] in (None, algorithm)]
     style = series_style(number + 1 if number == 0 else number + 3)
     hollow = {**style, "linestyle": "none", "markerfacecolor": "white"}
@@ -168,7 +195,7 @@ def _reached(
     shielded = [level for level in own if level["first"].get("shielded") is not None]
     for some, told, beside, look in (
         (steps, steps, 0.0, {**style, "label": algorithm}),
-        # what the same teams do behind the step shield, as crosses to the left
+        # the same teams behind the step shield, as crosses to the left
         (
             shielded, [{harm_count: level[harm_count]["shielded"]} for level in shielded], -0.12,
             {"fmt": "x", "color": COLOURS[2], "label": f"{algorithm}, shielded"},
@@ -192,7 +219,16 @@ def _reached(
 def _with_intervals(
     axes: Axes, at: Sequence[float], estimates: Sequence[Estimate], *, upright: bool = True, **style: Any
 ) -> None:
-    """Marks with whiskers: ``at`` is where they stand, along the other axis."""
+    """Draw estimates as marks with whiskers for their intervals.
+
+    Args:
+        axes: axes to draw on.
+        at: position of each estimate on the other axis.
+        estimates: values and intervals.
+        upright: whether values are on the y axis; False: on the x axis.
+        style: keyword arguments of ``Axes.errorbar``.
+
+    """
     values = np.array([each.value for each in estimates])
     errors = np.abs(np.array([each.ends for each in estimates]).T - values)
     if upright:
@@ -206,12 +242,12 @@ def _algorithms(found: Json) -> list[str]:
 
 
 def _short(name: str) -> str:
-    """``cooperation-2-paper`` as two lines, ``2`` and ``paper``."""
+    """Return the name of a level without ``cooperation-``, in two lines: ``2`` and ``paper``."""
     return name.removeprefix("cooperation-").replace("-", "\n", 1)
 
 
 def _of_changes(found: Json) -> list[str]:
-    """What each step and each worse channel is called."""
+    """Return a label ``LEVEL → LEVEL`` for each change between levels, then for each worse V2X channel."""
     changes, several = found["steps"] + found["channels"], len(_algorithms(found)) > 1
     words = [f"{_short(change['from'])} → {_short(change['to'])}".replace("\n", " ") for change in changes]
     return [f"{each} ({c['algorithm']})" if several else each for each, c in zip(words, changes, strict=True)]

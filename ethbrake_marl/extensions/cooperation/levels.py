@@ -1,4 +1,7 @@
-"""Levels of cooperation that belong together: the same lines; what differs is who learns, knows and cares."""
+"""The levels and the plan of an ablation.
+
+All levels have the same lines of vehicles. They differ in who learns, who has which information, and whose harm counts.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.registry import split_names
+from ethbrake_marl.agents.spec import split_names
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.evaluation.identity import LIST_SEED
 from ethbrake_marl.evaluation.trial import load_runnable
@@ -52,10 +55,11 @@ _BUT_CHANNEL = {"name", "title", "description", "source", "v2x"}
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """One scenario of an ablation."""
+    """One level of cooperation in an ablation: a scenario, compared with others on the same lines of vehicles."""
 
-    scenario: Scenario
-    clear: str | None = None  # name of the level that is the same but for ``v2x``; None: a step of the ladder
+    scenario: Scenario  # who learns, who has which information, and whose harm counts
+    # Name of an earlier level from which this one differs only in its V2X channel (``v2x``); None: there is none.
+    clear: str | None = None
 
     @property
     def name(self) -> str:
@@ -64,11 +68,17 @@ class Level:
 
 
 def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list[Level]:
-    """Load the levels, by name or path, in this order; ``settings`` hold in each.
+    """Load the levels of an ablation, in this order.
 
-    One that differs from an earlier one in ``v2x`` only is that level over another channel; the others are the ladder,
-    each compared with the one before. Raises ``InvalidInput`` for fewer than two levels or one given twice, and what
-    ``load_runnable`` raises.
+    A level that differs from an earlier one only in ``v2x`` is compared with that level (``Level.clear``). Each of the
+    other levels is compared with the one before; they form the *ladder*.
+
+    Args:
+        names: names or paths of scenarios.
+        settings: settings ``KEY=VALUE`` that override keys in each of them.
+
+    Raises ``InvalidInput`` for fewer than two levels or a repeated level, and the exceptions of ``load_runnable``.
+
     """
     levels: list[Level] = []
     for name in names:
@@ -90,10 +100,10 @@ def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list
 
 
 def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Sample]:
-    """The list of each level: world k is the same line in all of them, and the same physics hold in it.
+    """Draw ``episodes`` worlds from ``seed`` for each level; world k is the same line of vehicles in all levels.
 
-    Latencies may differ where ``v2x`` does, and an obstacle ahead may be there or not. Raises ``InvalidInput`` naming
-    the level and what is another there.
+    Latencies may differ where ``v2x`` differs, and an obstacle ahead may be present or not. Raises ``InvalidInput``
+    with the level and the quantity that differs, if another quantity differs.
     """
     samples = [level.scenario.sample(episodes, seed) for level in levels]
     for k, level in enumerate(levels):
@@ -121,14 +131,17 @@ def _check_same(one: Level, first: Sample, other: Level, sample: Sample, names: 
 
 
 def _values(name: str, level: Level, sample: Sample) -> Floats:
-    """One row per world of a quantity of the worlds; one row of a number of the scenario."""
+    """Return the quantity called ``name``, such as ``gaps_m``, in the worlds of ``sample``: one row per world.
+
+    A number of the level's whole scenario, such as ``time_step_s``, gives a single row.
+    """
     if name in _LINE:
         return np.array([getattr(level.scenario, name)], np.float64)
     values: Floats = getattr(sample.worlds if name in _WORLD else sample.worlds.vehicles, name)
     return values
 
 
-SETTINGS = "settings.json"  # inside the ablation's folder
+SETTINGS = "settings.json"  # file name in the ablation's folder
 
 _QUICK = {"seeds": 2, "steps_per_learner": 200_000, "episodes": 500, "search_episodes": 40, "budget": 2_000}
 
@@ -137,27 +150,30 @@ _FULL = {"seeds": 5, "steps_per_learner": 400_000, "episodes": 4_000, "search_ep
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """An ablation."""
+    """Settings of an ablation, a comparison of trainings at several levels of cooperation."""
 
-    levels: tuple[Level, ...]
-    recipes: tuple[TrainingRecipe, ...]  # with the scheme of levels with several learners, see ``with_scheme``
-    seeds: int
-    steps_per_learner: int  # decisions of each learner
-    episodes: int  # worlds on which everything is measured
-    list_seed: int
-    search_episodes: int  # of these, worlds in which the joint optimum is searched
-    budget: int  # candidates per world and count of that search
-    folder: Path
-    noted: tuple[str, ...] = ()  # by which scenarios and recipes differ from their files, for ``config.json``
-    shield: str | None = None  # "step": everything drives a second time, behind it
+    levels: tuple[Level, ...]  # the compared levels, in order
+    recipes: tuple[TrainingRecipe, ...]  # how to train; each recipe names its scheme for several learners
+    seeds: int  # trainings per level and recipe
+    steps_per_learner: int  # decisions of each learner in a training
+    episodes: int  # number of common worlds
+    list_seed: int  # seed of the common worlds
+    search_episodes: int  # number of these worlds, from the first on, in which the joint optimum is searched
+    budget: int  # candidate profiles that the search tries per world and count of harm
+    folder: Path  # folder of all results
+    noted: tuple[str, ...] = ()  # overrides of scenarios and recipes, for ``config.json``
+    shield: str | None = None  # "step": the trained policies also drive behind a shield in step mode; None: no shield
 
     @property
     def algorithms(self) -> tuple[str, ...]:
-        """Names of what is compared: recipes with the scheme."""
+        """Names of the compared algorithms, ``RECIPE-SCHEME`` each."""
         return tuple(algorithm(recipe) for recipe in self.recipes)
 
     def trainings(self) -> Iterator[tuple[Level, str, TrainingJob]]:
-        """Level, algorithm and training; seed by seed, so that a first result over all levels is there early."""
+        """Yield all trainings as (level, name of the algorithm, training), seed by seed.
+
+        So a first result over all levels exists early. Levels without learners are omitted.
+        """
         for seed in range(self.seeds):
             for recipe in self.recipes:
                 for level in self.levels:
@@ -165,17 +181,20 @@ class Plan:
                         yield level, algorithm(recipe), self.training(level, recipe, seed)
 
     def training(self, level: Level, recipe: TrainingRecipe, seed: int) -> TrainingJob:
-        """The training of one seed; raises ``InvalidInput`` where recipe and level do not go together."""
+        """Return the training of one recipe at one level with one seed, with its folder.
+
+        Raises ``InvalidInput`` if recipe and level do not fit together.
+        """
         learners = len(level.scenario.learners)
         changes: dict[str, Any] = {"seed": seed, "total_steps": self.steps_per_learner * learners}
-        if learners == 1:  # the same training whatever the scheme of several learners
+        if learners == 1:  # the scheme has no effect with one learner
             changes |= dict.fromkeys({"scheme", "turns"} & type(recipe).model_fields.keys())
         name = recipe.name if learners == 1 else algorithm(recipe)
         folder = self.folder / "trainings" / f"{level.name}-{name}-seed{seed}"
         return TrainingJob(Training.of(recipe.replace(**changes), level.scenario), folder, self.noted)
 
     def settings(self) -> dict[str, Any]:
-        """Everything that shapes the results, as plain data."""
+        """Return all settings that affect the results as plain data: levels, recipes, numbers and the shield."""
         numbers = ("seeds", "steps_per_learner", "episodes", "list_seed", "search_episodes", "budget")
         return {
             "levels": [level.scenario.model_dump(mode="json", exclude=set(WORDS)) for level in self.levels],
@@ -185,18 +204,24 @@ class Plan:
         }
 
     def study_folder(self) -> StudyFolder:
-        """The folder, which no ablation with other settings may have: its results would be lost."""
+        """Return the object that guards the ablation's folder.
+
+        It refuses a folder with the results of an ablation with other settings.
+        """
         advice = f"give another folder (--output), or, to use its trainings, a copy of it without {SETTINGS}"
         written = (*FIGURES, *(f"ablation.{ending}" for ending in ("html", "md", "csv", "json")))
         return StudyFolder(self.folder, "an ablation", self.settings(), record=SETTINGS, advice=advice, writes=written)
 
     def optimum_folder(self, level: Level) -> Path:
-        """Where the parts of its search stand."""
+        """Return the path of the folder with the results of a level's search for the joint optimum."""
         return self.folder / "optimum" / level.name
 
 
 def with_scheme(recipe: TrainingRecipe, scheme: str | None = None) -> TrainingRecipe:
-    """The recipe with this scheme for several learners; None: its own, else shared."""
+    """Return the recipe with a scheme for several learners.
+
+    This is ``scheme``, or if it is None the recipe's own, or else ``shared``.
+    """
     return recipe.replace(scheme=scheme or recipe.scheme or "shared")
 
 
@@ -213,10 +238,19 @@ def plan_ablation(
     tell: Callable[[str], None] | None = None,
     **given: Any,
 ) -> Plan:
-    """The ablation that is asked for; ``given`` are fields of ``Plan``, None: as ``quick`` has them, or as usual.
+    """Return the plan of an ablation from the options of its command.
 
-    Raises ``InvalidInput`` for recipes of one name, numbers below 1, an unknown shield, nothing to train, and whatever
-    cannot be trained or compared.
+    Args:
+        levels: names or paths of scenarios with commas between them; None: the shipped levels.
+        recipes: names or paths of recipes with commas between them.
+        settings: settings ``KEY=VALUE`` of scenarios and recipes; None: none.
+        quick: use few seeds, worlds and decisions by default.
+        tell: called with notes about settings that do not fit together.
+        given: other fields of ``Plan``; None means the default.
+
+    Raises ``InvalidInput`` for recipes with the same name, numbers below 1, an unknown shield, levels without any
+    learner, and levels that cannot be trained or compared.
+
     """
     names = [*(LADDER if quick else STANDARD)] if levels is None else split_names(levels, os.path.isfile)
     loaded = [load_recipe(each.strip()) for each in split_names(recipes, os.path.isfile)]
@@ -243,15 +277,15 @@ def plan_ablation(
         raise InvalidInput("levels: nobody learns in any of them; give at least one with a learner")
     StudyFolder(plan.folder, "an ablation").check()
     common_worlds(plan.levels, 5, plan.list_seed)
-    list(plan.trainings())  # one that cannot be is refused
+    list(plan.trainings())  # raises InvalidInput for an impossible training
     return plan
 
 
-TOLERANCE = 1e-6  # m2/s2; a vehicle whose harm rose by more is worse off
+TOLERANCE = 1e-6  # m2/s2; a vehicle is worse off if its harm rises by more than this
 
 HARM = {"first": "first-impact harm", "total": "total harm"}
 
-FIGURES = {  # those of ``ablation_figures``, each with its title and what it shows
+FIGURES = {  # file of each figure of ``ablation_figures``: its title and its description
     "ablation.png": (
         "Harm against cooperation",
         "Both harms at each level, between full braking and the joint optimum.",

@@ -1,4 +1,4 @@
-"""The files of an ablation: tables, page, CSV and JSON."""
+"""Files of an ablation: tables, HTML page, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -26,11 +26,15 @@ from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.training.run_folder import RunDirectory
 from ethbrake_marl.training.team import load_team
 
-_MOST, _USUAL, _LEAST = 3, 2, 2  # worlds in which most, as usual and least is saved
+_MOST, _USUAL, _LEAST = 3, 2, 2  # number of example worlds with the largest, a median and the least saving
 
 
 def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
-    """A few worlds by what the last level of the ladder saves against the first, in total harm, of the first seed."""
+    """Choose example worlds to watch, by the total harm that the last level of ``measured`` saves against the first.
+
+    These are the worlds with the largest, a median and the least saving by the policies of the first seed. Levels with
+    a worse V2X channel do not count.
+    """
     ladder = [one for one in measured if one.level.clear is None]
     first, last = ladder[0], ladder[-1]
     before, after = (one.reached.world["total"][0] for one in (first, last))
@@ -49,13 +53,16 @@ def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
 
 
 def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
-    """A few worlds of the ablation to watch, level beside level; each trained level by its first seed."""
+    """Return a section of the page with episodes to watch, level beside level, in the worlds of ``choose_worlds``.
+
+    Each trained level drives with its first seed.
+    """
     played = choose_worlds(measured)
     rows = np.array([each.number for each in played], np.int64)
     driven: dict[str, tuple[int, ...]] = {}
     for level in plan.levels:
         worlds = level.scenario.sample(plan.episodes, plan.list_seed).worlds.take(rows)
-        drivers = {level.name: Team({}, level.name)}  # who drives nobody changes nothing
+        drivers = {level.name: Team({}, level.name)}  # a team without vehicles: scripts drive
         if level.scenario.learners:
             drivers = {}
             for recipe in plan.recipes:
@@ -74,9 +81,10 @@ def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
 
 
 def levels_csv(measured: Sequence[Measured], searched: int) -> str:
-    """One row per level, algorithm and seed: means over the worlds (m2/s2); without a shield its columns are empty.
+    """Return CSV text with one row per level, algorithm and seed: means over the worlds (m2/s2).
 
-    ``searched``: over the worlds in which the joint optimum was searched.
+    Columns ``searched_*`` are means over the first ``searched`` worlds, in which the joint optimum was searched.
+    Without a shield its columns are empty.
     """
     return csv_text(_seed_row(one, seed, searched) for one in measured for seed in range(len(one.reached.collided)))
 
@@ -118,14 +126,25 @@ _ALGORITHM = "Algorithm"
 
 
 def markdown(found: Json, conditions: str) -> str:
-    """All tables, with their conditions below."""
+    """Return all tables of an ablation as Markdown.
+
+    ``found`` is the content of ``ablation.json``; ``conditions`` is the text below the tables.
+    """
     blocks = [f"**{line}**" for line in found["undertrained"]]
     blocks += [text for title, sheets in _blocks(found) for text in (f"## {title}", *(s.markdown() for s in sheets))]
     return "\n\n".join([*blocks, conditions]) + "\n"
 
 
 def ablation_page(found: Json, conditions: str, figures: Mapping[str, Figure], episodes: Sequence[Section] = ()) -> str:
-    """The figures by name, sections of episodes to watch and all tables as one HTML page, with their conditions."""
+    """Return the HTML page of an ablation.
+
+    Args:
+        found: content of ``ablation.json``.
+        conditions: text about worlds, seeds and machine.
+        figures: file name -> figure.
+        episodes: sections with episodes to watch.
+
+    """
     drawn = [
         Part.drawing(figure, *FIGURES[name], alone=name == "ablation-who-pays.png", known=conditions)
         for name, figure in figures.items()
@@ -147,7 +166,7 @@ def ablation_page(found: Json, conditions: str, figures: Mapping[str, Figure], e
 
 
 def _blocks(found: Json) -> list[tuple[str, list[Sheet]]]:
-    """The tables below their titles; a cell stands where its path says: keys with blanks between."""
+    """Return the tables of an ablation in groups, each as (title, tables); ``found`` is from ``ablation.json``."""
     levels = [{**level, "level": f"`{level['level']}`"} for level in found["levels"]]
     steps, channels = (
         [{**change, "from": f"`{change['from']}`", "to": f"`{change['to']}`"} for change in found[key]]
@@ -219,7 +238,11 @@ _Columns = list[tuple[Column | str, str]]
 
 
 def _sheet(rows: Sequence[Json], columns: _Columns) -> Sheet:
-    """The table without the algorithm's column where there is only one."""
+    """Return a table with one line for each of ``rows`` (nested objects from ``ablation.json``).
+
+    A column is a pair of its heading, and the path to its value in a row: ``first harm`` leads to
+    ``row["first"]["harm"]``. The algorithm's column is left out if there is only one algorithm.
+    """
     if len({row["algorithm"] for row in rows} - {None}) == 1:
         columns = [(column, path) for column, path in columns if column != _ALGORITHM]
     cells: list[list[Any]] = []
@@ -234,7 +257,7 @@ def _sheet(rows: Sequence[Json], columns: _Columns) -> Sheet:
 
 
 def interval_words(seeds: int) -> str:
-    """What the intervals of figures over so many seeds hold for."""
+    """Return a phrase for captions about what 95 % intervals over this number of seeds cover."""
     if seeds == 1:
         return "95 % intervals for other worlds only: one seed says nothing about others"
     rough = f" (rough: {seeds} seeds)" if seeds < 3 else ""
@@ -246,7 +269,16 @@ def _share(heading: str) -> Column:
 
 
 def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> tuple[Json, list[Path]]:
-    """Write all files, replacing earlier ones: what ``ablation.json`` holds; page, Markdown and figures."""
+    """Write page, Markdown, CSV, JSON and figures of an ablation, replacing existing files.
+
+    Args:
+        plan: settings of the ablation.
+        measured: results of ``measure``.
+        machine: description of this machine, for the caption.
+
+    Returns the content of ``ablation.json``, and the paths of page, Markdown and figures.
+
+    """
     settings = {
         **plan.settings(),
         "levels": [level.name for level in plan.levels],

@@ -1,3 +1,3 @@
-"""Episodes as datasets: Parquet and Minari."""
+"""Recorded episodes as datasets: Parquet and Minari."""
 
 from ethbrake_marl.extensions.datasets.minari import write_dataset as write_dataset

@@ -1,6 +1,7 @@
-"""Episodes of one learner as a dataset of Minari, which replays to the recorded bits in the environment it recovers.
+"""Write the episodes of one learner as a Minari dataset.
 
-An episode's ``seed`` and ``options`` put its world back: ``env.reset(seed=seed, options=options)``.
+``dataset.recover_environment()`` makes the environment, and the recorded actions replay in it bit for bit. To restore
+the world of an episode: ``env.reset(seed=seed, options=options)`` with the episode's ``seed`` and ``options``.
 """
 
 from __future__ import annotations
@@ -48,16 +49,17 @@ from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
 
-DATA = "data"  # the folder of the data inside a dataset's
+DATA = "data"  # name of Minari's data folder inside the folder of a dataset
 
 _DATASET_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]*-v\d+")
 
 
 def check_folder(path: Path, *, force: bool = False) -> None:
-    """Refuse what cannot become a dataset's folder, before any work.
+    """Check, before any work, that a Minari dataset can be written to the folder ``path``.
 
-    Raises ``AlreadyExists`` for one that is there, ``InvalidInput`` for what ``force`` does not replace: it replaces
-    datasets of Minari alone.
+    ``force``: a dataset that exists there may be replaced. Raises ``AlreadyExists`` if ``path`` exists and ``force`` is
+    off. Raises ``InvalidInput`` if the name is not ``NAME-vNUMBER``, if the parent is missing or cannot be written, or
+    if ``force`` would replace something other than a Minari dataset.
     """
     if _DATASET_NAME.fullmatch(path.name) is None:
         raise InvalidInput(f"{path}: a dataset of Minari is a folder called NAME-vNUMBER, for instance brakes-v0")
@@ -78,18 +80,28 @@ def check_folder(path: Path, *, force: bool = False) -> None:
 def minari_folder(
     path: Path, task: Task, told: Mapping[str, Any], *, force: bool
 ) -> Iterator[Callable[[Recording], None]]:
-    """Give what adds recordings to the dataset, whose folder appears at ``path`` when the block ends well.
+    """Context manager: open a new Minari dataset, and yield the function that adds a recording to it.
 
-    ``told`` is read at the end, and stands in its metadata under ``KEY``, as JSON. Raises ``MissingExtra``.
+    The folder appears at ``path`` only when the block ends without an exception.
+
+    Args:
+        path: the folder, called ``NAME-vNUMBER``.
+        task: scenario, seed, reward and observation of the recordings.
+        told: metadata (``tell``), stored as JSON under the key ``ethbrake_marl``. It is read when the block ends, so
+            entries may be added until then.
+        force: replace an existing dataset.
+
+    Raises ``MissingExtra`` without minari or h5py.
+
     """
     with naming_extras():
-        import h5py  # noqa: F401  # minari's own message would name another line
+        import h5py  # noqa: F401  # imported here so that a missing h5py raises our message, not Minari's
         from minari.data_collector.episode_buffer import EpisodeBuffer
         from minari.dataset.minari_storage import MinariStorage
 
     with new_folder(path, replace=force) as partial:
         storage = MinariStorage.new(
-            partial.resolve() / DATA,  # of a relative path Minari 0.5.4 looks for its own files in the wrong place
+            partial.resolve() / DATA,  # absolute: with a relative path Minari 0.5.4 looks in the wrong folder
             observation_space=feature_box(task.observation.features),
             action_space=action_box(),
             env_spec=env_spec(task),
@@ -116,9 +128,9 @@ def minari_folder(
 
 
 def env_spec(task: Task) -> EnvSpec:
-    """What ``gymnasium.make`` makes the same environment of, of plain data alone: it survives JSON.
+    """Return the Gymnasium spec from which ``gymnasium.make`` makes the environment of a recording's task.
 
-    Raises ``InvalidInput`` unless exactly one vehicle learns.
+    The spec holds plain data only, so it survives JSON. Raises ``InvalidInput`` unless exactly one vehicle learns.
     """
     names = [task.scenario.vehicle_names[i] for i in task.scenario.learners]
     check_one_learner(
@@ -132,7 +144,7 @@ def env_spec(task: Task) -> EnvSpec:
 
 
 def _episodes(recording: Recording) -> Iterator[dict[str, Any]]:
-    """The fields of an ``EpisodeBuffer``, world by world."""
+    """Yield the keyword arguments of Minari's ``EpisodeBuffer`` for each recorded episode."""
     vehicle, seed = recording.learners[0], recording.task.seed
     infos = _infos(recording, vehicle)
     reward, terminated, truncated = (np.stack([getattr(step, name) for step in recording.steps]) for name in OF_STEPS)
@@ -150,7 +162,7 @@ def _episodes(recording: Recording) -> Iterator[dict[str, Any]]:
 
 
 def _infos(recording: Recording, vehicle: int) -> dict[str, NDArray[Any]]:
-    """The infos of the environment, [T + 1, n, ...]."""
+    """Return the infos that the environment gives to ``vehicle`` (0 = front), by name, each [T + 1, n, ...]."""
     told = {name: recording.told(name)[:, :, vehicle] for name in recording.reports[0].columns()}
     cost = np.stack([each.cost for each in recording.reports])
     news = [each.known_from_s[:, vehicle] for each in recording.reports if each.known_from_s is not None]
@@ -166,7 +178,7 @@ def _infos(recording: Recording, vehicle: int) -> dict[str, NDArray[Any]]:
     }
 
 
-BATCH = 500  # worlds recorded together: bounds memory, changes no episode
+BATCH = 500  # number of worlds recorded together; it limits memory and has no effect on the episodes
 
 DatasetFormat = Literal["parquet", "minari"]
 
@@ -175,14 +187,16 @@ _NEEDED_PACKAGES: dict[DatasetFormat, tuple[str, ...]] = {"parquet": ("pyarrow",
 
 @dataclass(frozen=True, slots=True)
 class DatasetSummary:
-    """What ``write_dataset`` wrote."""
+    """What ``write_dataset`` wrote: the file, its format, and numbers of episodes and decisions."""
 
-    path: Path
-    format: DatasetFormat
-    episodes: Mapping[str, int]  # by agent
-    decisions: int  # of all episodes
-    off_by: Mapping[str, float]  # by agent: by how much (m2/s2) rounding to actions changed a world's harm, at most
-    left_out: tuple[LeftOut, ...]  # worlds that could not be advanced
+    path: Path  # the file or folder
+    format: DatasetFormat  # ``parquet`` or ``minari``
+    episodes: Mapping[str, int]  # agent's name -> number of recorded episodes
+    decisions: int  # number of decisions in all episodes of all agents
+    # Agent's name -> largest difference (m2/s2) in a world between the harm of the recorded episode, whose actions are
+    # rounded to float32, and the harm with the agent's exact commands.
+    off_by: Mapping[str, float]
+    left_out: tuple[LeftOut, ...]  # worlds that were not recorded, because the physics could not advance them
 
 
 def write_dataset(
@@ -198,25 +212,26 @@ def write_dataset(
     force: bool = False,
     on_progress: Callable[[str, int], None] | None = None,
 ) -> DatasetSummary:
-    """Record agents, each in the same worlds of a list, as a Parquet file or as a dataset of Minari.
+    """Record agents in the same worlds of an evaluation list, as a Parquet file or a Minari dataset.
 
-    The recorded actions replay to the recorded bits; docs/datasets.md says what is in it.
+    An environment that takes the recorded actions repeats the episodes bit for bit. docs/datasets.md describes the
+    content.
 
     Args:
-        path: the file (``.parquet``), or the folder (``NAME-v0``) to write.
-        agents: specs as on the command line, or name -> agent, or team, that drives the scenario's learners; they are
-            left as they are.
-        scenario: whose worlds are driven in, also by name or path.
-        episodes: worlds of the list, from its first one on.
-        seed: of the list.
-        format: ``parquet`` or ``minari``; None: as the path's ending says.
-        reward: what a learner is rewarded with.
-        observation: what a learner observes; None: ``observation_for(scenario)``.
-        force: replace a dataset that is there.
-        on_progress: is called with an agent's name and its worlds done so far.
+        path: the file (``.parquet``) or the folder (``NAME-v0``) to write.
+        agents: agent specs as on the command line, or a mapping from name to agent or team. They control the scenario's
+            learners. They are not changed.
+        scenario: the scenario, its name or its path.
+        episodes: number of worlds, from the first one of the list.
+        seed: seed of the list of worlds.
+        format: ``parquet`` or ``minari``; None: chosen by the ending of ``path``.
+        reward: the reward to record.
+        observation: the observation to record; None: ``observation_for(scenario)``.
+        force: replace an existing dataset.
+        on_progress: called with the name of an agent and the number of its worlds done so far.
 
-    Raises ``InvalidInput``, ``AlreadyExists`` and ``MissingExtra`` before the work, ``PhysicsError`` where no world is
-    left.
+    Raises ``InvalidInput``, ``AlreadyExists`` and ``MissingExtra`` before the work begins, and ``PhysicsError`` if no
+    world could be recorded.
 
     """
     check_whole_number("write_dataset: episodes", episodes, 1)
@@ -263,7 +278,11 @@ def write_dataset(
 def check_dataset(
     path: str | Path, scenario: Scenario, format: str | None = None, *, force: bool = False
 ) -> DatasetFormat:
-    """The format of a dataset that can be written to ``path``; raises as ``write_dataset`` does before its work."""
+    """Check that a dataset of this scenario can be written to ``path``, and return its format.
+
+    ``format`` None: chosen by the ending of ``path``. ``force``: an existing dataset may be replaced. Raises the
+    exceptions that ``write_dataset`` raises before its work begins.
+    """
     target = Path(path)
     is_file = target.suffix.lower() == ".parquet"
     chosen: Any = format if format is not None else "parquet" if is_file else "minari"
@@ -283,11 +302,18 @@ def check_dataset(
     else:
         env_spec(Task(scenario, LIST_SEED, reward_params("harm"), observation_for(scenario)))
         check_folder(target, force=force)
-    return chosen  # type: ignore[no-any-return]  # one of them
+    return chosen  # type: ignore[no-any-return]  # a DatasetFormat: checked above
 
 
 def tell(task: Task, agents: Mapping[str, Driver], episodes: int) -> dict[str, Any]:
-    """What is recorded, as plain data: the metadata of every dataset."""
+    """Return the metadata of a dataset as plain data: scenario, seed, agents, observation, reward and versions.
+
+    Args:
+        task: scenario, seed, reward and observation of the recordings.
+        agents: recorded agents by name.
+        episodes: number of worlds that each agent drives.
+
+    """
     scenario = task.scenario
     teams = {name: Team.of(driver, scenario.learners).drivers for name, driver in agents.items()}
     return {

@@ -1,4 +1,4 @@
-"""Episodes as a Parquet file: one row per agent, world and decision, one row group per batch of worlds."""
+"""Write episodes as a Parquet file: one row per agent, world and decision; one row group per batch of worlds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ethbrake_marl.errors import naming_extras
 from ethbrake_marl.extensions.datasets.recording import Recording
 from ethbrake_marl.files.sheet import parquet_file
 
-KEY = "ethbrake_marl"  # of the file's metadata: what was recorded, as JSON
+KEY = "ethbrake_marl"  # key in the file's metadata whose value describes the recording, as JSON
 
 Columns = dict[str, NDArray[Any]]
 
@@ -24,9 +24,17 @@ OF_STEPS = ("reward", "terminated", "truncated")
 
 @contextmanager
 def parquet_dataset(path: Path, told: Mapping[str, Any]) -> Iterator[Callable[[Recording], None]]:
-    """Give what adds recordings to the file, which appears at ``path`` when the block ends well.
+    """Context manager: open a new Parquet file, and yield the function that adds a recording to it.
 
-    ``told`` is read at the end, and stands in the file's metadata under ``KEY``. Raises ``MissingExtra``.
+    The file appears at ``path`` only when the block ends without an exception.
+
+    Args:
+        path: the file.
+        told: metadata (``tell``), stored as JSON under the key ``ethbrake_marl``. It is read when the block ends, so
+            entries may be added until then.
+
+    Raises ``MissingExtra`` without pyarrow.
+
     """
     with naming_extras():
         import pyarrow
@@ -41,16 +49,19 @@ def parquet_dataset(path: Path, told: Mapping[str, Any]) -> Iterator[Callable[[R
 
 
 def decision_columns(recording: Recording) -> Columns:
-    """One entry per decision, world by world; docs/datasets.md lists the columns."""
+    """Return a recording as table columns by name, one row per decision, world by world.
+
+    docs/datasets.md lists the columns.
+    """
     running = recording.running
     before = recording.told
 
     def each(values: NDArray[Any]) -> NDArray[Any]:
-        """Values [T or T + 1, n, ...], of each decision's begin, decision by decision."""
+        """Return values [T or T + 1, n, ...] as one row per decision that was made, world by world."""
         return values[: running.shape[1]].swapaxes(0, 1)[running]
 
     def whole(values: NDArray[Any]) -> NDArray[Any]:
-        """A value of each episode [n] in all of its rows."""
+        """Return ``values`` [n], one per episode, repeated in every row (decision) of the episode."""
         return np.repeat(values, recording.decisions)
 
     in_force, chosen = before("command_in_force_mps2"), before("chosen_command_mps2")[1:]

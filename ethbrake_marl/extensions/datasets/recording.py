@@ -1,10 +1,11 @@
-"""Episodes as a learner of any interface meets them, with the actions that an agent chose.
+"""Record episodes as a learner of the environment would experience them, with an agent's actions.
 
-An agent drives as in an evaluation, where its commands (float64, m/s2) are applied as they are. A learner's action is
-a float32 in [-1, 1], of which most commands are no exact image. So each command is rounded to an action, and those
-actions are played from the alert on: what is recorded is that second episode, and so it replays to the same bits. On
-the edge of an impact a last bit decides about it: of the roundings to the nearest, downwards and upwards, each world
-gets the one whose harm is nearest to that of the commands.
+In an evaluation an agent's commands (float64, m/s2) are applied unchanged. A learner's action is a float32 in [-1, 1],
+and most commands have no exact float32 action. Recording therefore takes two episodes: the agent controls the first,
+its commands are rounded to actions, and the second plays these actions from the alert. The second episode is recorded,
+so its actions replay bit for bit. At the edge of an impact the last bit decides whether the impact happens. So if the
+nearest action changes a world's harm, rounding down and rounding up are tried too, and each world keeps the rounding
+whose harm is nearest to that of the commands.
 """
 
 from __future__ import annotations
@@ -33,55 +34,60 @@ from ethbrake_marl.scenario.schema import Scenario
 
 Float32s = NDArray[np.float32]
 
-SLACK = 1e-6  # m2/s2; a smaller difference of harm is not worth another rounding
+SLACK = 1e-6  # m2/s2; no other rounding is tried for a smaller difference of harm
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What is recorded: the scenario, whose learners are driven, the list of its worlds, and what a learner is told."""
+    """What is recorded: scenario, seed of the worlds, reward and observation."""
 
-    scenario: Scenario
-    seed: int  # of the list of worlds
-    reward: RewardParams
-    observation: ObservationSpec
+    scenario: Scenario  # scenario of the worlds, whose learners are recorded
+    seed: int  # seed from which the worlds are drawn
+    reward: RewardParams  # reward that the learners receive
+    observation: ObservationSpec  # features that each learner observes
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Episodes of n worlds; T is the longest one's number of decisions, what stands behind an episode's end is void."""
+    """Recorded episodes of ``n`` worlds.
 
-    agent: str
-    task: Task
-    index: Ints  # [n] numbers of the worlds in their list
-    decisions: Ints  # [n] of each episode
-    observations: Float32s  # [T + 1, n, L, F], the last one at the end of the episode
-    actions: Float32s  # [T, n, L]
-    steps: tuple[Step, ...]  # T
-    reports: tuple[Report, ...]  # T + 1; ``reports[t + 1]`` tells what step t brought
-    positions_m: Floats  # [T + 1, n, N] front bumpers along the road; Vehicle 1 is at 0 at the alert
-    speeds_mps: Floats  # [T + 1, n, N]
-    ledger: Ledger  # [n] harm of the episodes
-    off_by: (
-        float  # largest difference (m2/s2) of a world's harm from that of the commands as they were, before rounding
-    )
+    ``T`` is the number of decisions in the longest episode, ``L`` the number of learners, ``F`` the number of observed
+    features. Values after the end of an episode are meaningless.
+    """
+
+    agent: str  # name of the agent
+    task: Task  # scenario, seed, reward and observation
+    index: Ints  # [n] number of each world in the list of the seed
+    decisions: Ints  # [n] number of decisions of each episode
+    observations: Float32s  # [T + 1, n, L, F] observations at each decision, then at the end of the episode
+    actions: Float32s  # [T, n, L] actions in [-1, 1]
+    steps: tuple[Step, ...]  # T results of ``Engine.step``, with rewards and ends of episodes
+    reports: tuple[Report, ...]  # T + 1 sets of infos; ``reports[t + 1]`` is after step t, ``reports[0]`` at the alert
+    positions_m: Floats  # [T + 1, n, N] positions of the front bumpers; Vehicle 1 is at 0 at the alert
+    speeds_mps: Floats  # [T + 1, n, N] speeds
+    ledger: Ledger  # harm of all impacts of each episode
+    off_by: float  # largest change of a world's harm because commands were rounded to float32 actions (m2/s2)
 
     @property
     def learners(self) -> tuple[int, ...]:
-        """Indices of the driven vehicles."""
+        """Indices (0 = front) of the L recorded learners."""
         return self.task.scenario.learners
 
     @cached_property
     def running(self) -> Bools:
-        """[n, T] where a decision was made."""
+        """Whether each decision was made before the end of its episode, [n, T] bool."""
         mask: Bools = np.arange(len(self.steps)) < self.decisions[:, np.newaxis]
         return mask
 
     def told(self, column: str) -> Floats:
-        """A column of the infos of every vehicle, [T + 1, n, N]."""
+        """Return the column of the environment's infos with this name, such as ``time_s``, [T + 1, n, N]."""
         return np.stack([each.columns()[column] for each in self.reports])
 
     def terms(self) -> dict[str, Floats]:
-        """Each term of the reward, before its weight, after every step: [T + 1, n, L]; row 0 is 0."""
+        """Return each term of the reward, without its weight, by name: [T + 1, n, L].
+
+        Entry t + 1 belongs to step t; entry 0 is 0.
+        """
         shape = (len(self.index), self.task.scenario.vehicles)
         found = {}
         for name in self.reports[0].terms:
@@ -92,9 +98,18 @@ class Recording:
 
 
 def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Recording:
-    """Let ``driver`` drive the scenario's learners through these worlds, and record the episodes of its actions.
+    """Let an agent control the scenario's learners in these worlds, and record the episodes.
 
-    Raises ``PhysicsError`` naming worlds that could not be advanced, and what ``episode_engine`` raises.
+    The agent's commands are rounded to float32 actions; the recorded episodes are those with the rounded actions.
+
+    Args:
+        sample: the worlds at the alert.
+        driver: agent or team.
+        name: name of the agent in the recording.
+        task: scenario, seed, reward and observation to record.
+
+    Raises ``PhysicsError`` with the worlds that could not be advanced, and whatever ``episode_engine`` raises.
+
     """
     scenario, learners = task.scenario, task.scenario.learners
     engine = episode_engine(sample.worlds, Team.of(driver, learners), scenario)
@@ -107,7 +122,7 @@ def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Re
     actions, off_by = _rounded(np.stack(asked), sample.worlds, engine.ledger, task)
     engine = _learners_engine(sample.worlds, task)
     steps: list[Step] = []
-    front, before = ShovedFront(sample.worlds, np.zeros(sample.worlds.n)), sample.worlds  # worlds know gaps, no places
+    front, before = ShovedFront(sample.worlds, np.zeros(sample.worlds.n)), sample.worlds  # Worlds has no positions
     observations, reports, positions, speeds = [], [], [], []
     decisions = np.zeros(engine.n, np.int64)
     while True:
@@ -131,7 +146,17 @@ def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Re
 
 
 def _rounded(commanded: Floats, worlds: Worlds, evaluated: Ledger, task: Task) -> tuple[Float32s, Floats]:
-    """The actions [T, n, L] to play, and by how much their harm differs from the evaluated one, [n] m2/s2."""
+    """Round commands to float32 actions so that harm changes least.
+
+    Args:
+        commanded: [T, n, L] commands as exact actions in [-1, 1] (float64).
+        worlds: the worlds at the alert.
+        evaluated: harm of the episodes with the exact commands.
+        task: scenario, seed, reward and observation.
+
+    Returns the rounded actions [T, n, L], and how much they change the harm of each world, [n] m2/s2.
+
+    """
     nearest = commanded.astype(np.float32)
     best, off_by = nearest.copy(), _off_by(nearest, worlds, evaluated, task)
     rows = np.flatnonzero(off_by > SLACK)
@@ -146,7 +171,10 @@ def _rounded(commanded: Floats, worlds: Worlds, evaluated: Ledger, task: Task) -
 
 
 def _off_by(actions: Float32s, worlds: Worlds, evaluated: Ledger, task: Task) -> Floats:
-    """By how much the harm of these actions differs from the evaluated one, the larger of both counts, [n] m2/s2."""
+    """Return how much these actions [T, n, L] change the ``evaluated`` harm of each world, [n] m2/s2.
+
+    It is the larger change of first-impact and total harm.
+    """
     engine = _learners_engine(worlds, task)
     step = 0
     while not engine.ended.all():
@@ -159,7 +187,10 @@ def _off_by(actions: Float32s, worlds: Worlds, evaluated: Ledger, task: Task) ->
 
 
 def _learners_engine(worlds: Worlds, task: Task) -> Engine:
-    """An engine over worlds at the alert, as an interface has it: the learners take actions."""
+    """Return an engine at the alert of ``worlds`` in which the learners take actions, as in an environment.
+
+    Scenario, reward, observation and seed are those of ``task``.
+    """
     engine = Engine(
         task.scenario,
         worlds.n,

@@ -1,1 +1,1 @@
-"""Controllers that the field compares with: IDM, ACC, RSS, UN R157, AEB."""
+"""Controllers from the literature to compare with: IDM, ACC, RSS, UN R157, AEB."""

@@ -1,6 +1,7 @@
-"""Controllers that the field compares with: car-following laws, drivers of UN R157, emergency braking.
+"""Controllers from the literature: car-following models, the driver models of UN R157, emergency braking.
 
-Each is one entry of ``LAWS``: a formula of the vehicle ahead alone, its parameters and its source.
+``LAWS`` lists them. A *law* is a formula that depends only on the vehicle itself and on the vehicle ahead, with its
+parameters and its source.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Source
-from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.extensions.certified.estimated import Told
@@ -21,13 +22,13 @@ from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.physics.state import Bools, Floats, Worlds
 from ethbrake_marl.registry import Part
 
-_TOUCHING_M = 1e-6  # a gap below this counts as this: laws divide by it
+_TOUCHING_M = 1e-6  # smallest gap that a law sees, because laws divide by the gap
 
-_SAME_S = 1e-9  # what rounding may take from a time that has elapsed
+_SAME_S = 1e-9  # tolerance for rounding in an elapsed time
 
 
 class Parameters:
-    """Those of one law by name, SI units."""
+    """Parameters of one law (a controller's formula) as attributes, in SI units; ``LAWS`` lists their names."""
 
     def __init__(self, **values: float) -> None:
         self.__dict__.update(values)
@@ -37,22 +38,22 @@ class Parameters:
 
 
 class Seen(NamedTuple):
-    """What one vehicle was told of the vehicle ahead, by sensors or messages, in n worlds, each [n].
+    """What one vehicle knows about the vehicle ahead in ``n`` worlds, by sensors or messages; each field is [n].
 
-    News that are old are moved on with the command of then. Ahead of Vehicle 1 is the obstacle, or nothing; so it is of
-    a vehicle that was told nothing.
+    Old information is extrapolated with the acceleration that it reported. Ahead of Vehicle 1 is the obstacle, if there
+    is one. Without an obstacle, and for a vehicle that has received nothing, the road ahead is free.
     """
 
-    gap_m: Floats  # to what is ahead; infinite: to nothing
-    speed_mps: Floats
-    front_mps: Floats  # speed of what is ahead
-    front_mps2: Floats  # its acceleration in force
-    own_mps2: Floats
-    step_s: float  # to the next decision
+    gap_m: Floats  # [n] gap to the vehicle or obstacle ahead; infinite if nothing is ahead
+    speed_mps: Floats  # [n] own speed
+    front_mps: Floats  # [n] speed of the vehicle or obstacle ahead
+    front_mps2: Floats  # [n] present commanded acceleration of the vehicle ahead
+    own_mps2: Floats  # [n] own present commanded acceleration
+    step_s: float  # time until the next decision (s)
 
     @classmethod
     def of(cls, worlds: Worlds, vehicle: int, step_s: float) -> Seen:
-        """In these worlds, by ``vehicle`` (0 = front)."""
+        """Return what ``vehicle`` (0 = front) knows in these worlds; ``step_s`` is the time between decisions (s)."""
         told, own, none = Told.to(worlds, vehicle), worlds.command_mps2[:, vehicle], np.zeros(worlds.n)
         gap, front, force = told.obstacle_m, none, none
         if vehicle:
@@ -66,22 +67,26 @@ class Seen(NamedTuple):
 
     @property
     def closing_mps(self) -> Floats:
-        """How fast the gap closes."""
+        """Speed at which the gap closes, [n]; negative if it opens."""
         return self.speed_mps - self.front_mps
 
     @property
     def until_contact_s(self) -> Floats:
-        """Time to collision at these speeds; infinite where the gap does not close."""
+        """Time to contact at the present speeds, [n]; infinite where the gap does not close."""
         closing = self.closing_mps
         return np.where(closing > 0.0, self.gap_m / np.where(closing > 0.0, closing, 1.0), np.inf)
 
     @property
     def headway_s(self) -> Floats:
-        """Gap over speed; infinite of a vehicle that does not move forward."""
+        """Gap divided by the own speed, [n]; infinite where the vehicle does not move forward."""
         return np.where(self.speed_mps > 0.0, self.gap_m / np.where(self.speed_mps > 0.0, self.speed_mps, 1.0), np.inf)
 
     def built_up(self, wanted_mps2: Floats, rate_mps3: float) -> Floats:
-        """The command of this decision on the way to ``wanted_mps2``, whose braking grows by at most this rate."""
+        """Return the command [n] (m/s2) for the next time step, if braking can only build up gradually.
+
+        It is ``wanted_mps2`` [n], but the deceleration exceeds the vehicle's present one by at most ``rate_mps3`` times
+        the time step.
+        """
         return np.maximum(wanted_mps2, np.minimum(self.own_mps2, 0.0) - rate_mps3 * self.step_s)
 
 
@@ -130,13 +135,17 @@ def _human_notices(seen: Seen, p: Parameters) -> Bools:
 
 
 def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
-    """0 beyond the safe distance, 1 within the unsafe one, linear between."""
+    """Return a fuzzy degree of danger [n]: 0 beyond the safe distance, 1 within the unsafe one, linear between."""
     between = (safe - distance) / np.where(safe > unsafe, safe - unsafe, 1.0)
     return np.where(distance > safe, 0.0, np.where(distance < unsafe, 1.0, between))
 
 
 def fuzzy(seen: Seen, p: Parameters) -> tuple[Floats, Floats]:
-    """The proactive and the critical fuzzy criterion of the fuzzy safety model, each [n] from 0 to 1."""
+    """Return the proactive and the critical criterion of the fuzzy safety model of UN R157, each [n] from 0 to 1.
+
+    0 means no danger, 1 full danger. ``seen`` is what the vehicle knows about the one ahead, and ``p`` the parameters
+    of the law ``r157_fsm``.
+    """
     speed, front = np.maximum(seen.speed_mps, 0.0), np.maximum(seen.front_mps, 0.0)
     ahead, reacting = np.square(front) / (2.0 * p.b_front), speed * p.reaction
     proactive = _share(
@@ -148,7 +157,7 @@ def fuzzy(seen: Seen, p: Parameters) -> tuple[Floats, Floats]:
     after = speed + p.reaction * own - front
     way = (speed + 0.5 * own * p.reaction - front) * p.reaction
     critical = _share(seen.gap_m, way + np.square(after) / (2.0 * p.b_min), way + np.square(after) / (2.0 * p.b_max))
-    slows = (after < 0.0) & (own < 0.0)  # it is slower than its front one once it has reacted
+    slows = (after < 0.0) & (own < 0.0)  # slower than the vehicle ahead after the reaction time
     until = np.square(speed - front) / (2.0 * np.where(slows, -seen.own_mps2, 1.0))
     critical = np.where(slows, np.where(seen.gap_m < until, 1.0, 0.0), critical)
     return proactive, np.where(speed > front, critical, 0.0)
@@ -172,20 +181,22 @@ def _aeb(seen: Seen, p: Parameters) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """One controller: the acceleration that it calls for, [n] m/s2, from what is seen and its parameters."""
+    """One controller from the literature: a formula for the acceleration, its parameters and its source."""
 
-    about: str
-    source: str
-    parameters: Mapping[str, float]  # SI units
-    command: Callable[[Seen, Parameters], Floats]
-    notices: Callable[[Seen, Parameters], Bools] | None = None  # what it reacts to; None: it acts at once
-    stays: bool = False  # with what it has begun, though what it noticed is over
+    about: str  # name of the controller, for lists
+    source: str  # publication
+    parameters: Mapping[str, float]  # default value of each parameter, in SI units
+    command: Callable[[Seen, Parameters], Floats]  # formula that returns the acceleration, [n] m/s2
+    # Formula that returns for each world whether the law sees a danger, [n] bool; None: it acts from the start.
+    notices: Callable[[Seen, Parameters], Bools] | None = None
+    stays: bool = False  # whether the reaction continues after the danger is over
+    # Names of parameters that may be 0; all others must be above 0.
     may_be_zero: frozenset[str] = field(default=frozenset({"T", "s0", "rho", "reaction", "perception", "release"}))
 
 
 _MOST = 0.774 * 9.81  # m/s2
 
-_FREE = {"free": 2.0, "speed": 0.4, "v0": 33.3}  # beyond this headway the speed v0 is kept
+_FREE = {"free": 2.0, "speed": 0.4, "v0": 33.3}  # speed control to v0 beyond the headway `free` (s)
 
 LAWS: dict[str, Law] = {
     "idm": Law(
@@ -222,24 +233,39 @@ LAWS: dict[str, Law] = {
 
 
 class Controller:
-    """A vehicle that follows a ``Law``; what it remembers is since when it has noticed, [n] s.
+    """Agent that follows a ``Law``, a controller's formula from the literature.
 
-    A reaction counts from the decision at which it notices; what it notices at its first one it has seen since the
-    alert, so reaction and latency run side by side. The human stays with what it has begun; the
-    fuzzy model begins anew when what it noticed is over.
+    Its memory is the time at which it noticed the danger, [n] s; infinite: no danger yet; NaN: before its first
+    decision.
+
+    The reaction time runs from the decision at which the controller notices the danger. A danger that exists at the
+    first decision counts as noticed at the alert, so reaction time and latency overlap. If
+    ``law.stays``, a reaction that has begun goes on after the danger is over (law ``r157_human``); else the controller
+    waits for the next danger (law ``r157_fsm``).
+
+    Args:
+        name: spec of the agent.
+        law: the formula.
+        parameters: value of each of the law's parameters.
+        step_s: time between two decisions (s).
+
     """
 
-    knows = Source.MESSAGES
+    knows = Source.MESSAGES  # it decides from the messages that have reached it
 
     def __init__(self, name: str, law: Law, parameters: Mapping[str, float], step_s: float) -> None:
         self.name, self.law, self.parameters, self.time_step_s = name, law, Parameters(**parameters), step_s
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Floats:
-        """Nothing was looked at yet: NaN."""
+        """Return the initial memory [n]: NaN, because no decision was made yet. The arguments only give n."""
         return np.full(alert.n, np.nan)
 
     def act(self, worlds: Worlds, memory: Floats, vehicle: int) -> tuple[Floats, Floats]:
-        """What the law calls for within the capacities, [n] m/s2."""
+        """Return the command of the law within the vehicle's capacities, [n] m/s2, and the new memory [n].
+
+        ``memory`` is the new memory of the last call, or that of ``begin``; ``vehicle`` is this vehicle's index (0 =
+        front).
+        """
         seen, p, vehicles = Seen.of(worlds, vehicle, self.time_step_s), self.parameters, worlds.vehicles
         command = self.law.command(seen, p)
         if self.law.notices is not None:
@@ -255,9 +281,16 @@ class Controller:
 
 
 def make_controller(argument: str | None, settings: AgentSettings) -> Controller:
-    """The controller of that name; ``argument`` gives parameters, ``T=1.0`` or ``T=1.0:a=2``.
+    """Return the controller of a spec such as ``idm:T=1.0``.
 
-    Raises ``UnknownName`` for a parameter that the law has not, ``InvalidInput`` for one that is not a number in range.
+    Args:
+        argument: the part of the spec after the name, which sets parameters: ``T=1.0`` or ``T=1.0:a=2``; None: all
+            parameters have their default values.
+        settings: the whole spec, and the scenario's time step.
+
+    Raises ``UnknownName`` for a parameter that the law does not have, and ``InvalidInput`` for a value that is not a
+    number in range.
+
     """
     name = settings.spec.partition(":")[0]
     law, where = LAWS[name], f"agent {settings.spec!r}"
@@ -302,4 +335,4 @@ R157_FSM = Part(
 
 AEB = Part(make_controller, form="aeb[:ttc=1.5]", about="automatic emergency braking", knows=Source.MESSAGES)
 
-FIELD = ("idm", "acc", "cacc", "rss", "r157_human", "r157_fsm", "aeb")  # behind ``--agents field``
+FIELD = ("idm", "acc", "cacc", "rss", "r157_human", "r157_fsm", "aeb")  # the agents of ``--agents field``

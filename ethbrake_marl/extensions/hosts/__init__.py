@@ -1,4 +1,4 @@
-"""Driving worlds that another simulator moves; SUMO."""
+"""Hosts: agents drive vehicles that another simulator moves, for instance SUMO."""
 
 from ethbrake_marl.extensions.hosts.protocol import (
     Host as Host,

@@ -1,13 +1,15 @@
-"""Driving worlds that somebody else moves: a simulator, or a test bench; and SUMO as one.
+"""Let agents drive vehicles that a *host* moves: another simulator or a test bench.
 
-A host only moves vehicles. Decisions and their grid, latencies, holding at rest, impacts and the ledger are ours:
+The host only moves vehicles. This package makes the decisions on their time grid, applies latencies, holds vehicles at
+rest, resolves impacts and keeps the ledger of harm. Every step has three parts:
 
-1. *Decide.* Who decides now is asked on the state that the host told, behind the shield where there is one.
-2. *Move.* The host gets one command, and moves for one step.
-3. *Meet.* Pairs that touch and close by then exchange velocity, unless the host has an impact law of its own and
-   tells what happened.
+1. *Decide.* Agents whose decision is due act on the state that the host reported, behind the shield if there is one.
+2. *Move.* The host receives one command and moves for one step.
+3. *Meet.* Pairs that overlap and still close exchange velocity, unless the host resolves impacts itself and reports
+   them.
 
-A latency is rounded up to whole steps of the host, and everybody is told so: no decision falls between two steps.
+Latencies are rounded up to whole steps of the host, and agents know the rounded value, so no decision falls between two
+steps.
 """
 
 from __future__ import annotations
@@ -45,21 +47,22 @@ from ethbrake_marl.physics.paper_map import held_speeds
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Vehicles, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.step import StepShield
 
-STANDS_MPS = 1e-3  # a vehicle that a host with steps of its own moves more slowly stands
+STANDS_MPS = 1e-3  # below this speed a vehicle of a host with a fixed step counts as standing
 
-STARTS_WITHIN = 0.01  # m, m/s: how far the first state may be from the worlds that the host was set up with
+STARTS_WITHIN = 0.01  # m, m/s: tolerance between the host's first state and the worlds it was set up with
 
-READ_WITHIN = 0.2  # m, m/s: how far a change between two states may be misread
+READ_WITHIN = 0.2  # m, m/s: tolerance for a change between two states
 
-# how a host's vehicles may follow commands: late by so much, and off by so much and by this share of the command
+# tolerances for following a command: delay, constant error, and error as a share of the command
 LAG_S, OFF_MPS2, OFF_SHARE = 0.5, 0.5, 0.2
 
-SNAP = 1e-6  # of a step: moments so close are one
+SNAP = 1e-6  # times closer than this share of a step count as equal
 
 
 class HostState(NamedTuple):
-    """What a host tells of its ``n`` lines of ``N`` vehicles, front to rear.
+    """State that a host (another simulator or a test bench) reports of its ``n`` lines of ``N`` vehicles.
 
     >>> import ethbrake_marl as eb
 
@@ -69,14 +72,14 @@ class HostState(NamedTuple):
 
     """
 
-    time_s: ArrayLike  # by its own clock, which may begin anywhere, to [n]
+    time_s: ArrayLike  # a number or [n]: time on the host's own clock, which may start anywhere
     gaps_m: ArrayLike  # [n, N - 1] bumper to bumper; below 0 where bodies overlap
-    speeds_mps: ArrayLike  # [n, N]
-    impacts: Impacts | None = None  # of a host with an impact law of its own: those since its last state
+    speeds_mps: ArrayLike  # [n, N] speed of each vehicle, front to rear
+    impacts: Impacts | None = None  # impacts since the last state, if the host resolves impacts itself
 
 
 class HostCommand(NamedTuple):
-    """What a host is to do in one step.
+    """Command to a host (the simulator that moves the vehicles) for one step.
 
     >>> import ethbrake_marl as eb
 
@@ -86,17 +89,19 @@ class HostCommand(NamedTuple):
 
     """
 
-    acceleration_mps2: Floats  # [n, N] to hold: 0 before the latency, and no more than leads to rest or the speed limit
-    speeds_mps: Floats  # [n, N] with which the step begins: those it told, but where vehicles have met
-    wanted_mps2: Floats  # [n, N] what was decided, for a host that holds at rest and keeps latencies by itself
-    until_s: Floats  # [n] when the step ends, since the alert
+    acceleration_mps2: Floats  # [n, N] acceleration over the step, with latency, rest and speed limit applied
+    speeds_mps: Floats  # [n, N] speeds at the start of the step: the reported ones, or others after an impact
+    wanted_mps2: Floats  # [n, N] acceleration that agents decided, for a host that handles rest and latencies itself
+    until_s: Floats  # [n] time since the alert at which the step ends
 
 
 class Host(Protocol):
-    """Somebody else's ``n`` lines of vehicles, at the alert.
+    """Interface of a host, a simulator that moves ``n`` lines of vehicles, one line per world, from the alert on.
 
-    ``dt``: the length of its steps (s), all alike. With ``math.inf`` each world moves to its own ``command.until_s``,
-    the next decision there, and one whose time that is already stays as it is.
+    A host needs the attribute ``dt`` and the methods ``state`` and ``apply``; it need not inherit from this class.
+
+    ``dt`` is the length of every step (s). With ``math.inf`` each world moves to its own ``command.until_s``, the time
+    of its next decision; a world that is already there does not move.
 
     >>> import ethbrake_marl as eb
 
@@ -121,14 +126,16 @@ class Host(Protocol):
     dt: float
 
     def state(self) -> HostState:
-        """What its vehicles do now."""
+        """Return the present time, gaps and speeds, and impacts since the last call if the host reports impacts."""
 
     def apply(self, command: HostCommand) -> None:
-        """Move on by one step."""
+        """Move all vehicles by one step, as ``command`` says."""
 
 
 class HostFailed(EthBrakeError):
-    """A host raised, or told what cannot be; ``ledger`` and ``worlds`` keep what had happened by then.
+    """Raised if a host raises an exception or reports an impossible state.
+
+    Its attributes ``ledger`` and ``worlds`` hold the harm and the last valid state; ``reason`` is the message.
 
     >>> import ethbrake_marl as eb
 
@@ -144,32 +151,34 @@ class HostFailed(EthBrakeError):
 
 
 class Hosted(NamedTuple):
-    """What an agent achieved in a host."""
+    """Result of an agent that drove vehicles in a host (another simulator)."""
 
-    outcome: Outcome
-    # [n] the host did what the shield did not foretell: nothing is promised there; None: no mode step or robust, which
-    # alone compare
+    outcome: Outcome  # harm and final state of each world
+    # [n] whether the host moved otherwise than the shield predicted, so that the shield's bound does not hold. None
+    # without a shield of mode step or robust, because only these compare their prediction with the host.
     distrusted: Bools | None
 
     @classmethod
     def join(cls, parts: list[Hosted]) -> Hosted:
-        """One from those of consecutive worlds."""
+        """Join the results of consecutive batches of worlds, in their order, into one result."""
         distrusted = [part.distrusted for part in parts if part.distrusted is not None]
         outcome = Outcome.join([part.outcome for part in parts])
         return cls(outcome, np.concatenate(distrusted) if distrusted else None)
 
 
 def drive_host(host: Host, agent: Driver, scenario: str | Path | Scenario, worlds: Worlds) -> Hosted:
-    """Let an agent, or a team, drive the scenario's learners in a host, from the alert to the end of every episode.
+    """Let an agent or a team control the scenario's learners in a host, from the alert to the end of every episode.
 
     Args:
-        host: at the alert.
-        agent: drives each learner, as ``make_agent`` makes it, with or without a shield; it is left as it is.
-        scenario: its scripts drive the other vehicles, and every agent is told of them.
-        worlds: at the alert, as the host was set up with them: it is asked for gaps and speeds, not for the rest.
+        host: the host, at the alert.
+        agent: agent or team for the learners, as returned by ``make_agent``, with or without a shield. It is not
+            changed.
+        scenario: the scenario; its scripts control the other vehicles, and agents know these scripts.
+        worlds: the worlds at the alert with which the host was set up. Only gaps and speeds are read from the host.
 
-    Gives the ``outcome``, and where a shield ``distrusted`` the host. Raises ``InvalidInput`` for what does not go with
-    a host, ``HostFailed`` for one that raises or tells what cannot be.
+    Returns the outcome, and the worlds in which the host moved otherwise than a shield predicted. Raises
+    ``InvalidInput`` for a scenario, agent or worlds that a host does not support, and ``HostFailed`` if the host raises
+    or reports an impossible state.
 
     """
     scenario = load_scenario(scenario)
@@ -184,7 +193,16 @@ def drive_host(host: Host, agent: Driver, scenario: str | Path | Scenario, world
 
 
 class _Grid:
-    """Who decides together, at ``first_s`` [n] and every time step from then on; ``made`` [n] decisions so far."""
+    """Decision times of vehicles that decide together: a first time in each world, and every time step after it.
+
+    ``made`` [n] counts the decisions so far, ``all`` [n] the decisions until the horizon.
+
+    Args:
+        first_s: [n] time of the first decision.
+        vehicles: indices (0 = front) of the vehicles.
+        scenario: scenario, for time step and horizon.
+
+    """
 
     def __init__(self, first_s: Floats, vehicles: list[int], scenario: Scenario) -> None:
         self.decisions, self.horizon_s = Decisions(first_s, scenario.time_step_s), scenario.horizon_s
@@ -193,16 +211,19 @@ class _Grid:
 
     @property
     def next_s(self) -> Floats:
-        """Time of the next decision; of none any more, the horizon."""
+        """Time of the next decision in each world, [n] s; after the last decision, the horizon."""
         return np.where(self.made < self.all, self.decisions.at(self.made), self.horizon_s)
 
     def is_due(self, time_s: Floats) -> Bools:
-        """Where the next decision, or the end, has come."""
+        """Return whether the next decision, or the horizon, is due at the times ``time_s`` [n], as [n] bool."""
         return self.next_s <= time_s + ROUNDING * self.decisions.time_step_s
 
 
 class _Run:
-    """The worlds of a host while they run."""
+    """Running episodes in a host: decisions, latencies, impacts and harm, around the host's steps.
+
+    The arguments are those of ``drive_host``; ``team`` holds the agent of each learner.
+    """
 
     def __init__(self, host: Host, worlds: Worlds, team: Team, scenario: Scenario) -> None:
         self.host, self.team, self.scenario = host, team, scenario
@@ -234,7 +255,7 @@ class _Run:
         self.at_rest: Bools = np.zeros(worlds.n, np.bool_)
 
     def to_the_end(self) -> Hosted:
-        """Drive every world to the end of its episode."""
+        """Run every world to the end of its episode, and return the result."""
         if self.exact:
             self._move()  # to the first decision
         while not self.ended.all():
@@ -244,12 +265,12 @@ class _Run:
         guarded = self.engine.guarded
         driven = {i: memory for i, memory in self.memories.items() if i in self.team.drivers}
         outcome = outcome_of(self.team, Episodes(self.ledger, self.final, self.at_rest, guarded, driven))
-        return Hosted(outcome, getattr(getattr(guarded, "shield", None), "distrusted", None))
+        shield = None if guarded is None else guarded.shield
+        return Hosted(outcome, shield.memory.distrusted if isinstance(shield, StepShield) else None)
 
-    # what was decided
-
+    # decisions
     def _decide(self) -> None:
-        """Ask those who decide now; all of them see the same."""
+        """Let every vehicle decide whose decision is due. All of them see the same state."""
         each = [~self.ended & (grid.made < grid.all) & grid.is_due(self.time_s) for grid in self.grids]
         if not np.any(each):
             return
@@ -268,7 +289,14 @@ class _Run:
             grid.made = grid.made + due
 
     def _ask_guard(self, worlds: Worlds, due: Bools, idle: Ints) -> None:
-        """Let the policies behind the shield propose, and want what it applies."""
+        """Let the policies behind the shield propose actions, and use the actions that the shield applies.
+
+        Args:
+            worlds: the present state.
+            due: [n] whether a decision is due in each world.
+            idle: row numbers of the other worlds, whose memories stay as they are.
+
+        """
         engine = self.engine
         assert engine.guard is not None
         engine.place(worlds, self.ledger, ended=~due)
@@ -281,7 +309,7 @@ class _Run:
             self.wanted_mps2[due, i] = action_to_command(ruling.applied[:, c], worlds.vehicles, i)[due]
 
     def _seen(self) -> Worlds:
-        """The worlds as agents see them."""
+        """Return the present state as agents see it: nearly standing vehicles stand, and gaps are at least 0."""
         latency, speeds = self.alert.vehicles.latency_s, self.speeds_mps
         in_force = np.where(has_acted(latency, self.time_s[:, np.newaxis]), self.wanted_mps2, 0.0)
         if not self.exact:
@@ -290,7 +318,7 @@ class _Run:
         return self.alert.running(self.time_s, gaps, speeds, command_mps2=in_force, pair_hit=self.ledger.count > 0)
 
     def _end(self) -> None:
-        """Note whose episodes end with this step: they hold the brakes."""
+        """Mark the episodes that end with the last step. Their controlled vehicles brake fully from now on."""
         first = self.grids[0]
         if not (stepped := ~self.ended & first.is_due(self.time_s) & (first.made > 0)).any():
             return
@@ -303,10 +331,9 @@ class _Run:
         self.final = self.final.assign(rows, worlds.take(rows))
         self.wanted_mps2[np.ix_(over, drivers)] = -worlds.vehicles.braking_capacity_mps2[np.ix_(over, drivers)]
 
-    # what the host does
-
+    # the host's steps
     def _move(self) -> None:
-        """Let the host make one step, and let vehicles meet that touch then."""
+        """Let the host make one step, check the state that it reports, and resolve impacts unless it reported them."""
         if self.exact:
             until = np.minimum.reduce([grid.next_s for grid in self.grids])
             until = np.where(self.ended, self.time_s, np.maximum(until, self.time_s))
@@ -333,10 +360,19 @@ class _Run:
         self.ledger = self.ledger.add(self._meet(before_m, begin, step_s) if impacts is None else impacts)
 
     def _meet(self, before_m: Floats, begin: Floats, step_s: Floats) -> Impacts:
-        """Let pairs that touch and close exchange velocity by the paper's eq. (13), from the rear to the front.
+        """Resolve the impacts of the step by the paper's eq. (13), from the rear pair to the front pair.
 
-        With closing speed w and gap g <= 0 now, and the mean closing acceleration b of the step, a pair that was apart
-        before closed with ``sqrt(w^2 + 2 b g)`` when it met: that is what harms, and what is exchanged.
+        A pair has an impact if its gap is at most 0 and still closes. At the end of the step let w be the closing
+        speed, g <= 0 the gap, and b the mean closing acceleration of the step. A pair that was apart before the step
+        met with the closing speed ``sqrt(w^2 + 2 b g)``; this speed counts as harm and enters eq. (13).
+
+        Args:
+            before_m: [n, P] gaps before the step.
+            begin: [n, N] speeds at the start of the step.
+            step_s: [n] length of the step.
+
+        Changes ``speeds_mps``, and returns the impacts.
+
         """
         v, gaps, speeds, told = self.alert.vehicles, self.gaps_m, self.speeds_mps, self.speeds_mps.copy()
         first, total, count = np.zeros(gaps.shape), np.zeros(gaps.shape), np.zeros(gaps.shape, np.int64)
@@ -356,7 +392,11 @@ class _Run:
         return Impacts(first, total, count, *Impacts.no_obstacle(len(gaps)))
 
     def _read(self) -> tuple[Floats, Floats, Floats, Impacts | None]:
-        """Time since the alert, gaps, speeds and impacts as the host tells them, in our memory."""
+        """Read the host's state, and return checked copies.
+
+        These are the time since the alert [n], gaps [n, P], speeds [n, N], and impacts (None: not reported). Raises
+        ``HostFailed`` for an exception, a wrong shape or a number that is not finite.
+        """
         (n, N), read = self.alert.speeds_mps.shape, list[Floats]()
         try:
             state = HostState(*self.host.state())
@@ -383,7 +423,10 @@ class _Run:
         return read[0] - self.origin_s, read[1], read[2], impacts
 
     def _first_state(self) -> tuple[Floats, Floats]:
-        """Gaps and speeds at the alert, and when that is by the host's clock."""
+        """Return the host's gaps [n, P] and speeds [n, N] at the alert, and set the origin of its clock.
+
+        Raises ``HostFailed`` if they differ from the worlds with which the host was set up.
+        """
         self.origin_s, gaps, speeds, _ = self._read()
         for name, told, given in (("gaps_m", gaps, self.alert.gaps_m), ("speeds_mps", speeds, self.alert.speeds_mps)):
             if not (close := np.abs(told - given) <= STARTS_WITHIN).all():
@@ -395,7 +438,7 @@ class _Run:
         return np.maximum(gaps, 0.0), speeds
 
     def _check_clock(self, time_s: Floats, until: Floats) -> None:
-        """Refuse a clock that is not where the step was to lead; by half a step it may be off."""
+        """Raise ``HostFailed`` unless the host's clock ``time_s`` [n] is at ``until`` [n], to half a step."""
         within = SNAP * self.scenario.time_step_s if self.exact else self.dt / 2.0
         if not (good := np.abs(time_s - until) <= within).all():
             k = int(np.argmin(good))
@@ -411,40 +454,47 @@ class _Run:
 
 
 class _Step(NamedTuple):
-    """One step of a host: what it was to do, and what it says of its end."""
+    """One step of a host: its command and the state that it reported at the end."""
 
-    wanted_mps2: Floats  # [n, N]
-    begin_mps: Floats  # [n, N] the speeds it was to begin with
-    until_s: Floats  # [n] when it was to end
-    clock_s: Floats  # [n] how long it was by the host's clock
-    gaps_m: Floats  # [n, N - 1]
-    speeds_mps: Floats  # [n, N]
-    impacts: Impacts | None
+    wanted_mps2: Floats  # [n, N] acceleration that the agents decided
+    begin_mps: Floats  # [n, N] speeds at the start of the step, as commanded to the host
+    until_s: Floats  # [n] time since the alert at which the step should end
+    clock_s: Floats  # [n] length of the step on the host's own clock (s)
+    gaps_m: Floats  # [n, N - 1] reported gaps at the end; below 0 where bodies overlap
+    speeds_mps: Floats  # [n, N] reported speeds at the end
+    impacts: Impacts | None  # impacts in the step; None: the host does not report impacts
 
 
 class _Motion:
-    """How the vehicles of a host can have moved since the alert. Three rules refuse what is impossible:
+    """Ranges in which the gaps and speeds of a host's vehicles can be, given the commands since the alert.
+
+    ``alert`` are the worlds at the alert, ``dt`` is the length of the host's steps (s; infinite: each to a decision).
+
+    Three rules refuse an impossible state:
 
     1. *Speed in a step.* It changes by no more than the commands so far allow.
-    2. *Gaps since the alert.* They follow from the speeds at the beginning and at the end of each step.
-    3. *Speed since the alert.* The commands lead to it, late by ``LAG_S`` at most, with accelerations that are off by
-       ``OFF_MPS2`` and ``OFF_SHARE`` of the command at most.
+    2. *Gaps since the alert.* They follow from the speeds at the start and at the end of each step.
+    3. *Speed since the alert.* It follows the commands with a delay of at most ``LAG_S`` and an error of the
+       acceleration of at most ``OFF_MPS2`` plus ``OFF_SHARE`` of the command.
 
-    Bodies that pass through one another never push. In a host that reports impacts, vehicles that touch push one
-    another: rule 1 takes the commands of their whole line, and its energy where there was an impact; rules 2 and 3
-    begin again at what the host says.
+    In a host that does not report impacts, bodies pass through one another and never push. In a host that reports
+    impacts, vehicles in contact push one another. For them rule 1 uses the commands of the whole line, and the line's
+    energy after an impact; rules 2 and 3 start again from the reported state.
     """
 
     def __init__(self, alert: Worlds, dt: float) -> None:
         self.vehicles, self.jitter_s = alert.vehicles, 0.0 if math.isinf(dt) else dt
         self.time_s, self.gaps_m, self.speeds_mps = alert.time_s, alert.gaps_m, alert.speeds_mps
-        self.least_mps2 = self.most_mps2 = np.zeros(alert.speeds_mps.shape)  # of the commands so far
-        self.least_m = self.most_m = alert.gaps_m  # where the speeds lead
-        self.led_mps = alert.speeds_mps  # where the commands lead
-        self.off_mps = np.full(alert.speeds_mps.shape, READ_WITHIN)  # how far from there, apart from the lag
+        self.least_mps2 = self.most_mps2 = np.zeros(alert.speeds_mps.shape)  # range of the commands so far
+        self.least_m = self.most_m = alert.gaps_m  # range of the gaps that follows from the speeds
+        self.led_mps = alert.speeds_mps  # speeds that follow from the commands
+        self.off_mps = np.full(alert.speeds_mps.shape, READ_WITHIN)  # tolerance of led_mps, without the delay
 
     def refusal(self, step: _Step) -> tuple[int, str] | None:
-        """The world and what is impossible in it; None: every world can be as the host says."""
+        """Check the state that the host reported at the end of ``step``.
+
+        Returns the row number of a world and what is impossible in it, or None if every state is possible.
+        """
         acting_s = np.maximum(step.until_s[:, np.newaxis] - np.maximum(self._now, self.vehicles.latency_s), 0.0)
         command = np.where(acting_s > 0.0, step.wanted_mps2, 0.0)
         met = self._met(step)
@@ -468,7 +518,7 @@ class _Motion:
         return self.time_s[:, np.newaxis]
 
     def _met(self, step: _Step) -> Bools:
-        """Which vehicles may have pushed one another, [n, N]."""
+        """Return which vehicles may have pushed one another during the step, [n, N] bool."""
         met = np.zeros(step.speeds_mps.shape, np.bool_)
         if step.impacts is not None:
             touch = (step.impacts.count > 0) | (np.minimum(step.gaps_m, self.gaps_m) <= READ_WITHIN)
@@ -477,8 +527,11 @@ class _Motion:
         return met
 
     def _reachable(self, step: _Step, met: Bools) -> tuple[Floats, Floats]:
-        """The least and the greatest speed at the end of the step, [n, N] m/s."""
-        # a host that keeps latencies by itself does not round them up
+        """Return the least and the greatest possible speed at the end of the step, each [n, N] m/s.
+
+        ``met`` [n, N]: vehicles that may have pushed one another.
+        """
+        # a host that handles latencies itself does not round them up to whole steps
         begun = step.until_s[:, np.newaxis] + self.jitter_s > self.vehicles.latency_s
         command = np.where(begun, step.wanted_mps2, 0.0)
         self.least_mps2, self.most_mps2 = np.minimum(self.least_mps2, command), np.maximum(self.most_mps2, command)
@@ -486,7 +539,7 @@ class _Motion:
         most = np.where(met, self.most_mps2.max(axis=1, keepdims=True), self.most_mps2)
         begin, seconds = step.begin_mps, np.maximum(step.until_s - self.time_s, step.clock_s)[:, np.newaxis]
         low = begin + least * seconds - READ_WITHIN
-        high = np.maximum(begin, 0.0) + most * seconds + READ_WITHIN  # brakes bring one that rolls back to rest
+        high = np.maximum(begin, 0.0) + most * seconds + READ_WITHIN  # brakes stop a vehicle that rolls backwards
         if step.impacts is None:
             return low, high
         mass, fastest = self.vehicles.mass_t, np.maximum(np.abs(low), np.abs(high))
@@ -511,14 +564,23 @@ class _Motion:
         )  # fmt: skip
 
     def _wrong_speed(self, step: _Step, met: Bools, change: Floats) -> tuple[int, str] | None:
-        """By a command that alone makes ``change`` [n, N] m/s of a vehicle's speed."""
+        """Return the first reported speed that the commands since the alert rule out, and what is wrong with it.
+
+        Args:
+            step: the step.
+            met: [n, N] vehicles that may have pushed one another, which are not checked.
+            change: [n, N] m/s that the command alone adds to the speed in this step.
+
+        Returns the row number of the world and a message; None if all speeds are possible.
+
+        """
         began = self.led_mps + step.begin_mps - self.speeds_mps
         led = held_speeds(began, change, self.vehicles.speed_limit_mps, 1.0)
         seconds = (step.until_s - self.time_s)[:, np.newaxis]
         self.off_mps = self.off_mps + OFF_MPS2 * seconds + OFF_SHARE * np.abs(led - began)
         self.led_mps = np.where(met, step.speeds_mps, led)
         off = self.off_mps + LAG_S * (self.most_mps2 - self.least_mps2)
-        led = np.where(step.speeds_mps >= 0.0, np.maximum(led, 0.0), led)  # some hosts know no speed below 0
+        led = np.where(step.speeds_mps >= 0.0, np.maximum(led, 0.0), led)  # some hosts have no negative speeds
         return _refused(
             step.speeds_mps, np.where(met, -np.inf, led - off), np.where(met, np.inf, led + off),
             lambda k, i, right: f"vehicle_{i + 1} of world {k} drives at {step.speeds_mps[k, i]:g} m/s at"
@@ -529,7 +591,10 @@ class _Motion:
 def _refused(
     values: Floats, low: Floats, high: Floats, describe: Callable[[int, int, str], str]
 ) -> tuple[int, str] | None:
-    """The world of the first value outside its range, and what is wrong there."""
+    """Find the first of ``values`` [n, entries] outside its range from ``low`` to ``high``.
+
+    Returns its row, and ``describe(row, entry, range in words)``; None if all values are in range.
+    """
     good = (low <= values) & (values <= high)
     if good.all():
         return None
@@ -538,7 +603,11 @@ def _refused(
 
 
 def _checked_dt(host: Host, scenario: Scenario) -> float:
-    """The host's step; raises ``InvalidInput`` for what is no host, or one whose steps make no decision."""
+    """Return the length of the host's steps (s), its ``dt``.
+
+    Raises ``InvalidInput`` for an object that is not a host, and for a step that does not divide the scenario's time
+    step.
+    """
     missing = [what for what in ("dt", "state", "apply") if not hasattr(host, what)]
     if missing:
         raise InvalidInput(f"host {type(host).__name__}: has no {' and no '.join(missing)}; docs/hosts.md shows one")
@@ -554,7 +623,10 @@ def _checked_dt(host: Host, scenario: Scenario) -> float:
 
 
 def _check_known(worlds: Worlds, scenario: Scenario, vehicles: tuple[int, ...]) -> None:
-    """Refuse worlds of which a host would have to know more than gaps and speeds."""
+    """Raise ``InvalidInput`` if the worlds have brakes that build up, periodic messages or an obstacle.
+
+    A host provides gaps and speeds only, so it cannot represent these. ``vehicles``: indices of controlled vehicles.
+    """
     scenario.play_pieces(worlds, vehicles).refuse_build_up("host")
     if worlds.messages.shape[1] or worlds.obstacle_ahead.any():
         what = "periodic messages (v2x)" if worlds.messages.shape[1] else "an obstacle ahead (obstacle_gap_m)"
@@ -562,7 +634,7 @@ def _check_known(worlds: Worlds, scenario: Scenario, vehicles: tuple[int, ...]) 
 
 
 def _on_steps(worlds: Worlds, dt: float) -> Vehicles:
-    """The vehicles, with latencies of whole steps."""
+    """Return the vehicles of these worlds with all latencies rounded up to whole steps of ``dt`` (s)."""
 
     def up(seconds: Floats) -> Floats:
         return np.ceil(seconds / dt - SNAP) * dt

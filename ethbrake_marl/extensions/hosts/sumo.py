@@ -1,4 +1,4 @@
-"""SUMO as a host: every world is a straight edge of one simulation, which runs in this process (libsumo)."""
+"""SUMO as a host. Each world is a straight edge of one simulation, which runs in this process (libsumo)."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from ethbrake_marl.physics.state import Bools, Floats, Worlds
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
 
-_SUMO_DT_S = 0.01  # of its steps
+_SUMO_DT_S = 0.01  # default step length
 
-_SUMO_LENGTH_M = 5.0  # of every vehicle: gaps are from bumper to bumper
+_SUMO_LENGTH_M = 5.0  # length of every vehicle; gaps are bumper to bumper, so its value has no effect
 
 _SUMO_EDGE_M = 10_000.0
 
-_EVERY_CHECK_OFF = 32  # SUMO's speed mode: a vehicle has the speed that it is told
+_EVERY_CHECK_OFF = 32  # SUMO's speed mode in which a vehicle takes the commanded speed without checks
 
 _SUMO_OPTIONS = (
     *("--step-method.ballistic", "true", "--collision.action", "none", "--time-to-teleport", "-1"),
@@ -36,21 +36,22 @@ _SUMO_OPTIONS = (
 
 
 class SumoHost:
-    """Worlds at the alert as parallel edges of one simulation of SUMO; one at a time in a process.
+    """Host that runs worlds as parallel edges of one SUMO simulation. A process can hold one at a time.
 
-    Vehicles have the speed that they are told; SUMO moves them by its ballistic steps and lets bodies pass through one
-    another. It knows no speed below 0: a vehicle that bounces back stands instead. ``close`` ends it.
+    Vehicles take the commanded speed. SUMO moves them by its ballistic steps and lets bodies pass through one another.
+    It has no negative speeds: a vehicle that would bounce backwards stands instead. ``close`` ends the simulation.
 
     Args:
-        worlds: at the alert.
-        dt: its step, whole milliseconds, s.
+        worlds: the worlds at the alert.
+        dt: step length, in whole milliseconds (s).
 
-    Raises ``MissingExtra`` without libsumo, ``InvalidInput`` for another step and while another one is open.
+    Raises ``MissingExtra`` without libsumo. Raises ``InvalidInput`` for another step length, or while another
+    simulation is open.
 
     """
 
     def __init__(self, worlds: Worlds, dt: float = _SUMO_DT_S) -> None:
-        with naming_extras(), redirect_stdout(StringIO()):  # it prints what it thinks of another library's version
+        with naming_extras(), redirect_stdout(StringIO()):  # libsumo prints a warning about another library's version
             import libsumo
         if not (dt >= 0.001 and abs(1000.0 * dt - round(1000.0 * dt)) < 1e-9):
             raise InvalidInput(f"sumo: dt = {dt!r}: must be whole milliseconds, s, for instance 0.01")
@@ -64,13 +65,13 @@ class SumoHost:
             routes.write_text(_routes(worlds, self._names), "utf-8")
             files = ("--net-file", str(net), "--route-files", str(routes))
             libsumo.start(["sumo", *files, "--step-length", repr(self.dt), *_SUMO_OPTIONS])
-        libsumo.simulationStep()  # inserts them, where they are and as fast as they are
+        libsumo.simulationStep()  # inserts the vehicles at their positions and speeds
         for name in (name for line in self._names for name in line):
             libsumo.vehicle.setSpeedMode(name, _EVERY_CHECK_OFF)
         self._speeds: Floats = np.array(self.state().speeds_mps)
 
     def state(self) -> HostState:
-        """What SUMO says of its vehicles."""
+        """Return time, gaps and speeds as SUMO reports them."""
         vehicle = self._sumo.vehicle
         place = np.array([[vehicle.getLanePosition(name) for name in line] for line in self._names])
         self._speeds = np.array([[vehicle.getSpeed(name) for name in line] for line in self._names])
@@ -78,7 +79,7 @@ class SumoHost:
         return HostState(self._sumo.simulation.getTime(), gaps, self._speeds)
 
     def apply(self, command: HostCommand) -> None:
-        """One step of SUMO."""
+        """Set the speed of every vehicle at the end of the step from ``command``, and let SUMO make the step."""
         vehicle, begin = self._sumo.vehicle, np.maximum(command.speeds_mps, 0.0)
         end = np.maximum(command.speeds_mps + command.acceleration_mps2 * self.dt, 0.0)
         for k, line in enumerate(self._names):
@@ -89,12 +90,12 @@ class SumoHost:
         self._sumo.simulationStep()
 
     def close(self) -> None:
-        """End the simulation."""
+        """End the SUMO simulation, so that this process can start another one."""
         self._sumo.close()
 
 
 def _net(edges: int) -> str:
-    """Straight edges of one lane, side by side."""
+    """Return the XML of SUMO's network: ``edges`` straight roads of one lane, side by side, one for each world."""
     lines = []
     for k in range(edges):
         y = 10.0 * k
@@ -112,7 +113,11 @@ def _net(edges: int) -> str:
 
 
 def _routes(worlds: Worlds, names: Sequence[Sequence[str]]) -> str:
-    """The vehicles, where they begin: the last one of a line ``_SUMO_EDGE_M / 10`` into its edge."""
+    """Return the XML of SUMO's routes file: all vehicles with their positions and speeds at the alert.
+
+    ``names`` holds the names of the vehicles of each world, front to rear. The last vehicle of each line stands at a
+    tenth of its edge.
+    """
     lines = [
         f'<vType id="v" length="{_SUMO_LENGTH_M}" minGap="0" tau="0.001" sigma="0" accel="1000" decel="1000"'
         ' emergencyDecel="1000" maxSpeed="200"/>'
@@ -131,10 +136,10 @@ def _routes(worlds: Worlds, names: Sequence[Sequence[str]]) -> str:
 
 
 class FoundHost(NamedTuple):
-    """A host that is named: by its name in tables, and a new one around some worlds."""
+    """A kind of host (a simulator that moves the vehicles), chosen by its name on a command line."""
 
-    name: str
-    open: Callable[[Worlds], AbstractContextManager[Host]]
+    name: str  # name and version, for tables
+    open: Callable[[Worlds], AbstractContextManager[Host]]  # starts a host at the alert of these worlds, for ``with``
 
     def evaluate(
         self,
@@ -146,7 +151,20 @@ class FoundHost(NamedTuple):
         at_once: int = 100,
         on_progress: Callable[[str, int], None] = lambda agent, done: None,
     ) -> tuple[Evaluation, dict[str, Bools | None]]:
-        """``evaluate`` in hosts of ``at_once`` worlds each, and by agent in which worlds its shield was distrusted."""
+        """Let agents drive the scenario's learners in hosts, in the same worlds.
+
+        Args:
+            sample: the worlds at the alert.
+            agents: agents or teams by name.
+            scenario: scenario of the worlds.
+            seed: seed of the worlds, which is recorded; None for worlds of other origin.
+            at_once: number of worlds in one host.
+            on_progress: called with an agent's name and the number of its worlds done.
+
+        Returns the evaluation, and for each agent in which worlds [n] the host moved otherwise than its shield
+        predicted (None without such a shield).
+
+        """
         found: dict[str, Hosted] = {}
         for spec, agent in agents.items():
             parts = []
@@ -165,7 +183,10 @@ class FoundHost(NamedTuple):
 
 
 def find_host(spec: str) -> FoundHost:
-    """The host that is written ``sumo`` or ``sumo:0.05``, its step in s; raises as ``SumoHost``."""
+    """Return the kind of host that a spec names: ``sumo``, or ``sumo:0.05`` with the step length in s.
+
+    Raises the exceptions of ``SumoHost``.
+    """
     name, colon, text = spec.partition(":")
     if name != "sumo":
         raise unknown_name("host", name, ("sumo",))

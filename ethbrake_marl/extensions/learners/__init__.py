@@ -1,1 +1,1 @@
-"""Learning algorithms of our own."""
+"""Learning algorithms of this project: vine, mixtures of experts, rollout classification."""

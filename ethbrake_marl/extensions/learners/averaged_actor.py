@@ -23,22 +23,29 @@ from ethbrake_marl.training.networks import ACTIVATIONS, sb3_names, tensors_of
 
 
 class Deterministic(BasePolicy):
-    """A policy without noise: its actions are its ``means``, cut at -1 and 1."""
+    """Base class of policies without exploration noise: actions are the network's outputs, clipped to [-1, 1].
+
+    A subclass defines ``means`` and ``forward``, and ``expect`` if decisions are drawn by their expected gradient. It
+    can define ``act`` instead of ``means`` if it has no outputs to clip.
+    """
 
     def means(self, observation: Float32s) -> Float32s:
-        """Outputs [rows] of the weights that learn for observations [rows, F], before they are cut."""
+        """Return the outputs [rows] of the network in training for observations [rows, F], before clipping."""
         raise NotImplementedError
 
     def expect(self, observation: Float32s) -> Floats:
-        """Expected size of the gradient, [rows]."""
+        """Return a prediction, [rows], of how strongly the return depends on the action at observations [rows, F].
+
+        It is the expected absolute gradient of the return with respect to the action.
+        """
         raise NotImplementedError
 
     def act(self, observation: Float32s) -> Float32s:
-        """Actions [rows] in [-1, 1]."""
+        """Return the actions [rows], in [-1, 1], for observations [rows, F]."""
         return np.clip(self.means(observation), -1.0, 1.0)
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
-        """Copy the weights that drive under the names of a policy bundle with this network."""
+        """Return copies of the averaged weights, by their names in the policy bundle that ``network`` describes."""
         return tensors_of(self, network)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> Tensor:
@@ -47,9 +54,16 @@ class Deterministic(BasePolicy):
 
 
 class AveragedActor(Deterministic):
-    """An actor that learns (``learning``), and the running average of its weights, which drives.
+    """Actor with two copies of its network: one in training (``learning``), and the running average of its weights.
 
-    The average has the names of Stable-Baselines3's PPO.
+    A trained policy drives with the average. Its parameters have the same names as in Stable-Baselines3's PPO.
+
+    Args:
+        observation_space: Gymnasium space of an observation.
+        action_space: Gymnasium space of an action.
+        rate: learning rate as a function of the remaining share of the training, from 1 to 0.
+        recipe: recipe of the training, with the shape of the network.
+
     """
 
     def __init__(
@@ -66,7 +80,7 @@ class AveragedActor(Deterministic):
                 nn.init.zeros_(layer.bias)
         nn.init.orthogonal_(self.action_net.weight, 0.01)
         nn.init.constant_(self.action_net.bias, shape.initial_action or 0.0)
-        # a bundle has it; the actor itself never explores
+        # a policy bundle needs this parameter; the actor itself never explores
         self.log_std = nn.Parameter(torch.full((1,), -3.0), requires_grad=False)
         last = nn.Linear(hidden[-1], 1)
         self.learning = nn.Sequential(*create_mlp(inputs, -1, hidden, activation), last)
@@ -82,7 +96,7 @@ class AveragedActor(Deterministic):
             learns.copy_(mean)
 
     def take_over(self, tensors: Mapping[str, Float32s]) -> None:
-        """Take over the tensors of a bundle."""
+        """Copy ``tensors``, the weights of a policy bundle by name, into both copies of the network."""
         state = self.state_dict()
         for name, theirs in sb3_names(self._spec).items():
             state[theirs].copy_(torch.from_numpy(tensors[name]))
@@ -98,6 +112,6 @@ class AveragedActor(Deterministic):
         return self.scout.expect(observation)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Actions [rows, 1] of the average."""
+        """Return the actions [rows, 1] of the averaged network for observations [rows, F]."""
         means: Tensor = self.action_net(self.mlp_extractor["policy_net"](observation))
         return means.clamp(-1.0, 1.0)

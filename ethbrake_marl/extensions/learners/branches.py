@@ -1,7 +1,7 @@
-"""Branches of running episodes: the same moment, played on to the end in more than one way.
+"""Branches of running episodes: the same moment, played to the end in more than one way.
 
-A learner's action is moved by an offset for a few steps; then the policy goes on in closed loop. Two branches differ
-by the offset alone. Everything else in them is the same, to the bit.
+In a branch, an offset is added to one learner's actions for a few steps; then the policy continues in closed loop. Two
+branches of a moment differ only by the offset. Everything else in them is the same, bit for bit.
 """
 
 from __future__ import annotations
@@ -20,40 +20,45 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Bools, Floats, Ints
 from ethbrake_marl.policies.network_spec import Float32s
 
-ROUNDING_MPS2 = 1e-5  # a command that differs by less is the same: networks round by the size of their batch
+ROUNDING_MPS2 = 1e-5  # commands closer than this are equal: a network's rounding depends on its batch size
 
 Act = Callable[[Observations], Float32s]  # observations [rows, F] -> actions [rows] in [-1, 1]
 
-Decide = Callable[[Observations, Ints, int], Floats]  # what is seen [m, L, F] in rows [m], steps made -> actions [m, L]
+Decide = Callable[[Observations, Ints, int], Floats]  # (observations [m, L, F], rows [m], steps so far) -> [m, L]
 
 
 class Offsets(NamedTuple):
-    """How one learner's actions in each row differ from those of its policy."""
+    """Changed actions in n branches (copies of a running episode).
 
-    learner: Ints  # [n] place among the learners
-    size: Floats  # [n] added to its action, which stays in [-1, 1]
-    steps: Ints  # [n] for so many steps, at least 1
+    In each branch, an offset is added to the actions of one learner during its first steps. For example, with
+    ``learner = [0, 0]``, ``size = [0.1, -0.1]``, ``steps = [3, 3]``, the foremost learner brakes less for three steps
+    in the first branch, and more in the second.
+    """
+
+    learner: Ints  # [n] for each branch: index of the changed learner among the learners (0 = foremost)
+    size: Floats  # [n] for each branch: offset added to its actions; the sum is clipped to [-1, 1]
+    steps: Ints  # [n] for each branch: number of steps with the offset, from the first step on
 
 
 def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) -> tuple[Floats, Floats]:
-    """Play every row to the end of its episode. Return what its moved learner gains, and how far it was moved.
+    """Play every branch (copy of a running episode) to its end, with an offset added to one learner's actions.
 
     Args:
-        engine: branches, which this changes.
-        act: drives all learners, from their observations alone.
-        offsets: the learner whose actions are moved in each row, how far, and for how many steps.
+        engine: engine whose n rows are the branches to play; it is changed.
+        act: policy of all learners, a function of observations alone.
+        offsets: for each row the learner whose actions are changed, by how much, and for how many steps.
         gamma: discount of one time step.
 
-    Returns the return [n] of the moved learner from now on (NaN for a row that could not be advanced), and the sum of
-    its offsets [n], each cut so that the action stays in [-1, 1]. If the reward is harm alone, a row ends as soon as
-    nothing can change any more.
+    Returns two arrays [n]: the changed learner's discounted return from now on (NaN for a row that could not be
+    advanced), and the sum over the steps of the changes of its actions, after clipping to [-1, 1]. If the reward is
+    harm alone, a row ends as soon as nothing can change any more.
 
     """
     moved, most = np.zeros(engine.n), int(offsets.steps.max(initial=0))
 
     def decide(seen: Observations, rows: Ints, number: int) -> Floats:
         wanted = act(seen.reshape(-1, seen.shape[2])).astype(np.float64).reshape(seen.shape[:2])
-        some = np.flatnonzero(number < offsets.steps[rows])  # whose offset still lasts
+        some = np.flatnonzero(number < offsets.steps[rows])  # rows whose offset still applies
         lasting = rows[some]
         before = wanted[some, offsets.learner[lasting]]
         after = np.clip(before + offsets.size[lasting], -1.0, 1.0)
@@ -66,9 +71,18 @@ def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) ->
 
 
 def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) -> Floats:
-    """Play every row to the end of its episode, and for ``at_least`` so many steps. Return each learner's gain [n, L].
+    """Play every row of an engine to the end of its episode, and return each learner's discounted return, [n, L].
 
-    ``decide`` returns the learners' actions. The rest is as for ``play_to_the_end``.
+    Args:
+        engine: engine whose rows are played; it is changed.
+        decide: function of the observations [m, L, F], the row numbers [m] that still run, and the number of steps so
+            far. It returns the learners' actions [m, L].
+        gamma: discount of one time step.
+        at_least: number of steps before which no row ends early.
+
+    If the reward is harm alone, a row ends early as soon as nothing can change any more. The return is NaN for a row
+    that could not be advanced.
+
     """
     vehicles = np.array(engine.learners, np.int64)
     gained, actions = np.zeros((engine.n, len(vehicles))), np.zeros((engine.n, len(vehicles)))
@@ -90,7 +104,11 @@ def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) 
 
 
 def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
-    """Play every row to its end by ``act``. Return the observations at each decision [m, L, F], and the states [m]."""
+    """Play every row of an engine to the end of its episode, and return what the policy met on the way.
+
+    ``act`` is the policy of all learners. The result covers the m decisions of all rows, in the order of time: the
+    observations [m, L, F], and the states of the worlds.
+    """
     seen_then, moments = [], []
 
     def decide(seen: Observations, rows: Ints, number: int) -> Floats:
@@ -103,12 +121,15 @@ def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
 
 
 def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
-    """Whether everything in these ``rows`` stands as it stood ``before`` [rows], and will stay so.
+    """Return for each of ``rows`` [m] whether all vehicles stand and will keep standing, [m] bool.
 
-    A policy that observes the same does the same. Rows count only if no latency or news can change the observation.
+    ``before`` [m, columns] is the packed state of these rows one step earlier; it must show the same standstill.
+
+    A policy with the same observation acts the same. So the answer is True only if no latency or message can change
+    the observation later.
     """
     if engine.packed.has_messages or engine.in_pieces:
-        return np.zeros(len(rows), np.bool_)  # what is still on its way may change what it sees, or what holds
+        return np.zeros(len(rows), np.bool_)  # messages under way may change the observation; a profile, the braking
     (state, params), stands = engine.packed, np.empty(len(rows), np.bool_)
     find_standing(state, before, params, rows, stands)
     return stands
@@ -116,7 +137,16 @@ def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
 
 @compiled
 def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, stands: Bools) -> None:
-    """Fill ``stands`` [m] for ``rows`` [m] of ``state``, which stood as ``before`` [m]."""
+    """Write into ``stands`` [m] whether nothing can change any more in each of ``rows`` [m].
+
+    Args:
+        state: packed state of all rows of an engine.
+        before: [m, columns] packed state of ``rows`` one step earlier.
+        params: packed constants of all rows.
+        rows: [m] row numbers.
+        stands: [m] result, which is overwritten.
+
+    """
     column = columns(state)
     by_link = params.shape[1] > column.own_latency
     for m in range(rows.shape[0]):
@@ -135,12 +165,15 @@ def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, sta
 
 
 def other_count(count: HarmCount) -> HarmCount:
-    """The harm count that is not ``count``."""
+    """Return the other count of harm: ``total`` (all impacts) for ``first`` (first impacts), and the reverse."""
     return "total" if count == "first" else "first"
 
 
 def moving_rows(moments: State) -> Bools:
-    """Whether some vehicle moves, for each row. A row in which everything stands teaches nothing."""
+    """Return for each of the n states ``moments`` whether at least one vehicle moves, [n] bool.
+
+    Decisions at which all vehicles stand are left out of training, because actions make no difference there.
+    """
     column = moments.packed.column
     moving: Bools = (moments.motion[:, column.speed : column.command] != 0.0).any(axis=1)
     return moving

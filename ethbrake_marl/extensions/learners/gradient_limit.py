@@ -1,4 +1,4 @@
-"""``gradient_limit: auto``: the limit and the smallest offset follow the gradients measured last."""
+"""``gradient_limit: auto``: derive the gradient limit and the smallest offset from recently measured gradients."""
 
 from __future__ import annotations
 
@@ -7,28 +7,42 @@ import numpy as np
 from ethbrake_marl.physics.elementary import exp, log
 from ethbrake_marl.physics.state import Floats
 
-REMEMBERED = 65_536  # measured gradients
+REMEMBERED = 65_536  # number of measured gradients in memory
 
-CUT = 0.1  # share of the sum of their sizes that the limit cuts
+CUT = 0.1  # share of the sum of gradient sizes that the limit removes
 
-SPREAD = 2.0  # at the smallest offset the spread of gradients is at most so many times that at the largest
+SPREAD = 2.0  # largest ratio of the spread of gradients at the smallest offset to the spread at the largest
 
-NARROWEST = 4.0  # but offsets are drawn from a range at least so wide
+NARROWEST = 4.0  # least ratio of the largest to the smallest offset, which takes precedence over SPREAD
 
 
 def limit_that_cuts(sizes: Floats, share: float) -> float:
-    """The limit that removes this share of the sum of the sizes [n]."""
+    """Return the limit to which large gradients are reduced, so that the sum of all sizes falls by ``share``.
+
+    ``sizes`` [n] are absolute gradients. For example, reducing ``[1, 1, 4]`` to at most 2 lowers the sum 6 to 4, so 2
+    is the limit for the share 1/3.
+    """
     rising = np.sort(sizes)
-    kept = np.cumsum(rising) + np.arange(len(rising) - 1, -1, -1) * rising  # of the sum, by each of them as the limit
+    kept = (
+        np.cumsum(rising) + np.arange(len(rising) - 1, -1, -1) * rising
+    )  # remaining sum if the limit is each size in turn
     return float(np.interp((1.0 - share) * kept[-1], kept, rising))
 
 
 def smallest_offset(measured: Floats, least: float, most: float) -> float:
-    """The smallest offset to draw: ``least``, or more if the spread of gradients falls steeply with the offset.
+    """Return the smallest offset (change of an action) with which gradients should be measured.
 
-    If the harm jumps, the spread falls with the square root of the offset. If the harm is smooth, it stays. The slope
-    is taken between the smaller and the larger half of the offsets. ``measured`` [n, 2] holds sizes of gradients and
-    their offsets (0: not measured yet).
+    Where harm jumps, gradients scatter more the smaller the offset; where harm is smooth, they do not. So the result is
+    the offset at which their root mean square is expected to be ``SPREAD`` times as large as at ``most``. It is limited
+    to ``most / NARROWEST``, and is never below ``least``. If gradients do not scatter more at small offsets, it is
+    ``least``.
+
+    Args:
+        measured: [n, 2] absolute value of each measured gradient, and the offset with which it was measured (0: no
+            measurement yet). The smaller half of the offsets is compared with the larger half.
+        least: lower end of the range of offsets.
+        most: upper end of the range of offsets.
+
     """
     known = measured[measured[:, 1] > 0.0]
     halves = np.array_split(known[np.argsort(known[:, 1], kind="stable")], 2)

@@ -1,4 +1,4 @@
-"""Train a mixture of experts: one expert alone, further experts, the gating network, then all together."""
+"""Train a mixture of experts (several networks that drive, and a gating network that chooses one at each decision)."""
 
 from __future__ import annotations
 
@@ -34,7 +34,11 @@ from ethbrake_marl.policies.network_spec import Float32s
 
 
 class ModesModel(CounterfactualModel):
-    """Train one expert alone, further experts in worlds of their own, the gating network, then all together."""
+    """Model that trains a mixture of experts: several networks that drive, and a gate that chooses one of them.
+
+    It trains the first expert alone, further experts in worlds of their own, the gate, then all together. The key
+    ``modes`` of the recipe configures it. The arguments are the environment of the training, and the recipe.
+    """
 
     policy: ModesPolicy  # type: ignore[assignment]
 
@@ -42,7 +46,7 @@ class ModesModel(CounterfactualModel):
         assert recipe.modes is not None
         self.plan = recipe.modes
         self._stage: Stage | None = None
-        self._own: State | None = None  # starts of the worlds of the stage's network
+        self._own: State | None = None  # starting states of the worlds of the stage's expert
         self._rate_share = 1.0
         super().__init__(environment, recipe)
 
@@ -53,7 +57,7 @@ class ModesModel(CounterfactualModel):
         if stage != self._stage:
             self._enter(stage, number)
         member = policy.actors[stage.network]
-        if stage.does == "further":  # whole episodes in some of the stage's own worlds
+        if stage.does == "further":  # whole episodes in some of the expert's own worlds
             assert self._own is not None
             some = torch.randint(len(self._own.motion), (self.n_envs,)).numpy()
             found, moments = visit(self.engine.branch(self._own.take(some)), member.act)
@@ -67,7 +71,7 @@ class ModesModel(CounterfactualModel):
         if stage.does in ("alone", "further"):
             self._train(member, self._try_out(seen, moments, member))
             return
-        if stage.does == "together":  # each network on what was tried where the gate chooses it
+        if stage.does == "together":  # each expert learns from the decisions at which the gate chooses it
             tried = self._try_out(seen, moments, policy)
             chosen = policy.gate.choose(tried.seen)
             for k, actor in enumerate(policy.actors):
@@ -83,7 +87,13 @@ class ModesModel(CounterfactualModel):
         update_learning_rate(optimizers, rate)
 
     def _enter(self, stage: Stage, number: int) -> None:
-        """Prepare a stage. After a resume the result is the same: it depends on finished experts alone."""
+        """Prepare a stage of the training that begins, or is resumed, at update ``number``.
+
+        For a further expert, find the worlds that it will be trained in, and let it imitate templates (random braking
+        profiles) that do better than the experts so far.
+
+        The result depends only on finished experts, so it is the same after a resume.
+        """
         self._stage, self._own = stage, None
         if stage.does != "further":
             return
@@ -105,22 +115,31 @@ class ModesModel(CounterfactualModel):
             self.policy.actors[stage.network].load_state_dict(pupil.state_dict())
 
     def _imitate(self, pupil: AveragedActor, shown: Shown, seed: int) -> None:
-        """Teach an expert the actions of templates."""
+        """Train the expert ``pupil`` to imitate the shown actions; ``seed`` orders the batches."""
         pupil.optimizer = adam(self.lr_schedule(1.0), pupil.learning)
         seen, wanted = torch.from_numpy(shown.seen), torch.from_numpy(shown.action)
         generator = torch.Generator().manual_seed(seed)
         for _ in range(self.plan.imitation_epochs):
             for batch in torch.split(torch.randperm(len(wanted), generator=generator), self.recipe.batch_size):
                 means, target = pupil.learning(seen[batch])[:, 0], wanted[batch]
-                reached = (target.abs() >= 1.0) & (means * target >= 1.0)  # beyond a bound it means the bound
+                reached = (target.abs() >= 1.0) & (means * target >= 1.0)  # an output beyond a bound is clipped to it
                 loss = mse_loss(means, torch.where(reached, means.detach(), target))
                 descend(pupil.optimizer, loss)
         follow(pupil.average, pupil.learning, 0.0)
 
     def _compare(self, seen: Float32s, moments: State) -> tuple[Float32s, Floats, Float32s]:
-        """Compare the experts at some decisions. Return observations [B, F], costs [B, K], and importance [B].
+        """Let each of the K experts play to the end from B of the visited decisions, and return what it costs.
 
-        Where all networks would do the same now nothing depends on the choice: the gate is asked again at the next one.
+        The cost is minus the return, plus ``tie_break`` times the harm under the count that the reward does not use.
+        The B decisions are drawn; those at which all experts take the same action are
+        left out, because the choice has no effect there.
+
+        Args:
+            seen: [steps, rows, F] observations at the visited decisions.
+            moments: states of the worlds at these decisions.
+
+        Returns observations [B, F], costs [B, K], and the importance (weight in the loss) of each decision [B].
+
         """
         engine, members = self.engine, [actor.act for actor in self.policy.actors]
         observed = seen.reshape(-1, seen.shape[2])
@@ -139,7 +158,16 @@ class ModesModel(CounterfactualModel):
         return observed[rows[good]], costs[good], importance[good]
 
     def _train_gate(self, seen: Float32s, costs: Floats, importance: Float32s | None = None) -> None:
-        """Teach the gating network which expert costs least. A decision weighs as much as the others cost more."""
+        """Train the gating network to choose the cheapest expert.
+
+        A decision's weight is the extra cost of the other experts.
+
+        Args:
+            seen: [B, F] observations.
+            costs: [B, K] cost of each expert.
+            importance: [B] factor of each decision; None: 1.
+
+        """
         importance = np.ones(len(seen), np.float32) if importance is None else importance
         gate = self.policy.gate
         self._update_learning_rate(gate.optimizer)

@@ -1,4 +1,4 @@
-"""Keys that the recipes of this extension share."""
+"""Recipe keys that the algorithms of this extension share."""
 
 from __future__ import annotations
 
@@ -12,10 +12,13 @@ from ethbrake_marl.training.recipe import Rate
 
 
 class OffsetRange(FileModel):
-    """How far an action is moved to see what comes of it; the logarithm of what is drawn is uniform."""
+    """Range from which a distance between two actions is drawn, uniformly in its logarithm.
 
-    smallest: Rate
-    largest: Rate
+    Actions are numbers from -1 (full braking) to 1.
+    """
+
+    smallest: Rate  # lower end of the range
+    largest: Rate  # upper end of the range
 
     @field_validator("largest")
     @classmethod
@@ -27,7 +30,7 @@ class OffsetRange(FileModel):
 
 Holds = Annotated[tuple[Annotated[int, Field(ge=1, le=1000)], ...], Field(strict=False, min_length=1, max_length=16)]
 
-Averaging = Annotated[float, Field(ge=0.0, lt=1.0)]  # 1 would keep the first weights for ever
+Averaging = Annotated[float, Field(ge=0.0, lt=1.0)]  # with 1 the average would never change
 
 AVERAGING = "share of itself that the average of the weights, which drives, keeps in each gradient step"
 

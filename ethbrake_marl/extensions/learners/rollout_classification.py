@@ -1,6 +1,6 @@
-"""The algorithm rollout classification: try several actions at a decision, learn to choose the one that costs least.
+"""The algorithm rollout classification: try several actions at a decision and learn to choose the cheapest one.
 
-Lagoudakis and Parr 2003. Recipes call it ``algorithm: options``.
+Source: Lagoudakis and Parr 2003. Recipes call it ``algorithm: options``.
 """
 
 from __future__ import annotations
@@ -17,17 +17,20 @@ from ethbrake_marl.training.training import Training
 
 
 class Options(Algorithm):
-    """Rollout classification, with one actor for all learners."""
+    """The algorithm rollout classification, with one actor for all learners."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> OptionsModel:
-        """The model, which at first brakes fully, or takes the first policy ``among``."""
+        """Return a new model for a training, which learns in ``environment``.
+
+        Before it learns, it brakes fully, or acts as the first policy of the recipe's key ``among``.
+        """
         recipe = training.recipe
         assert isinstance(recipe, OptionsRecipe)
-        environment.engine.branch(environment.engine.moment())  # refuses what cannot be branched before it begins
+        environment.engine.branch(environment.engine.moment())  # raises at once if the engine cannot branch
         among = [padded(policy, training, "among") for policy in recipe.policies]
         return OptionsModel(environment, recipe, among)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Copy the running average of the weights."""
+        """Return copies of the averaged weights of ``actor``, by the names in the bundle that ``network`` describes."""
         found: dict[str, Float32s] = actor.tensors(network)
         return found

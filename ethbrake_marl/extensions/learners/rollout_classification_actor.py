@@ -1,4 +1,4 @@
-"""An actor that scores actions, and the memory of what actions cost."""
+"""Actor that scores a number of actions and takes the best one, with a memory of what tried actions cost."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ from ethbrake_marl.training.networks import ACTIVATIONS, copy_of, tensors_of_lay
 
 
 class _TorchActor(Actor):
-    """``Actor`` with torch's products: three times as fast, with other last bits."""
+    """``Actor`` (a policy's network) with torch's matrix products instead of numpy's.
+
+    It is three times as fast; the last bits differ.
+    """
 
     @torch.no_grad()
     def _forward(self, layers: Layers, x: Float32s) -> Float32s:
@@ -40,17 +43,29 @@ class _TorchActor(Actor):
 
 
 class ChoosingActor(Deterministic):
-    """An actor that scores actions, and a memory of what actions cost.
+    """Actor whose network scores a number of options; it takes the option with the highest score.
 
-    The weights ``learning`` learn; their running ``average`` drives. The memory holds the last decisions at which
-    actions were tried, and how much more than the best one each action costs.
+    The first ``first`` options are policies, which then choose the action; the others are actions, evenly from -1 to 1.
+    The network ``learning`` is in training; ``average``, with the running average of its weights, drives.
+
+    The memory of M places holds the last decisions at which C options were tried, and how much more each cost than the
+    best one. F is the number of features.
+
+    Args:
+        observation_space: Gymnasium space of an observation.
+        action_space: Gymnasium space of an action.
+        rate: learning rate as a function of the remaining share of the training, from 1 to 0.
+        recipe: the recipe.
+        among: for each trained policy that the actor can choose instead of an action, its weights by name.
+        members: number of scenarios in the training's mixture; 1 without a mixture.
+
     """
 
-    seen: Tensor  # [M, F]
-    tried: Tensor  # [M, C] numbers of actions; the first one was taken
-    more: Tensor  # [M, C]
-    known: Tensor  # [1] decisions so far; the newest take the places of the oldest
-    usual: Tensor  # [members] average cost of the best action tried in each scenario of a mixture; 0: not known
+    seen: Tensor  # [M, F] observations in memory
+    tried: Tensor  # [M, C] numbers of the tried options; the actor itself took the first of the C
+    more: Tensor  # [M, C] extra cost of each tried option over the best one
+    known: Tensor  # [1] number of decisions added to the memory so far; new ones replace the oldest
+    usual: Tensor  # [members] mean cost of the best tried option in each scenario of a mixture; 0: not measured yet
 
     def __init__(
         self,
@@ -63,10 +78,10 @@ class ChoosingActor(Deterministic):
     ) -> None:
         super().__init__(observation_space, action_space)
         inputs, shape, room = flatdim(observation_space), recipe.network, (recipe.memory, 1 + recipe.others)
-        self.first, scores = len(among), len(among) + shape.choices  # the number of the first action behind policies
+        self.first, scores = len(among), len(among) + shape.choices  # numbers below ``first`` stand for policies
         layers = create_mlp(inputs, scores, list(shape.policy), ACTIVATIONS[shape.activation])
-        nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]  # until it learns, it takes the first: a policy's
-        nn.init.zeros_(layers[-1].bias)  # type: ignore[arg-type]  # action, or full braking
+        nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]  # until it learns, all scores are equal and it
+        nn.init.zeros_(layers[-1].bias)  # type: ignore[arg-type]  # takes number 0: a policy, or full braking
         self.average = nn.Sequential(*layers)
         self.learning = copy.deepcopy(self.average)
         self.optimizer = adam(rate(1.0), self.learning)
@@ -85,7 +100,11 @@ class ChoosingActor(Deterministic):
 
     @torch.no_grad()
     def choose(self, observation: Float32s) -> Ints:
-        """Numbers of the actions to take [rows] for observations [rows, F]."""
+        """Return the number of the option with the highest score, [rows], for each of the observations [rows, F].
+
+        Numbers below the attribute ``first`` stand for policies. The other numbers stand for actions, evenly spread:
+        ``first`` is the action -1, and the largest number is the action 1.
+        """
         chosen: Ints = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen
 
@@ -94,7 +113,7 @@ class ChoosingActor(Deterministic):
         return found
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Actions [rows, 1] of the average."""
+        """Return the actions [rows, 1] of the averaged network for observations [rows, F]."""
         return torch.from_numpy(self.act(observation.numpy()))[:, None]
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
@@ -102,14 +121,30 @@ class ChoosingActor(Deterministic):
         return {**tensors_of_layers("policy", self.average), **among}
 
     def remember(self, seen: Float32s, tried: Ints, more: Floats) -> None:
-        """Add decisions to the memory."""
+        """Add m decisions to the memory.
+
+        Args:
+            seen: [m, F] observations.
+            tried: [m, C] numbers of the tried options, as from ``choose``; the actor itself took the first of the C.
+            more: [m, C] extra cost of each tried option over the best one.
+
+        """
         places = torch.arange(int(self.known), int(self.known) + len(seen)) % len(self.seen)
         self.seen[places], self.tried[places] = torch.from_numpy(seen), torch.from_numpy(tried)
         self.more[places] = torch.from_numpy(more.astype(np.float32))
         self.known += len(seen)
 
     def draw(self, batches: int, count: int, focus: float) -> Iterator[tuple[Tensor, Tensor]]:
-        """Draw remembered decisions for each step, and how much each counts; ``focus`` as in ``draw_rows``."""
+        """Draw decisions from the memory; yield for each gradient step their rows and importance, both [count].
+
+        The importance is a decision's weight in the loss.
+
+        Args:
+            batches: number of gradient steps.
+            count: decisions per step.
+            focus: share that is drawn in proportion to how much the choice matters; 0: all are drawn uniformly.
+
+        """
         known = min(int(self.known), len(self.seen))
         if focus == 0.0 or batches == 0:
             for _ in range(batches):
@@ -121,10 +156,16 @@ class ChoosingActor(Deterministic):
             yield torch.from_numpy(rows[part]), torch.from_numpy(importance[part])
 
     def loss(self, some: Tensor, importance: Tensor, guide: float) -> Tensor:
-        """Expected cost, in some remembered decisions, of choosing at random by a softmax of the scores.
+        """Return the loss at decisions of the memory: the expected cost of actions drawn by a softmax of the scores.
 
-        It has no slope if the chances are nearly 0 or 1. So ``guide`` times a convex loss is added, which lowers the
-        score of every action but the best, more for an action that costs more.
+        Its gradient vanishes if the probabilities are nearly 0 or 1. So ``guide`` times a convex loss is added, which
+        lowers the score of every action except the best, and more for a costlier action.
+
+        Args:
+            some: row numbers of the decisions in the memory.
+            importance: factor of each of them.
+            guide: weight of the convex loss.
+
         """
         more = self.more[some]
         scores = self.learning(self.seen[some]).gather(1, self.tried[some])

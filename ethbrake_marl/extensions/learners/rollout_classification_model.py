@@ -21,15 +21,22 @@ from ethbrake_marl.policies.network_spec import Float32s
 from ethbrake_marl.scenario.sampling import members_of
 from ethbrake_marl.scenario.schema import as_scenario
 
-FOR_GOOD = 2**31  # steps: more than any episode has
+FOR_GOOD = 2**31  # number of steps beyond the length of any episode
 
 USUAL_KEPT = 0.98  # share of itself that the running mean of costs keeps in each update
 
-LEAST_USUAL = 0.1  # m2/s2: a scenario with next to no harm counts no more than one with so much
+LEAST_USUAL = 0.1  # m2/s2; least divisor of relative costs, for scenarios with almost no harm
 
 
 class OptionsModel(CounterfactualModel):
-    """Visit decisions by the actor, try several actions at some of them, and learn what each costs."""
+    """Model that visits decisions with the actor, tries several actions at some of them, and learns their costs.
+
+    Args:
+        environment: environment of the training.
+        recipe: the recipe.
+        among: for each trained policy that the actor can choose instead of an action, its weights by name.
+
+    """
 
     policy: ChoosingActor  # type: ignore[assignment]
     recipe: OptionsRecipe  # type: ignore[assignment]
@@ -38,7 +45,7 @@ class OptionsModel(CounterfactualModel):
         self, environment: EthBrakeVecEnv, recipe: OptionsRecipe, among: Sequence[Mapping[str, Float32s]]
     ) -> None:
         self._among = among
-        super().__init__(environment, recipe)  # type: ignore[arg-type]  # it has what all models ask for
+        super().__init__(environment, recipe)  # type: ignore[arg-type]  # it has all keys that the base class reads
 
     def _setup_model(self) -> None:
         self._setup_lr_schedule()
@@ -72,9 +79,16 @@ class OptionsModel(CounterfactualModel):
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
 
     def _try_actions(self, seen: Float32s, moments: State) -> tuple[Float32s, Ints, Floats]:
-        """Try actions at some decisions. Return observations [B, F], numbers of the actions [B, C], and costs [B, C].
+        """Try several options (actions, or policies that act) at some visited decisions, each to the episode's end.
 
-        The first action is the one that the actor takes. ``caution`` is part of the costs.
+        Args:
+            seen: [steps, rows, F] observations at the visited decisions.
+            moments: states of the worlds at these decisions.
+
+        Returns for B decisions and C options at each: observations [B, F], numbers of the options [B, C] as from
+        ``ChoosingActor.choose``, and their costs [B, C]. The first option is the one that the actor takes. A cost is
+        minus the return, changed by the recipe's keys ``tie_break``, ``caution`` and ``relative``.
+
         """
         recipe, actor, learners = self.recipe, self.policy, len(self.engine.learners)
         observed, first, last = seen.reshape(-1, seen.shape[2]), actor.first, recipe.network.choices - 1
@@ -97,7 +111,7 @@ class OptionsModel(CounterfactualModel):
         each, back = np.unique(np.arange(len(rows))[:, None] * every + tried, return_inverse=True)
         row, number = each // every, each % every
         steps = holds[row]
-        if recipe.caution:  # one more branch of each decision brakes fully from there to the end
+        if recipe.caution:  # one more branch of each decision brakes fully to the end
             row, number = np.append(row, np.arange(len(rows))), np.append(number, np.full(len(rows), first))
             steps = np.append(steps, np.full(len(rows), FOR_GOOD))
         learner = rows[row] % learners
@@ -129,7 +143,15 @@ class OptionsModel(CounterfactualModel):
         return observed[rows], tried, costs
 
     def _usual(self, rows: Ints, least: Floats) -> Floats:
-        """Usual cost of a decision in the scenario of each row [B], updated by the ``least`` costs [B]."""
+        """Update the running mean cost of each scenario of a mixture; return the mean that belongs to each decision.
+
+        Args:
+            rows: [B] indices of the decisions' worlds among all visited worlds.
+            least: [B] cost of the best tried option at each decision.
+
+        The result [B] has a lower limit, so that costs can be divided by it.
+
+        """
         numbers = self._numbers[rows]
         first = int(numbers.min())
         drawn = members_of(

@@ -1,7 +1,7 @@
-"""The algorithm ``vine``: gradients of the return, measured by playing on from the same moment in two ways.
+"""The algorithm ``vine``: gradients of the return, measured by continuing from the same moment in two ways.
 
-Vine is the sampling of Schulman et al. 2015 (TRPO): branches from visited states with common random numbers. Recipes
-call it ``algorithm: counterfactual``.
+Vine is the sampling scheme of Schulman et al. 2015 (TRPO): branches from visited states with common random numbers.
+Recipes call it ``algorithm: counterfactual``.
 """
 
 from __future__ import annotations
@@ -23,13 +23,19 @@ from ethbrake_marl.training.training import Training
 
 
 class Counterfactual(Algorithm):
-    """Vine, with one actor for all learners, or a mixture of experts for one."""
+    """The algorithm vine: it measures gradients of the return, and trains an actor with them.
+
+    All learners share one actor; a single learner may have a mixture of experts instead.
+    """
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> CounterfactualModel:
-        """The model, with the weights of the policy to start from, or random ones."""
+        """Return a new model for a training, which learns in ``environment``.
+
+        It begins with the weights of the policy that the recipe's key ``start`` names, or with random weights.
+        """
         recipe = training.recipe
         assert isinstance(recipe, CounterfactualRecipe)
-        environment.engine.branch(environment.engine.moment())  # refuses what cannot be branched before it begins
+        environment.engine.branch(environment.engine.moment())  # raises at once if the engine cannot branch
         model = (CounterfactualModel if recipe.modes is None else ModesModel)(environment, recipe)
         start = recipe.policy_to_start_from(training.scenario)
         if start is not None:
@@ -40,12 +46,15 @@ class Counterfactual(Algorithm):
         return model
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Copy the running averages of the weights."""
+        """Return copies of the averaged weights of ``actor``, by the names in the bundle that ``network`` describes."""
         found: dict[str, Float32s] = actor.tensors(network)
         return found
 
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
-        """The optimiser of the actor, or of each expert and of the gating network."""
+        """Return the model's optimisers by name.
+
+        The only one is ``policy``, or in a mixture there are ``network_1``, ``network_2``, ..., and ``gate``.
+        """
         if not isinstance(model, ModesModel):
             return {"policy": model.policy.optimizer}
         members = {f"network_{k + 1}": actor.optimizer for k, actor in enumerate(model.policy.actors)}

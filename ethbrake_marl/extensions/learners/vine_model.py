@@ -26,7 +26,16 @@ from ethbrake_marl.policies.network_spec import Float32s
 
 
 class CounterfactualModel(BaseAlgorithm):
-    """Visit decisions by a deterministic actor, try some of them in two ways, and learn from the difference."""
+    """Model that visits decisions with a deterministic actor, tries two actions at some of them, and learns from that.
+
+    One of the two actions is higher than the actor's, the other is lower. The difference of the returns measures the
+    gradient of the return with respect to the action.
+
+    Args:
+        environment: environment of the training.
+        recipe: the recipe.
+
+    """
 
     policy: AveragedActor
 
@@ -48,7 +57,7 @@ class CounterfactualModel(BaseAlgorithm):
         self.set_random_seed(self.seed)
         kind: Any = AveragedActor if self.recipe.modes is None else ModesPolicy
         self.policy = kind(self.observation_space, self.action_space, self.lr_schedule, self.recipe)
-        if self.recipe.gradient_limit == "auto":  # a checkpoint keeps it with the policy's weights
+        if self.recipe.gradient_limit == "auto":  # a buffer, so that a checkpoint saves it
             self.policy.register_buffer("measured", torch.zeros(REMEMBERED, 2, dtype=torch.float64))
 
     def learn(
@@ -60,7 +69,7 @@ class CounterfactualModel(BaseAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
-        """Train for a number of decisions of learners."""
+        """Train until the learners have made ``total_timesteps`` decisions; arguments as in Stable-Baselines3."""
         total, told = self._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         told.on_training_start(locals(), globals())
         while self.num_timesteps < total:
@@ -70,7 +79,10 @@ class CounterfactualModel(BaseAlgorithm):
         return self
 
     def _update(self, told: BaseCallback, total: int) -> None:
-        """One round of collecting and learning."""
+        """Do one update of the training: collect decisions, and learn from them.
+
+        ``told`` is the training's callback, ``total`` the number of decisions in the whole training.
+        """
         actor = self.policy
         seen, moments = self._visit(told, actor.act)
         told.on_rollout_end()
@@ -78,7 +90,10 @@ class CounterfactualModel(BaseAlgorithm):
         self._train(actor, self._try_out(seen, moments, actor))
 
     def _visit(self, told: BaseCallback, act: Act) -> tuple[Float32s, State]:
-        """Drive on for ``n_steps``. Return observations [n_steps, rows, F] and the worlds' states, step by step."""
+        """Drive all worlds for ``n_steps`` decisions with the policy ``act``, and report them to the callback ``told``.
+
+        Returns the observations [n_steps, rows, F], and the states of the worlds at these decisions.
+        """
         seen, moments, numbers = [], [], []
         for _ in range(self.recipe.n_steps):
             observations: Any = self._last_obs
@@ -87,21 +102,32 @@ class CounterfactualModel(BaseAlgorithm):
             moments.append(self.engine.moment())
             new_obs, rewards, dones, infos = self.rows.step(act(observations)[:, np.newaxis])
             self.num_timesteps += self.n_envs
-            self._update_info_buffer([infos[row] for row in np.flatnonzero(dones)], dones[dones])  # others tell nothing
+            self._update_info_buffer(
+                [infos[row] for row in np.flatnonzero(dones)], dones[dones]
+            )  # only ended episodes have statistics
             self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]
             told.update_locals(locals())
             told.on_step()
-        self._numbers = np.concatenate(numbers)  # of those worlds in the training
+        self._numbers = np.concatenate(numbers)  # index of each visited world in the training
         return np.stack(seen), State.join(moments)
 
     def _try_out(self, seen: Float32s, moments: State, actor: Deterministic) -> Tried:
-        """Try some of the visited decisions with a higher and a lower action, each to the end of its episode."""
+        """Try some of the visited decisions with a higher and a lower action, each to the end of its episode.
+
+        Args:
+            seen: [steps, rows, F] observations at the visited decisions.
+            moments: states of the worlds at these decisions.
+            actor: policy that drives before and after the change of the action.
+
+        Returns the tried decisions with their measured gradients.
+
+        """
         recipe, learners = self.recipe, len(self.engine.learners)
         moving = np.flatnonzero(moving_rows(moments).repeat(learners))
         observed = seen.reshape(-1, seen.shape[2])
         rows, importance = choose_rows(observed, moving, recipe.counterfactuals, recipe.focus, actor.expect)
         least, most = recipe.offset.smallest, recipe.offset.largest
-        memory: Tensor | None = getattr(self.policy, "measured", None)  # where the limit is auto
+        memory: Tensor | None = getattr(self.policy, "measured", None)  # only if the gradient limit is auto
         if memory is not None:
             least = smallest_offset(memory.numpy(), least, most)
         sizes: Floats = least * (most / least) ** torch.rand(len(rows), dtype=torch.float64).numpy()
@@ -127,7 +153,10 @@ class CounterfactualModel(BaseAlgorithm):
         return Tried(then, actor.means(then), gradient[good].astype(np.float32), importance[good])
 
     def _train(self, actor: AveragedActor, tried: Tried) -> None:
-        """Regress the actor on better actions within the trust radius, and log the loss."""
+        """Train the actor on the decisions of ``tried`` towards better actions within the trust radius.
+
+        The loss is logged.
+        """
         recipe = self.recipe
         self._update_learning_rate(actor.optimizer)
         target, weight = trusted_targets(tried, recipe.trust_radius, recipe.anchor)

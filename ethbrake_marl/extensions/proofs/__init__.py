@@ -1,1 +1,1 @@
-"""Proven bounds on harm: nobody can do less, whatever the controlled vehicle does."""
+"""Proven bounds on harm that no behaviour of the controlled vehicles can beat."""

@@ -1,8 +1,8 @@
-"""Compiled: the least harm over all first meetings with one neighbour, by branch and bound.
+"""Least harm over all first meetings with one neighbour, by branch and bound.
 
-A meeting is a time and a closing speed. What it costs is its own closing speed squared and what must follow
-(``aftermath``). Cells of time and closing speed are halved until their bounds come close to the best meeting seen.
-docs/avoidability.md has the proof.
+A *meeting* is a first contact of the controlled vehicle with a neighbour: a time and a closing speed. Its harm is the
+squared closing speed and what must follow (``obstacle.after``). A *cell* is a range of times and closing speeds. Cells
+are halved until their bounds are close to the best meeting seen so far. docs/avoidability.md has the proof.
 """
 
 from __future__ import annotations
@@ -16,25 +16,33 @@ from ethbrake_marl.extensions.proofs.ramped_meetings import gentlest_ramped_betw
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats
 
-CELLS = 600  # room on the heap: after that many divisions a minimum stays as loose as it is
+CELLS = 600  # size of the heap, which limits the number of divisions
 
-# columns of a heap, of a cell of meetings: bound; times (s); closing speeds (m/s); of meetings behind also how much
-# further the rear vehicle has come (m)
+# Columns of a cell on the heap: bound (m2/s2); range of times (s); range of closing speeds (m/s); for meetings with the
+# rear vehicle also how much further than by full braking it has come (m).
 HARM, EARLY, LATE, SOFT, HARD, NEAR, FAR, HEAP_WIDTH = range(8)
 
-_SPLITS = 64  # parts at most into which decisions divide the times
+_SPLITS = 64  # largest number of first cells, which decisions divide
 
-_PART_S = 0.05  # of the times where brakes build up
+_PART_S = 0.05  # length of a first cell with brake build-up
 
-_TRIED = 8  # meetings tried before the search, to have something to compare with
+_TRIED = 8  # number of meetings evaluated before the search, for a first best value
 
 
 @compiled(apart=True)
 def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
-    """Least closing speed of the meetings between two times.
+    """Return the least closing speed of first contacts between the times ``early`` and ``late``, m/s.
 
-    It falls with the time, but for a leader that brakes harder than the controlled vehicle: it may then rise by the
-    difference.
+    It falls with time, except if the leader (front vehicle) brakes harder than the controlled vehicle: it may then rise
+    by the difference.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+
     """
     if kind >= RAMPED_FRONT:
         return gentlest_ramped_between(kind, at, early, late)
@@ -46,7 +54,11 @@ def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
 
 @compiled
 def decision_around(at: Floats, early: float, late: float) -> tuple[float, float]:
-    """Start and end of the step that holds these times; both ``late`` without decisions or over more than one."""
+    """Return start and end (s) of the decision step that holds both ``early`` and ``late``.
+
+    Returns ``late`` twice if there are no decision steps, or if the times lie in more than one step. ``at`` is one
+    world, an array with the columns of ``line.LINE``.
+    """
     step = at[LINE.TIME_STEP]
     if step <= 0.0:
         return late, late
@@ -58,10 +70,22 @@ def decision_around(at: Floats, early: float, late: float) -> tuple[float, float
 
 @compiled(apart=True)
 def lacking(kind: int, at: Floats, early: float, late: float, softest: float, hard: float, begin: float) -> float:
-    """How much the command in force at the meetings of a cell lacks, at least, of the extreme one that follows best.
+    """Return a lower bound (m/s2) on how far the command during a first contact is from the best command after it.
 
-    To meet gently the vehicle brakes (drives) before a meeting, and to soften what follows it drives (brakes) after it;
-    the command is one and the same in the whole step. Meetings of at most ``hard``, where ``softest`` is the least.
+    If the front vehicle is met first, the vehicle brakes before a gentle contact, and drives after it to soften the
+    impact from behind. If the rear vehicle is met first, it drives before and brakes after. The command is the same in
+    the whole decision step, so it cannot do both.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        softest: least closing speed of the contact, m/s.
+        hard: largest closing speed of the contact, m/s.
+        begin: start of the decision step, s.
+
     """
     whole = at[LINE.U_F] + at[LINE.A_F]
     turn = gentlest(kind, at, early)[1]
@@ -85,7 +109,21 @@ def harm_of(
     kind: int, at: Floats, early: float, late: float, soft: float, hard: float, floor: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Lower bound of the harm of the meetings of a cell."""
+    """Return a lower bound on the harm of the first contacts in a range of times and closing speeds, m2/s2.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        soft: least closing speed of the contact, m/s.
+        hard: largest closing speed of the contact, m/s.
+        floor: known lower bound on the harm at the other pair, m2/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
     begin, end = decision_around(at, early, late)
     lack = 0.0
     if end > late:
@@ -99,10 +137,19 @@ def harm_of(
 
 @compiled
 def room_for(heap: Floats, count: int, harm: float) -> int:
-    """Make room on the heap, whose first cell is the one of least harm, for a cell of this one; its place."""
+    """Make room on the heap for an entry with bound ``harm``; return its index. The caller fills in the other columns.
+
+    Index 0 holds the entry with the least bound.
+
+    Args:
+        heap: [CELLS, NEAR] entries ordered as a binary heap; changed in place.
+        count: number of entries so far.
+        harm: bound of the new entry, m2/s2.
+
+    """
     at = count
     while at > 0 and heap[(at - 1) // 2, HARM] > harm:
-        for c in range(heap.shape[1]):  # numba compiles the copy of a row with the text of an error, for 3 CPU-s
+        for c in range(heap.shape[1]):  # a copy of the whole row would take numba 3 s longer to compile
             heap[at, c] = heap[(at - 1) // 2, c]
         at = (at - 1) // 2
     heap[at, HARM] = harm
@@ -111,7 +158,18 @@ def room_for(heap: Floats, count: int, harm: float) -> int:
 
 @compiled(apart=True)
 def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: float, hard: float) -> int:
-    """Put a cell on the heap; the new number of cells."""
+    """Add a range of times and closing speeds to the heap; return the new number of entries.
+
+    Args:
+        heap: [CELLS, NEAR] entries ordered as a binary heap; changed in place.
+        count: number of entries so far.
+        harm: lower bound on the harm of first contacts in the range, m2/s2.
+        early: earliest time, s.
+        late: latest time, s.
+        soft: least closing speed, m/s.
+        hard: largest closing speed, m/s.
+
+    """
     at = room_for(heap, count, harm)
     heap[at, EARLY], heap[at, LATE], heap[at, SOFT], heap[at, HARD] = early, late, soft, hard
     return count + 1
@@ -119,7 +177,10 @@ def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: 
 
 @compiled(apart=True)
 def drop_first(heap: Floats, count: int) -> int:
-    """Take the first cell off the heap; the new number of cells."""
+    """Remove the entry with the least bound, index 0, from the heap; return the new number of entries.
+
+    ``count`` is the number of entries on the heap before.
+    """
     count -= 1
     at, below = 0, 1
     while below < count:
@@ -139,7 +200,21 @@ def drop_first(heap: Floats, count: int) -> int:
 def divide(
     kind: int, at: Floats, floor: float, count: int, plan: Floats, other: Floats, heap: Floats
 ) -> tuple[int, float]:
-    """Replace the first cell of the heap by its halves; their number, and the harm of a meeting within."""
+    """Replace the first entry of the heap, a range of times and closing speeds of first contacts, by its halves.
+
+    Returns the new number of entries, and a harm (m2/s2) that some contact in the range does not exceed.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        floor: known lower bound on the harm at the other pair, m2/s2.
+        count: number of entries on the heap.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: working memory of the search, [CELLS, NEAR].
+
+    """
     harm, early, late, soft, hard = (heap[0, HARM], heap[0, EARLY], heap[0, LATE], heap[0, SOFT], heap[0, HARD])
     count = drop_first(heap, count)
     middle = 0.5 * (early + late)
@@ -168,15 +243,28 @@ def least_harm(
     kind: int, at: Floats, first: float, last: float, floor: float, best: float, enough: float, plan: Floats,
     other: Floats, heap: Floats,
 ) -> float:  # fmt: skip
-    """Lower bound of the harm of all meetings between two times; ``best`` if none does less than that.
+    """Return a lower bound on the harm of all first contacts between two times (m2/s2), or ``best`` if none does less.
 
-    ``enough`` is proven without it: where some meeting does no more, 0 is returned at once.
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        first: earliest time of the contact, s after the controlled vehicle may act.
+        last: latest time of the contact, s.
+        floor: known lower bound on the harm at the other pair, m2/s2.
+        best: result if no contact does less harm, m2/s2.
+        enough: if some contact does no more harm than this (m2/s2), 0 is returned, because a bound of ``enough`` is
+            proven elsewhere.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: working memory of the search, [CELLS, NEAR].
+
     """
     for k in range(_TRIED):
         time = first + (last - first) * k / (_TRIED - 1)
         closing = gentlest(kind, at, time)[0]
         best = min(best, harm_of(kind, at, time, time, closing, closing, floor, plan, other))
-    # the meetings between both times, at most ``hard``, on the heap: one cell for each step
+    # put the meetings between both times, with closing speeds up to ``hard``, on the heap: one cell for each step
     hard = math.sqrt(best)
     count, begin = 0, first
     while begin < last:
@@ -198,7 +286,11 @@ def least_harm(
 
 @compiled
 def next_split(kind: int, at: Floats, time: float, last: float) -> float:
-    """The next time at which a decision falls or the leader comes to rest, at most ``last``."""
+    """Return the next time (s) at which a decision is due or the front vehicle comes to rest, at most ``last``.
+
+    With brake build-up it is at most ``_PART_S`` later than ``time``. ``kind`` is the kind of contact (``FRONT_FIRST``,
+    ...), ``at`` one world, an array with the columns of ``line.LINE``.
+    """
     until = last if kind < RAMPED_FRONT else min(last, time + _PART_S)
     if at[LINE.TIME_STEP] > 0.0:
         until = min(until, (math.floor(time / at[LINE.TIME_STEP] + 1e-6) + 1.0) * at[LINE.TIME_STEP])

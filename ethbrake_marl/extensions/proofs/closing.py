@@ -1,7 +1,7 @@
-"""Compiled: the least closing speed of a pair's first contact, whatever its vehicles and those around it do.
+"""Least closing speed of a pair's first contact, whatever its vehicles and their neighbours do.
 
-The leader goes as far ahead as it can (full drive where it is controlled, else full braking), the follower stays as
-far behind as it can (full braking). Where these extremes meet, every run of the pair meets no later.
+The extreme motions: the leader goes as far ahead as it can (full drive if it is controlled, else full braking), and the
+follower stays as far behind as it can (full braking). If these meet, every motion of the pair meets no later.
 docs/avoidability.md, "Teams", has the proof.
 """
 
@@ -14,7 +14,8 @@ from ethbrake_marl.extensions.proofs.plans import empty_plan, fill_braking, fill
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats
 
-# one pair: its gap; speed, onset and brakes of both; the leader's drive and speed limit where it is controlled
+# columns of a pair: gap; speed, onset and braking capacity of both vehicles; whether the leader is controlled, and then
+# its driving capacity and speed limit
 PAIR_GAP, LEADER_V, LEADER_ONSET, LEADER_A, LEADER_FREE, LEADER_U, LEADER_LIMIT = range(7)
 
 FOLLOWER_V, FOLLOWER_ONSET, FOLLOWER_A, PAIR_WIDTH = range(7, 11)
@@ -22,7 +23,7 @@ FOLLOWER_V, FOLLOWER_ONSET, FOLLOWER_A, PAIR_WIDTH = range(7, 11)
 
 @compiled(apart=True)
 def least_on_piece(constant: float, pressing: float, since: float, until: float) -> float:
-    """Least value of ``constant / t + pressing t / 2`` from ``since`` to ``until``."""
+    """Return the least value of ``(constant / t) + (pressing * t / 2)`` for ``t`` from ``since`` to ``until``."""
     least = constant / until + 0.5 * pressing * until
     if since > 0.0:
         least = min(least, constant / since + 0.5 * pressing * since)
@@ -37,9 +38,16 @@ def least_on_piece(constant: float, pressing: float, since: float, until: float)
 
 @compiled(apart=True)
 def least_before(at: Floats, met: float, squared: float) -> float:
-    """Least closing speed of a pair's first contact up to ``met``, where both extremes meet; a scripted leader.
+    """Return the least closing speed (m/s) of a pair's first contact until ``met``, for a leader that follows a script.
 
-    ``c(t) + g(t) / t``: the extremes' closing speed, and what must be added to it to be through their gap by then.
+    At time t the closing speed is at least ``c(t) + (g(t) / t)``. Here c and g are closing speed and gap of the extreme
+    motions, and ``g(t) / t`` is the speed that must be added to close the gap by then.
+
+    Args:
+        at: [PAIR_WIDTH] one pair, columns ``PAIR_GAP`` to ``FOLLOWER_A``.
+        met: time at which the extreme motions of the pair meet, s.
+        squared: their squared closing speed at that time, m2/s2.
+
     """
     if met <= 0.0:
         return math.sqrt(squared)
@@ -66,7 +74,17 @@ def least_before(at: Floats, met: float, squared: float) -> float:
 
 @compiled(apart=True)
 def least_closing_of_pair(at: Floats, until: float, plan: Floats, other: Floats) -> tuple[float, float]:
-    """Least closing speed at a pair's first contact, and its latest time; 0, inf where none is forced by ``until``."""
+    """Return the least closing speed (m/s) at a pair's first contact, and the latest time of that contact (s).
+
+    Returns 0 and infinity if no contact is forced by ``until``.
+
+    Args:
+        at: [PAIR_WIDTH] one pair, columns ``PAIR_GAP`` to ``FOLLOWER_A``.
+        until: horizon, s.
+        plan: working memory for one plan (``empty_plan``).
+        other: further working memory of the same kind.
+
+    """
     onset = at[LEADER_ONSET]
     if at[LEADER_FREE] > 0.0:
         full = onset + time_to_limit(at[LEADER_V], at[LEADER_U], at[LEADER_LIMIT])
@@ -82,7 +100,14 @@ def least_closing_of_pair(at: Floats, until: float, plan: Floats, other: Floats)
 
 @compiled
 def bound_pairs(pairs: Floats, until: Floats, out: Floats) -> None:
-    """Bounds of pairs ``pairs`` [n, PAIR_WIDTH] into ``out`` [n]; a touch counts as 0."""
+    """Compute the least harm of each of ``n`` pairs, whatever its vehicles and their neighbours do.
+
+    Args:
+        pairs: [n, PAIR_WIDTH] columns ``PAIR_GAP`` to ``FOLLOWER_A``.
+        until: [n] horizon of each pair, s.
+        out: [n] receives the bounds, m2/s2; a contact without impact counts as 0.
+
+    """
     plan, other = empty_plan(), empty_plan()
     for k in range(pairs.shape[0]):
         closing = least_closing_of_pair(pairs[k], until[k], plan, other)[0]

@@ -1,7 +1,8 @@
-"""Compiled: how much faster than the common speed of two touching vehicles one of them can be, and what that costs.
+"""Bounds on how much faster than their common speed one of two vehicles in contact can be, and what that costs.
 
-``share`` is the partner's share of both masses; ``press`` the acceleration with which they close under the best
-command (m/s2), ``reach`` how much of it a command can hold back. docs/avoidability.md has the proofs.
+A *flight* is a time in which the two are apart. ``share`` is the partner's share of both masses. ``press`` is the
+acceleration with which they close under the best command (m/s2); ``reach`` is how much of it a command can hold back.
+``opening`` is the speed with which they separate. docs/avoidability.md has the proofs.
 """
 
 from __future__ import annotations
@@ -13,10 +14,20 @@ from ethbrake_marl.physics.jit import compiled
 
 @compiled
 def flight_lead(share: float, press: float, reach: float, opening: float, flight: float) -> float:
-    """How far ahead of the common speed a flight of this length can bring the controlled vehicle, less what it costs.
+    """Return the speed (m/s) that a flight gains for the controlled vehicle over the common speed of both, less its
+    cost.
 
-    ``share (press L - o) - G``, where G is the least loss of command, at most ``reach`` a second, that keeps the two
-    apart for L: ``G L - G^2 / 2 reach >= press L^2 / 2 - o L``. -inf where nothing keeps them apart. [m/s]
+    A *flight* is a time in which the two vehicles are apart. For length L and opening speed o the lead over the common
+    speed is ``share (press L - o) - G``. G is the least loss of command, at most ``reach`` per second, that keeps the
+    two apart for L: ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o L``. Returns -inf if nothing keeps them apart.
+
+    Args:
+        share: partner's share of both masses, 0 to 1.
+        press: acceleration with which the two close under the best command, m/s2.
+        reach: part of ``press`` that a command can hold back, m/s2; infinite: no bound.
+        opening: speed with which the two separate, m/s.
+        flight: length of the flight, s.
+
     """
     relative = share * (press * flight - opening)
     if press * flight <= 2.0 * opening:
@@ -31,7 +42,18 @@ def flight_lead(share: float, press: float, reach: float, opening: float, flight
 
 @compiled
 def best_flight(share: float, press: float, reach: float, opening: float) -> float:
-    """The length of the flight of the largest ``flight_lead``; inf if it rises for ever."""
+    """Return the length (s) of the flight with the largest ``flight_lead``; infinite if the lead keeps rising with the
+    length.
+
+    A *flight* is a time in which the two vehicles are apart.
+
+    Args:
+        share: partner's share of both masses, 0 to 1.
+        press: acceleration with which the two close under the best command, m/s2.
+        reach: part of ``press`` that a command can hold back, m/s2; infinite: no bound.
+        opening: speed with which the two separate, m/s.
+
+    """
     if press <= 0.0:
         return math.inf
     if share <= 0.5:
@@ -50,9 +72,20 @@ def best_flight(share: float, press: float, reach: float, opening: float) -> flo
 def lead(
     share: float, press: float, reach: float, opening: float, shortest: float, longest: float, lost: float
 ) -> float:
-    """Largest ``flight_lead`` of lengths from ``shortest`` to ``longest``, of which ``lost`` is lost in any case.
+    """Return the largest ``flight_lead`` (m/s) of flights from ``shortest`` to ``longest`` (s).
 
-    Of all openings up to ``opening``: where flights are cut short, a smaller one may lead further.
+    A *flight* is a time in which the two vehicles are apart. The maximum is over all opening speeds up to ``opening``:
+    a smaller one may lead further if flights are cut short.
+
+    Args:
+        share: partner's share of both masses, 0 to 1.
+        press: acceleration with which the two close under the best command, m/s2.
+        reach: part of ``press`` that a command can hold back, m/s2; infinite: no bound.
+        opening: speed with which the two separate, m/s.
+        shortest: least length of the flight, s.
+        longest: largest length of the flight, s.
+        lost: speed that is lost in any case, m/s.
+
     """
     if press > 0.0:
         opening = min(opening, 0.5 * press * longest)
@@ -69,7 +102,17 @@ def lead(
 
 @compiled
 def decays(share: float, press: float, reach: float, bounce: float) -> bool:
-    """Whether no loss of command pays that makes a later bounce larger; ``reach`` then bounds what flights gain."""
+    """Return whether it never pays to give up some acceleration in order to make a later bounce larger.
+
+    If so, ``reach`` bounds the speed that the vehicle gains while the two are apart.
+
+    Args:
+        share: partner's share of both masses, 0 to 1.
+        press: acceleration with which the two close under the best command, m/s2.
+        reach: part of ``press`` that a command can hold back, m/s2; infinite: no bound.
+        bounce: coefficient of restitution.
+
+    """
     if share <= 0.5:
         return True
     if reach == math.inf or press <= 0.0:
@@ -84,10 +127,27 @@ def largest_lead(
     share: float, press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float,
     since: float, until: float,
 ) -> float:  # fmt: skip
-    """How much faster than the common speed, without loss, it can be between ``since`` and ``until``. [m/s]
+    """Return an upper bound (m/s) on how much faster the controlled vehicle is than the speed of both vehicles' centre
+    of mass.
 
-    The last flight before the rear meeting began with the first impact, after the window from ``late`` to ``end`` in
-    which ``lost`` is lost, or within it. ``reach`` is inf where ``press`` is not constant.
+    Both vehicles have met already. The centre of mass is the one that the best command alone would lead to. In the
+    *window* an earlier command still acts instead, which costs the speed ``lost``.
+
+    The bound covers three cases: the last time apart before the meeting with the other neighbour began with the first
+    impact, within the window, or after it.
+
+    Args:
+        share: partner's share of both masses, 0 to 1.
+        press: acceleration with which the two close under the best command, m/s2.
+        reach: part of ``press`` that a command can hold back, m/s2; infinite: no bound.
+        bounce: coefficient of restitution.
+        opening: speed with which the two separate, m/s.
+        lost: speed that is lost in the window, m/s.
+        late: start of the window, s.
+        end: end of the window, s.
+        since: earliest time of the meeting with the other neighbour, s.
+        until: latest time of that meeting, s.
+
     """
     if since < end:
         lost, end = 0.0, late
@@ -111,10 +171,20 @@ def largest_lead(
 def widest_flight(
     share: float, slack: float, press: float, drive: float, bounce: float, closing: float, back: float, time: float
 ) -> float:
-    """Most of ``sqrt(p^2 + 2 press s)`` in every flight from a partner that brakes harder by ``slack``; inf if unknown.
+    """Return the largest ``sqrt(p^2 + 2 press s)`` (m/s) while a vehicle and a partner that brakes harder are apart.
 
-    p is the speed with which the two part, s their gap. The first impact had ``closing`` and left the vehicle with
-    speed ``-back``. All within ``time``; ``drive`` is the most that a command accelerates. [m/s]
+    p is the speed with which the two separate, s their gap. Returns infinity if no bound is known.
+
+    Args:
+        share: partner's share of both masses, 0 to 1.
+        slack: by how much the partner brakes harder, m/s2.
+        press: acceleration with which the two close under the best command, m/s2.
+        drive: largest acceleration by a command, m/s2.
+        bounce: coefficient of restitution.
+        closing: closing speed of the first impact, m/s.
+        back: backward speed of the vehicle after that impact, m/s.
+        time: time that is covered, s.
+
     """
     if not slack > 0.0 or not bounce * bounce * press < slack:
         return math.inf

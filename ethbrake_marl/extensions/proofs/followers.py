@@ -1,11 +1,12 @@
-"""Compiled: the harm at the other pair that must follow a first meeting, whatever the controlled vehicle does then.
+"""Harm at the other pair that must follow a first meeting, whatever the controlled vehicle does then.
 
-A first meeting at ``time`` with ``closing`` leaves a state that is known exactly. From it on, the centre of mass of
-the two moves on a path that no command improves but the extreme one, and the controlled vehicle is faster (slower)
-than the centre only while it comes back to its partner. ``lead`` bounds that. docs/avoidability.md has the proofs.
+A first meeting at a given time with closing speed ``closing`` leaves an exactly known state. From then on, no command
+beats the extreme one for the path of the two vehicles' centre of mass, and the controlled vehicle is faster (slower)
+than the centre only until it returns to its partner; ``flights.largest_lead`` bounds by how much. docs/avoidability.md
+has the proofs.
 
-A cell of meetings lies between ``early`` and ``late``; its state is taken at ``early``. From ``late`` to ``end`` the
-command of the decision before is still in force, which lacks at least ``lack`` of the extreme one (m/s2).
+The meetings of a cell lie between ``early`` and ``late``; the state is taken at ``early``. From ``late`` to ``end`` the
+command of the earlier decision is still in force; it falls short of the extreme command by at least ``lack`` (m/s2).
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ from ethbrake_marl.extensions.proofs.plans import fill_braking, fill_drive_then_
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats
 
-STRUCK_M = 1e-6  # nearer than this a leader counts as touching the obstacle
+STRUCK_M = 1e-6  # below this distance a leader counts as in contact with the obstacle
 
-HELD_M = 1e-6  # more room than rounding can make of the gap to the leader
+HELD_M = 1e-6  # allowance for rounding in the gap to the leader
 
-LEADS = (0.02, 0.05, 0.1, 0.2, 0.4)  # s before the latest meeting at which the time is divided, to bound both parts
+LEADS = (0.02, 0.05, 0.1, 0.2, 0.4)  # s before the latest meeting; the time is divided there to bound both parts
 
 
 @compiled
@@ -30,7 +31,11 @@ def least_of_line(
     start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, since: float,
     until: float,
 ) -> float:  # fmt: skip
-    """Least value of ``start + slope t + bend (t - turn)+ + other_bend (t - other_turn)+`` from since to until."""
+    """Return the least value of a piecewise linear function of time from ``since`` to ``until``.
+
+    The function is ``start + slope t + bend (t - turn)+ + other_bend (t - other_turn)+``, where ()+ is the positive
+    part.
+    """
     least = math.inf
     for time in (since, until, min(max(turn, since), until), min(max(other_turn, since), until)):
         value = start + slope * time + bend * max(time - turn, 0.0) + other_bend * max(time - other_turn, 0.0)
@@ -43,9 +48,31 @@ def least_closing(
     start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, share: float,
     press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float, until: float,
 ) -> float:  # fmt: skip
-    """Least closing speed of a second meeting at most ``until``: that of the common speed, less the lead.
+    """Return the least closing speed (m/s) at which the controlled vehicle meets its second neighbour, after it met the
+    first.
 
-    The time is divided at one of a few moments: what was lost in the window counts only after it.
+    The *common speed* is the speed of the centre of mass of the two vehicles that met first. The result is the closing
+    speed that the second neighbour has to this centre, less the largest lead of the controlled vehicle over it
+    (``largest_lead``). The *window* is the time in which an earlier command still acts, which costs the speed ``lost``.
+    Times count from the first contact, in s.
+
+    Args:
+        start: closing speed of the second neighbour to the centre of mass, at the first contact, m/s.
+        slope: its rate of change, m/s2.
+        turn: first time at which the rate changes, s.
+        bend: change of the rate at ``turn``, m/s2.
+        other_turn: second time at which the rate changes, s.
+        other_bend: change of the rate at ``other_turn``, m/s2.
+        share: share of the partner of the first contact in both masses, 0 to 1.
+        press: acceleration with which these two close under the best command, m/s2.
+        reach: part of ``press`` that a command can hold back, m/s2.
+        bounce: coefficient of restitution.
+        opening: speed with which the two separate after the first contact, m/s.
+        lost: speed that is lost in the window, m/s.
+        late: start of the window, s.
+        end: end of the window, s.
+        until: latest time of the second meeting, s.
+
     """
     best = least_of_line(start, slope, turn, bend, other_turn, other_bend, 0.0, until)
     best -= largest_lead(share, press, reach, bounce, opening, lost, late, end, 0.0, until)
@@ -65,9 +92,21 @@ def least_closing(
 def pushed_by_leader(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Least closing speed at the rear, from the centre of mass of leader and controlled vehicle; 0: not proven.
+    """Return the least closing speed (m/s) at the rear pair after a first contact with the front vehicle (leader).
 
-    A leader that stands keeps its place, so a later meeting is the same one later: only what holds for all counts.
+    The bound follows from the centre of mass of leader and controlled vehicle. Returns 0 if nothing is proven. If the
+    leader stands, a later first contact differs only in its time, so ``late``, ``end`` and ``lack`` are not used.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        end: time until which the command of the earlier decision stays in force, s.
+        lack: least amount by which that command falls short of the best one, m/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     share, rest, press = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.U_F] + at[LINE.A_L]
     v_l, way_l = leader(at, early)
@@ -87,7 +126,7 @@ def pushed_by_leader(
         return 0.0
     reach = (
         at[LINE.U_F] + at[LINE.A_F] if until * at[LINE.A_L] <= v_l else math.inf
-    )  # the leader moves, however soft the impact
+    )  # finite if the leader still moves until then, however soft the impact
     if v_l <= 0.0:
         slowest = max(v_r - at[LINE.A_R] * max(until - onset, 0.0), 0.0)
         least = least_of_line(slowest - speed, -push, 0.0, 0.0, stand, -share * at[LINE.A_L], 0.0, until)
@@ -100,7 +139,19 @@ def pushed_by_leader(
 
 @compiled(apart=True)
 def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: Floats, other: Floats) -> float:
-    """Least closing speed at the rear of one that cannot fall far behind a leader of harder brakes; 0: not proven."""
+    """Return the least closing speed (m/s) at the rear pair after a first contact with a leader that brakes harder.
+
+    The controlled vehicle then stays near the leader (front vehicle). Returns 0 if nothing is proven.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
     share, rest, bounce = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.RESTITUTION]
     v_l, way_l = leader(at, early)
     v_r, way_r = follower(at, early)
@@ -139,9 +190,21 @@ def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: 
 def after_front(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Least squared closing speed at the rear after the leader was met from ``early`` on with at most ``closing``.
+    """Return the least squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
 
-    What is known of the centre of mass does not hold where an obstacle may throw both back.
+    It is the largest of several bounds. Those that rest on the centre of mass of both vehicles do not hold if an
+    obstacle may throw them back, and are then left out.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        end: time until which the command of the earlier decision stays in force, s.
+        lack: least amount by which that command falls short of the best one, m/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     share, rest = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE]
     v_l, way_l = leader(at, early)
@@ -166,9 +229,16 @@ def after_front(
 
 @compiled
 def obstacle_harm(at: Floats, late: float, closing: float) -> float:
-    """Least squared speed at which the leader, met by ``late``, meets the obstacle ahead: only its own brakes slow it.
+    """Return the least squared speed (m2/s2) at which the front vehicle hits the obstacle after the controlled vehicle
+    pushed it.
 
-    None is certain where it stands at the obstacle already: all three are one cluster then.
+    Only its own brakes slow it. Returns 0 if it already stands at the obstacle, because all three are then one cluster.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        late: latest time of the first contact, s.
+        closing: least closing speed of the push, m/s.
+
     """
     if not STRUCK_M < at[LINE.OBSTACLE] - at[LINE.V_L] * at[LINE.V_L] / (2.0 * at[LINE.A_L]) < math.inf:
         return 0.0
@@ -185,9 +255,21 @@ def obstacle_harm(at: Floats, late: float, closing: float) -> float:
 def braking_after(
     gap: float, least_gap: float, v_l: float, a_l: float, v_f: float, a_f: float, plan: Floats, other: Floats
 ) -> float:
-    """Least squared closing speed with the leader of one that brakes at most with ``a_f``; 0 if none is certain.
+    """Return the least squared closing speed (m2/s2) with which a vehicle meets the front vehicle if it brakes with at
+    most ``a_f``.
 
-    Its gap is at most ``gap``, and at least ``least_gap`` where it matters: behind a leader that brakes harder.
+    Returns 0 if no contact is certain.
+
+    Args:
+        gap: largest possible gap, m.
+        least_gap: least possible gap, m; it matters if the front vehicle brakes harder.
+        v_l: speed of the front vehicle, m/s.
+        a_l: its braking capacity, m/s2.
+        v_f: speed of the braking vehicle, m/s.
+        a_f: its braking capacity, m/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     fill_braking(plan, 0.0, a_l)
     fill_braking(other, 0.0, a_f)
@@ -203,7 +285,23 @@ def pushed_by_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, gap: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Least closing speed at the front, from the centre of mass of both other vehicles; for ``a_f >= a_r``."""
+    """Return the least closing speed (m/s) at the front pair after the rear vehicle hit the controlled one.
+
+    The bound follows from the centre of mass of these two vehicles. The controlled vehicle must have brakes at least as
+    strong as the rear one.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        end: time until which the command of the earlier decision stays in force, s.
+        lack: least amount by which that command falls short of the best one, m/s2.
+        gap: gap to the front vehicle at ``early``, m.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
     share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
     v_l = leader(at, early)[0]
     bounce = at[LINE.RESTITUTION]
@@ -226,7 +324,20 @@ def pushed_by_rear(
 
 @compiled(apart=True)
 def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: Floats, other: Floats) -> float:
-    """Least closing speed at the front of one that stays ahead of both; for ``a_f >= a_r``. 0 where it may rise."""
+    """Return the least closing speed (m/s) at the front pair after the rear vehicle hit the controlled one.
+
+    The bound follows because the controlled vehicle stays ahead of the rear one. The controlled vehicle must have
+    brakes at least as strong as the rear one. Returns 0 if the closing speed may rise.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        closing: largest closing speed of the contact, m/s.
+        gap: gap to the front vehicle at ``early``, m.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
     share, v_l = at[LINE.REAR_SHARE], leader(at, early)[0]
     pooled = (1.0 - share) * at[LINE.A_F] + share * at[LINE.A_R]
     mean = 0.5 * (at[LINE.A_F] + pooled)

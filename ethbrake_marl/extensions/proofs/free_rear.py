@@ -1,8 +1,9 @@
-"""Compiled: the least harm over all first meetings with a rear vehicle that may do as it likes.
+"""Least harm over all first meetings with a rear vehicle that may act freely.
 
-It is never behind, nor slower than, its full braking, but it may come earlier. So a meeting is a time, how much
-*further* it has come than by full braking, and a closing speed. Cells of these are halved until their bounds come
-close to the least meeting tried. docs/avoidability.md, "Teams", has the proof.
+The rear vehicle is never behind, nor slower than, its own full braking, but it may arrive earlier. So a meeting is
+described by its time, how much *further* the rear vehicle has come than by full braking, and the closing speed. Cells
+of these are halved until their bounds are close to the best meeting tried. docs/avoidability.md, "Teams", has the
+proof.
 """
 
 from __future__ import annotations
@@ -28,18 +29,25 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.motion import solo_motion
 from ethbrake_marl.physics.state import Floats
 
-SINCE, POWER, FLOOR, BEST, SEARCH = range(5)  # of a search: see gained; the front pair's own bound; the least meeting
+# Columns of a search: SINCE and POWER are arguments of ``gained``; FLOOR is the front pair's own bound; BEST is the
+# least harm of a meeting so far.
+SINCE, POWER, FLOOR, BEST, SEARCH = range(5)
 
-SEARCHED = 400  # divisions after which the least meeting stays as loosely bounded as it is
+SEARCHED = 400  # largest number of divisions
 
-_SHORT_S = 1e-3
+_SHORT_S = 1e-3  # least time to divide by
 
 
 @compiled
 def gained(near: float, time: float, since: float, power: float) -> float:
-    """How much faster than by full braking the rear vehicle is, at least, if it has come ``near`` further by ``time``.
+    """Return by how much, at least, the rear vehicle is faster at ``time`` than by its own full braking, m/s.
 
-    It holds back from ``since`` on, at most ``power`` a second (infinite where others push it).
+    Args:
+        near: by how much it has come further than by full braking, m.
+        time: time of the comparison, s.
+        since: time from which on it may hold back its brakes, s.
+        power: largest acceleration by which it holds them back, m/s2; infinite if other vehicles push it.
+
     """
     if near <= 0.0 or time <= since:
         return 0.0
@@ -51,7 +59,11 @@ def gained(near: float, time: float, since: float, power: float) -> float:
 
 @compiled
 def behind_full_braking(at: Floats, early: float, late: float) -> float:
-    """Gap behind, at least, where both brake fully: the controlled one until ``early``, the rear one until ``late``."""
+    """Return the least gap (m) to the rear vehicle if the controlled vehicle brakes until ``early``, the rear one until
+    ``late``.
+
+    ``at`` is one world, an array with the columns of ``line.LINE``; the times are in s.
+    """
     return float(
         at[LINE.GAP_R] + solo_motion(at[LINE.V_F], -at[LINE.A_F], 0.0, math.inf, early)[1] - follower(at, late)[1]
     )
@@ -59,9 +71,21 @@ def behind_full_braking(at: Floats, early: float, late: float) -> float:
 
 @compiled
 def soft_behind(at: Floats, early: float, late: float, near: float, far: float, since: float, power: float) -> float:
-    """Least closing speed of the meetings behind in a cell."""
+    """Return the least closing speed (m/s) of the first contacts with the rear vehicle in a range of times and
+    distances (``near`` to ``far``).
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        near: least distance by which the rear vehicle has come further than by full braking, m.
+        far: largest such distance, m.
+        since: time from which on the rear vehicle may hold back its brakes, s.
+        power: largest acceleration by which it holds them back, m/s2.
+
+    """
     faster = gained(near, late, since, power)
-    # of one that comes as much further, by the fastest way to be there: brake, then drive; negative where it is faster
+    # the fastest way of the controlled vehicle to that place is to brake, then to drive
     brake = braking_to_rear(at, late, far + faster * (late - early))
     closing = follower(at, late)[0] - braked_then_driven(at, brake, late)[1]
     return max(closing + faster, 0.0)
@@ -72,10 +96,23 @@ def after_behind(
     at: Floats, early: float, late: float, near: float, far: float, hard: float, faster: float, moved: Floats,
     plan: Floats, other: Floats,
 ) -> float:  # fmt: skip
-    """Least squared closing speed at the front after the meetings behind of a cell, of at most ``hard``.
+    """Return the least squared closing speed (m2/s2) at the front pair after a first contact with the rear vehicle.
 
-    The state is one at ``early`` that is, at every later time of the cell, no further and no faster than that of any
-    meeting there: ``near`` to ``far`` further than by full braking, and ``faster``.
+    The bound starts from a state at ``early`` that is at every later time no further and no faster than after any of
+    these contacts.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        near: least distance by which the rear vehicle has come further than by full braking, m.
+        far: largest such distance, m.
+        hard: largest closing speed of the contact, m/s.
+        faster: least speed by which the rear vehicle is faster than by full braking, m/s.
+        moved: working memory for a second world, [LINE.WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     further = near - faster * (late - early)
     v_l, way_l = leader(at, early)
@@ -104,7 +141,27 @@ def put_behind(
     at: Floats, early: float, late: float, near: float, far: float, soft: float, hard: float, search: Floats,
     count: int, moved: Floats, plan: Floats, other: Floats, heap: Floats,
 ) -> int:  # fmt: skip
-    """Put a cell of meetings behind on the heap if it may hold less harm than the best; the new number of cells."""
+    """Add a range of first contacts with the rear vehicle to the heap if it may do less harm than the best one known.
+
+    Returns the new number of entries on the heap.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        near: least distance by which the rear vehicle has come further than by full braking, m.
+        far: largest such distance, m.
+        soft: least closing speed, m/s.
+        hard: largest closing speed, m/s.
+        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
+            m2/s2) and ``BEST`` (least harm known so far, m2/s2).
+        count: number of entries on the heap.
+        moved: working memory for a second world, [LINE.WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: [SEARCHED + 4, HEAP_WIDTH] entries, the least bound first; changed in place.
+
+    """
     since, power, floor = search[SINCE], search[POWER], search[FLOOR]
     room = at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, late)[1] - follower(at, early)[1]
     span = max(late - since, 0.0)
@@ -127,7 +184,21 @@ def put_behind(
 def try_behind(
     at: Floats, time: float, near: float, far: float, search: Floats, moved: Floats, plan: Floats, other: Floats
 ) -> None:
-    """Lower the best to the bound of the gentlest meeting behind at ``time`` that is about ``near`` further."""
+    """Lower ``search[BEST]`` to the harm of the gentlest first contact with the rear vehicle at ``time``, if that is
+    less.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        time: time of the contact, s.
+        near: distance by which the rear vehicle has come further than by full braking, m; raised if too small.
+        far: largest such distance, m.
+        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
+            m2/s2) and ``BEST`` (least harm known so far, m2/s2); only ``BEST`` changes.
+        moved: working memory for a second world, [LINE.WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
     near = max(near, behind_full_braking(at, time, time))
     if near > far or near > at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, time)[1] - follower(at, time)[1]:
         return
@@ -141,7 +212,21 @@ def try_behind(
 def divide_behind(
     at: Floats, search: Floats, count: int, moved: Floats, plan: Floats, other: Floats, heap: Floats
 ) -> int:
-    """Replace the first cell of the heap by its halves; the new number of cells."""
+    """Replace the first entry of the heap by its halves; return the new number of entries.
+
+    An entry is a range of times, distances and closing speeds of first contacts with the rear vehicle.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
+            m2/s2) and ``BEST`` (least harm known so far, m2/s2); only ``BEST`` changes.
+        count: number of entries on the heap.
+        moved: working memory for a second world, [LINE.WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: [SEARCHED + 4, HEAP_WIDTH] entries, the least bound first; changed in place.
+
+    """
     early, late, near, far = heap[0, EARLY], heap[0, LATE], heap[0, NEAR], heap[0, FAR]
     soft, hard = heap[0, SOFT], min(heap[0, HARD], math.sqrt(search[BEST]))
     count = drop_first(heap, count)
@@ -169,7 +254,21 @@ def divide_behind(
 def meetings_behind(
     at: Floats, last: float, search: Floats, moved: Floats, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Lower bound of the harm, if below the best, of all meetings behind that come first, until ``last``."""
+    """Return a lower bound on the harm of all first contacts with the rear vehicle until ``last`` (s), m2/s2.
+
+    The result is at most ``search[BEST]``, the least harm that is known before.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        last: latest time of the contact, s after the controlled vehicle may act.
+        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
+            m2/s2) and ``BEST`` (least harm known so far, m2/s2); only ``BEST`` changes.
+        moved: working memory for a second world, [LINE.WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: working memory of the search, [SEARCHED + 4, HEAP_WIDTH].
+
+    """
     since, hard, count = min(search[SINCE], last), math.sqrt(search[BEST]), 0
     if since > 0.0:
         count = put_behind(at, 0.0, since, 0.0, 0.0, 0.0, hard, search, count, moved, plan, other, heap)

@@ -1,8 +1,8 @@
-"""Compiled: the least harm of the front three, Vehicle 1 scripted, Vehicle 2 controlled, the one behind it anything.
+"""Least harm of the first three vehicles: Vehicle 1 scripted, Vehicle 2 controlled, the third one arbitrary.
 
-The meetings with the leader are those of one controlled vehicle (``lower_bound_kernel``): a rear vehicle that comes
-earlier only makes what follows worse. Those behind have a search of their own (``meetings_behind``).
-docs/avoidability.md, "Teams", has the proofs.
+Meetings with the leader are bounded as for one controlled vehicle (``lower_bound.front_first``): a rear vehicle that
+arrives earlier only makes the rest worse. Meetings with the rear vehicle have their own search
+(``free_rear.meetings_behind``). docs/avoidability.md, "Teams", has the proofs.
 """
 
 from __future__ import annotations
@@ -35,9 +35,19 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(apart=True)
 def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Floats, other: Floats) -> float:
-    """Least harm where leader and rear vehicle meet, with the controlled one between them; inf where they do not.
+    """Return the least harm (m2/s2) of a contact of all three vehicles at the same time; infinity if there can be none.
 
-    The front pair has at least the least closing speed of its meetings, the other one what is left.
+    Front and rear vehicle then close with at least some speed W, which the two pairs share. The front pair's part of W
+    is at least its least closing speed of any first contact.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        first: earliest first contact with the front vehicle, s.
+        last: latest first contact with the front vehicle, s.
+        pair: working memory for a pair, [PAIR_WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     pair[PAIR_GAP], pair[LEADER_ONSET], pair[LEADER_FREE] = at[LINE.GAP_L] + at[LINE.GAP_R], 0.0, 0.0
     pair[LEADER_V], pair[LEADER_A] = at[LINE.V_L], at[LINE.A_L]
@@ -54,13 +64,25 @@ def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Float
 
 @compiled(apart=True)
 def late_meetings(at: Floats, first: float, stand: float, plan: Floats, other: Floats) -> int:
-    """Whether the rear vehicle may first meet the controlled one only after it would stand by full braking.
+    """Return a code: may the rear vehicle first touch the controlled one after the time at which it would stand by
+    braking?
 
-    0: no. 1: yes, and then no harm is less than where the leader is met first. 2: yes, and nothing is proven.
+    0: it cannot. 1: it may, and the harm is then no less than if the front vehicle is met first. 2: it may, and nothing
+    is proven.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        first: earliest first contact with the front vehicle, s; infinite: none.
+        stand: time at which the rear vehicle stands by full braking, s.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     if first == math.inf or not stays_ahead(at, first, first, plan, other):
         return 0
-    _, end, leans = last_meeting(at, first, plan, other)  # first of the leader, the rear one braking fully
+    _, end, leans = last_meeting(
+        at, first, plan, other
+    )  # latest first meeting with the leader if the rear vehicle brakes fully
     if end <= stand and not leans:
         return 0
     leader_moves = at[LINE.A_F] < at[LINE.A_L] and at[LINE.V_L] > at[LINE.A_L] * stand
@@ -75,9 +97,25 @@ def combined_bound_of_team(
     at: Floats, until: float, front: float, rear: float, since: float, power: float, pair: Floats, moved: Floats,
     plan: Floats, other: Floats, heap: Floats, heap_behind: Floats,
 ) -> float:  # fmt: skip
-    """Least harm of the front three where contact is unavoidable, whoever is met first; 0 if that may be after until.
+    """Return the least harm (m2/s2) of the first three vehicles in a world with unavoidable contact, whoever is met
+    first.
 
-    ``front`` and ``rear`` are the pairs' own bounds. The rear vehicle may hold back from ``since`` on, by ``power``.
+    Returns 0 if the harm may come after ``until``.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        until: horizon, s; harm after it does not count.
+        front: bound on the harm of the front pair alone, m2/s2.
+        rear: bound on the harm of the rear pair alone, m2/s2.
+        since: time from which on the rear vehicle may hold back its brakes, s.
+        power: largest acceleration by which it holds them back, m/s2.
+        pair: working memory for a pair, [PAIR_WIDTH].
+        moved: working memory for a second world, [LINE.WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: working memory for contacts with the front vehicle, [CELLS, NEAR].
+        heap_behind: working memory for contacts with the rear vehicle, [SEARCHED + 4, HEAP_WIDTH].
+
     """
     rest, stand = last_rest(at)
     if not rest < until:
@@ -90,7 +128,7 @@ def combined_bound_of_team(
     once = all_at_once(at, first, meet_front(at, 0.0, plan, other), pair, plan, other)
     search = np.empty(SEARCH)
     search[SINCE], search[POWER], search[FLOOR] = since, power, front
-    for time_step in (0.0, step):  # what holds for any command holds for one that changes at decisions only
+    for time_step in (0.0, step):  # a bound for all commands also holds for commands that change at decisions only
         at[LINE.TIME_STEP] = time_step
         best = min(front_first(at, rear, LARGE, front + rear, plan, other, heap), once)
         if time_step <= 0.0:
@@ -108,9 +146,16 @@ def combined_bound_of_team(
 
 @compiled
 def bound_threes(states: Floats, until: Floats, pairs: Floats, since: Floats, power: Floats, out: Floats) -> None:
-    """Combined bounds of the front three of worlds ``states`` [n, WIDTH] into ``out`` [n]; contact is unavoidable.
+    """Compute the combined bound of the first three vehicles for each of ``n`` worlds with unavoidable contact.
 
-    ``pairs`` [n, 2] are the bounds of their two pairs.
+    Args:
+        states: [n, LINE.WIDTH] the worlds, one row each, with the columns of ``line.LINE``.
+        until: [n] horizon, s.
+        pairs: [n, 2] bounds of the two pairs alone, m2/s2.
+        since: [n] time from which on the rear vehicle may hold back its brakes, s.
+        power: [n] largest acceleration by which it holds them back, m/s2.
+        out: [n] receives the bounds, m2/s2.
+
     """
     plan, other, pair, moved = empty_plan(), empty_plan(), np.empty(PAIR_WIDTH), np.empty(LINE.WIDTH)
     heap, heap_behind = np.empty((CELLS, NEAR)), np.empty((SEARCHED + 4, HEAP_WIDTH))

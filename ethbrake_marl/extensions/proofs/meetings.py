@@ -1,8 +1,8 @@
-"""Compiled: the gentlest first meeting of the controlled vehicle with a neighbour at a given time.
+"""The gentlest first meeting of the controlled vehicle with a neighbour at a given time.
 
-Times count from the moment at which the controlled vehicle may act; the front vehicle (leader, l) brakes by then, f
-is the controlled one, the rear vehicle (r) coasts to its onset and then brakes. All speeds and gaps are >= 0.
-docs/avoidability.md has the proofs.
+A *meeting* is a first contact. Times count from the moment at which the controlled vehicle (f) may act. The front
+vehicle (leader, l) brakes by then; the rear vehicle (r) coasts to its onset and then brakes. All speeds and gaps are
+>= 0. docs/avoidability.md has the proofs.
 """
 
 from __future__ import annotations
@@ -21,14 +21,16 @@ from ethbrake_marl.extensions.proofs.ramped_meetings import gentlest_ramped
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats
 
-_GUARD = 2.0**-46  # of the positions: a way that rounding shortens must not make a meeting look harder
+_GUARD = 2.0**-46  # relative allowance for rounding of positions, so that no meeting appears harder than it is
 
 
 @compiled(apart=True)
 def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
-    """Least closing speed of a meeting with the leader at ``time``, and how long it must be driven before braking.
+    """Return the least closing speed (m/s) of a contact with the front vehicle at ``time``, and how long to drive first
+    (s).
 
-    The slowest way to be there then: drive, then brake.
+    The slowest way to be there at that time is to drive, then to brake. ``at`` is one world, an array with the columns
+    of ``line.LINE``.
     """
     v_l, way = leader(at, time)
     place, v, u, a = at[LINE.GAP_L] + way, at[LINE.V_F], at[LINE.U_F], at[LINE.A_F]
@@ -49,7 +51,11 @@ def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
 
 @compiled
 def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, float]:
-    """Way and speed at ``time`` of one that brakes for ``brake`` (at most to rest), then drives."""
+    """Return distance (m) and speed (m/s) of the controlled vehicle at ``time`` if it brakes for ``brake`` s, then
+    drives.
+
+    It brakes at most to rest. ``at`` is one world, an array with the columns of ``line.LINE``.
+    """
     v, u, a = at[LINE.V_F], at[LINE.U_F], at[LINE.A_F]
     braking = min(brake, v / a)
     slow = max(v - a * brake, 0.0)
@@ -63,9 +69,14 @@ def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, fl
 
 @compiled(apart=True)
 def braking_to_rear(at: Floats, time: float, further: float) -> float:
-    """How long it must be braked to be met by the rear vehicle at ``time``, if it is driven from then on.
+    """Return for how long (s) the controlled vehicle must brake, then drive, so that the rear vehicle meets it at
+    ``time``.
 
-    Or by one that has come ``further`` than the rear vehicle by full braking (m).
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        time: time of the contact, s after the controlled vehicle may act.
+        further: by how much the rear vehicle has come further than by full braking, m.
+
     """
     place = follower(at, time)[1] - at[LINE.GAP_R] + further
     low, high = 0.0, time
@@ -80,9 +91,11 @@ def braking_to_rear(at: Floats, time: float, further: float) -> float:
 
 @compiled(apart=True)
 def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
-    """Least closing speed of a meeting with the rear vehicle at ``time``, and how long it must be braked before.
+    """Return the least closing speed (m/s) of a contact with the rear vehicle at ``time``, and how long to brake first
+    (s).
 
-    The fastest way to be there then: brake, then drive. The braking is infinite where that is at its speed limit.
+    The fastest way to be there at that time is to brake, then to drive. The braking is infinite if the vehicle is then
+    at its speed limit. ``at`` is one world, an array with the columns of ``line.LINE``.
     """
     brake = braking_to_rear(at, time, 0.0)
     speed = braked_then_driven(at, brake, time)[1]
@@ -91,7 +104,17 @@ def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
 
 @compiled(apart=True)
 def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
-    """``gentlest_front`` or ``gentlest_rear``, or ``gentlest_ramped``."""
+    """Return the least closing speed (m/s) of a first contact at ``time``, and how long to drive or brake first (s).
+
+    With brake build-up the second result is 0.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        time: time of the contact, s after the controlled vehicle may act.
+
+    """
     if kind >= RAMPED_FRONT:
         return gentlest_ramped(kind, at, time), 0.0
     return gentlest_front(at, time) if kind == FRONT_FIRST else gentlest_rear(at, time)
@@ -99,7 +122,18 @@ def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
 
 @compiled(apart=True)
 def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
-    """When one that drives for ``drive``, then brakes, meets the leader."""
+    """Return the time (s) at which the controlled vehicle, which drives for ``drive`` s and then brakes, meets the
+    front one.
+
+    Infinite if they never meet.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        drive: duration of the drive, s; infinite: drive all the time.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
     fill_braking(other, 0.0, at[LINE.A_L])
     return walk(at[LINE.GAP_L], at[LINE.V_L], other, at[LINE.V_F], plan, math.inf)[1]
@@ -107,7 +141,18 @@ def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
-    """When the rear vehicle meets one that brakes for ``brake``, then drives."""
+    """Return the time (s) at which the rear vehicle meets the controlled one, which brakes for ``brake`` s, then
+    drives.
+
+    Infinite if they never meet.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        brake: duration of the braking, s.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
     fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])
     fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
     return walk(
@@ -117,7 +162,17 @@ def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Floats) -> bool:
-    """Whether one that drives for ``drive``, then brakes, is not met from behind until then."""
+    """Return whether the controlled vehicle avoids the rear vehicle until ``until`` if it drives for ``drive`` s, then
+    brakes.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        drive: duration of the drive, s.
+        until: end of the comparison, s.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
     fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
     return walk(at[LINE.GAP_R], at[LINE.V_F], plan, at[LINE.V_R], other, until)[0] >= -AHEAD_M
@@ -125,7 +180,17 @@ def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Flo
 
 @compiled(apart=True)
 def stays_behind(at: Floats, brake: float, until: float, plan: Floats, other: Floats) -> bool:
-    """Whether one that brakes for ``brake``, then drives, does not meet the leader until then."""
+    """Return whether the controlled vehicle avoids the front vehicle until ``until`` if it brakes for ``brake`` s, then
+    drives.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        brake: duration of the braking, s.
+        until: end of the comparison, s.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
     fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])
     fill_braking(other, 0.0, at[LINE.A_L])
     return walk(at[LINE.GAP_L], at[LINE.V_L], other, at[LINE.V_F], plan, until)[0] >= -AHEAD_M

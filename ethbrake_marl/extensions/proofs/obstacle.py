@@ -1,7 +1,8 @@
-"""Compiled: what follows where an obstacle stands ahead. docs/proofs/lower-bound-obstacle.md has the proofs.
+"""Harm that must follow a first meeting if an obstacle stands ahead of the leader.
 
-``beyond`` is the squared speed with which the leader meets the obstacle; it bounds how far ahead the leader is.
-Places count from that of the controlled vehicle at its onset, masses in its own.
+``beyond`` is the squared speed with which the leader hits the obstacle; it bounds how far ahead the leader is.
+Positions count from the position of the controlled vehicle at its onset; masses are in units of its mass.
+docs/proofs/lower-bound-obstacle.md has the proofs.
 """
 
 from __future__ import annotations
@@ -21,22 +22,27 @@ from ethbrake_marl.extensions.proofs.ramped_meetings import after_ramped
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats
 
-CELL = 1e-3  # a minimum is bounded this closely, relative to 1 m2/s2 and to itself
+CELL = 1e-3  # relative and absolute (m2/s2) precision of a minimum
 
-ZONE_M = 1.0  # of the obstacle: where the controlled vehicle is taken to be once it was stopped there, if it can be
+ZONE_M = 1.0  # distance from the obstacle within which a vehicle that was stopped there is assumed to stay
 
-_BEYOND_PARTS, _BEYOND_FINEST = 4, 4  # into which the values of ``beyond`` are divided, and those that matter again
+_BEYOND_PARTS, _BEYOND_FINEST = 4, 4  # number of parts of the range of ``beyond``, and of a part that is divided again
 
-_MOST = 400.0  # m2/s2 at the rear that count
+_MOST = 400.0  # m2/s2; harm at the rear pair is cut to this
 
-_FLIGHTS = 6  # lengths of a last drive that are tried
+_FLIGHTS = 6  # number of lengths of a last drive that are tried
 
-_SHORTEST_S = 1e-3  # of them
+_SHORTEST_S = 1e-3  # shortest time or last drive to divide by
 
 
 @compiled
 def all_three(at: Floats) -> tuple[float, float, float, float]:
-    """Masses of leader and rear vehicle; how fast the centre of all slows at most, and what is the rear one's of it."""
+    """Return the masses of front and rear vehicle, and the largest deceleration of the centre of mass of all three
+    (m/s2).
+
+    Masses are in units of the controlled vehicle's mass. The fourth result is the part of that deceleration that comes
+    from the rear vehicle (m/s2). ``at`` is one world, an array with the columns of ``line.LINE``.
+    """
     front, rear = at[LINE.FRONT_SHARE] / (1.0 - at[LINE.FRONT_SHARE]), at[LINE.REAR_SHARE] / (1.0 - at[LINE.REAR_SHARE])
     whole = front + 1.0 + rear
     return front, rear, (front * at[LINE.A_L] + max(at[LINE.A_F], at[LINE.A_R])) / whole, rear * at[LINE.A_R] / whole
@@ -44,7 +50,17 @@ def all_three(at: Floats) -> tuple[float, float, float, float]:
 
 @compiled
 def leader_pushed(at: Floats, early: float, beyond: float) -> tuple[float, float]:
-    """Speed of a leader pushed at ``early`` so as to meet the obstacle with ``sqrt(beyond)``; and when it does."""
+    """Return the speed (m/s) to which a push at ``early`` must bring the front vehicle, and the time (s) of its impact
+    with the obstacle.
+
+    It then hits the obstacle with the speed ``sqrt(beyond)``.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: time of the push, s.
+        beyond: squared speed at the obstacle, m2/s2.
+
+    """
     v = math.sqrt(max(beyond + 2.0 * at[LINE.A_L] * (at[LINE.WALL] - leader(at, early)[1]), 0.0))
     return v, early + (v - math.sqrt(beyond)) / at[LINE.A_L]
 
@@ -53,9 +69,21 @@ def leader_pushed(at: Floats, early: float, beyond: float) -> tuple[float, float
 def least_beyond(
     at: Floats, early: float, late: float, place: float, speed: float, least: float, plan: Floats, other: Floats
 ) -> float:
-    """``least`` or more: the centre of all three must not be at the obstacle before the leader, pushed at ``early``.
+    """Return the least squared speed (m2/s2) with which the front vehicle, pushed at ``early``, hits the obstacle.
 
-    It is at ``late`` at least at ``place``, with ``speed``.
+    It follows from the centre of mass of all three vehicles, which must not reach the obstacle before the front
+    vehicle.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: time of the push, s.
+        late: time for which ``place`` and ``speed`` hold, s.
+        place: least position of the centre of mass of all three at ``late``, m.
+        speed: speed of that centre of mass at ``late``, m/s.
+        least: bound that is known before, m2/s2; the result is at least this.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     if not speed > 0.0:
         return least
@@ -73,9 +101,17 @@ def least_beyond(
 
 @compiled(apart=True)
 def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float, float, float]:
-    """Place and speed at ``late``, at least, of one that left a meeting this much faster than the leader; its brakes.
+    """Return the least position (m) and speed (m/s) at ``late`` of a vehicle that brakes after its first contact.
 
-    They are the hardest of all three, so that nothing falls further behind.
+    The third result is its deceleration (m/s2): the hardest of all three vehicles, so that no vehicle falls further
+    behind.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        faster: speed by which it left the contact faster than the front vehicle, m/s.
+
     """
     v_l, way = leader(at, late)
     brakes = max(at[LINE.A_F], at[LINE.A_L], at[LINE.A_R])
@@ -86,7 +122,19 @@ def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float
 
 @compiled
 def last_drive(room: float, speed: float, brakes: float, drive: float, time: float) -> float:
-    """How long one must drive at the end to be ``room`` further after ``time``, if it brakes before; inf: it cannot."""
+    """Return for how long (s) a vehicle must drive at the end of ``time``, after braking, to have travelled ``room`` m
+    by then.
+
+    Infinite if it cannot.
+
+    Args:
+        room: distance to travel, m.
+        speed: speed now, m/s.
+        brakes: deceleration while braking, m/s2.
+        drive: acceleration while driving, m/s2.
+        time: total time, s.
+
+    """
     stand = speed / brakes
     if time > stand:
         flight = math.sqrt(2.0 * max(room - 0.5 * speed * stand, 0.0) / drive) if drive > 0.0 else math.inf
@@ -100,9 +148,24 @@ def stopped_there(
     at: Floats, early: float, late: float, hard: float, beyond: float, struck: float, until: float, place: float,
     speed: float, brakes: float,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """How far from the obstacle, how fast backward and for how long one can be that the leader stopped there.
+    """Return three limits for a vehicle that the front vehicle stops at the obstacle: distance, backward speed and
+    time.
 
-    The zone is infinite where that is not known.
+    These are its largest distance from the obstacle (m; infinite if it is not known), its largest backward speed (m/s)
+    and the largest time it spends there (s).
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        hard: largest closing speed of the contact, m/s.
+        beyond: squared speed with which the front vehicle hits the obstacle, m2/s2.
+        struck: time of that impact, s.
+        until: time by which the rear vehicle arrives, s.
+        place: least position of the vehicle at ``late``, m.
+        speed: its least speed at ``late``, m/s.
+        brakes: its deceleration, m/s2.
+
     """
     bounce, drive, wall = at[LINE.RESTITUTION], at[LINE.U_F], at[LINE.GAP_L] + at[LINE.WALL]
     v_l, way = leader(at, early)
@@ -131,14 +194,27 @@ def behind_leader(
     at: Floats, early: float, late: float, soft: float, hard: float, beyond: float, place: float, speed: float,
     plan: Floats, other: Floats,
 ) -> float:  # fmt: skip
-    """Least squared closing speed at the rear after such a meeting with the leader, which nobody passes; LARGE: none.
+    """Return the least squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
 
-    The leader meets the obstacle with at most ``sqrt(beyond)``. The centre of all three is at ``late`` at least at
-    ``place``, with ``speed``.
+    It assumes that the front vehicle hits the obstacle with at most ``sqrt(beyond)`` m/s, and that no vehicle passes
+    it. Returns LARGE (a huge number) if that is impossible.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        soft: least closing speed of the contact, m/s.
+        hard: largest closing speed of the contact, m/s.
+        beyond: largest squared speed with which the front vehicle hits the obstacle, m2/s2.
+        place: least position of the centre of mass of all three at ``late``, m.
+        speed: speed of that centre of mass at ``late``, m/s.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     wall, drive, onset = at[LINE.GAP_L] + at[LINE.WALL], at[LINE.U_F], at[LINE.ONSET_R]
     kept = 1.0 - at[LINE.FRONT_SHARE] * (1.0 + at[LINE.RESTITUTION])
-    # until when the rear vehicle must have come: at the leader, or at the obstacle
+    # time by which the rear vehicle must have arrived: at the leader, or at the obstacle
     v_l, way_l = leader(at, early)
     v_r, way_r = follower(at, early)
     v, struck = leader_pushed(at, early, beyond)
@@ -153,7 +229,7 @@ def behind_leader(
     time, stand = until - late, low / brakes
     if not _SHORTEST_S < time < math.inf:
         return 0.0
-    # how fast the controlled one can be then: it was never further back than by braking, or than it was stopped
+    # largest speed of the controlled vehicle then: it was never further back than by braking, or where it was stopped
     v_r, goal = follower(at, until)
     goal -= at[LINE.GAP_R]
     longest = last_drive(goal - least, low, brakes, drive, time)
@@ -178,7 +254,7 @@ def behind_leader(
         fastest = min(fastest, (goal - behind) / flight + 0.5 * drive * flight)
     closing = max(v_r - fastest, 0.0)
     if not at_wall:
-        # what it drove to be met so softly brings all three nearer to the obstacle
+        # the drive that makes this meeting so soft brings all three nearer to the obstacle
         fill_braking(plan, 0.0, brakes)
         fill_braking(other, max(onset - late, 0.0), at[LINE.A_R])
         v_r, way_r = follower(at, late)
@@ -203,7 +279,19 @@ def behind_leader(
 def after_at_obstacle(
     at: Floats, early: float, late: float, soft: float, hard: float, follows: float, plan: Floats, other: Floats
 ) -> float:
-    """Least harm at rear and obstacle after such a meeting with the leader; at the rear it is at least ``follows``."""
+    """Return the least harm (m2/s2) at rear pair and obstacle together after a first contact with the front vehicle.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        soft: least closing speed of the contact, m/s.
+        hard: largest closing speed of the contact, m/s.
+        follows: known lower bound on the harm at the rear pair, m2/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
     share = at[LINE.FRONT_SHARE]
     least = obstacle_harm(at, late, soft)
     if not at[LINE.WALL] > 0.0 or share * (1.0 + at[LINE.RESTITUTION]) > 1.0:
@@ -214,7 +302,7 @@ def after_at_obstacle(
     place = ((front + 1.0) * place + rear * (way_r - at[LINE.GAP_R])) / (front + 1.0 + rear)
     speed = ((front + 1.0) * speed + rear * v_r) / (front + 1.0 + rear)
     least = least_beyond(at, early, late, place, speed, least, plan, other)
-    # the harder the leader meets the obstacle, the softer the rear vehicle can
+    # the harder the leader hits the obstacle, the softer the meeting with the rear vehicle can be
     first = min(max(behind_leader(at, early, late, soft, hard, least, place, speed, plan, other), follows), _MOST)
     step, begin, known = (first - follows) / _BEYOND_PARTS, least, least + first
     size, proven = step, known
@@ -233,7 +321,18 @@ def after_at_obstacle(
 def beyond_rear(
     at: Floats, early: float, late: float, closing: float, least: float, plan: Floats, other: Floats
 ) -> float:
-    """``least_beyond`` after the rear vehicle was met with at most ``closing``."""
+    """Return the least squared speed (m2/s2) of the front vehicle at the obstacle after the rear vehicle was met first.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        least: bound that is known before, m2/s2; the result is at least this.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
     v_l, way_l = leader(at, late)
     v_r, way_r = follower(at, late)
     front, rear = all_three(at)[:2]
@@ -248,7 +347,19 @@ def beyond_rear(
 def after_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Least squared closing speed at the front after the rear vehicle was met from ``early`` on with ``closing``."""
+    """Return the least harm (m2/s2) at front pair and obstacle after a first contact with the rear vehicle.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        end: time until which the command of the earlier decision stays in force, s.
+        lack: least amount by which that command falls short of the best one, m/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
     share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
     v_l, way_l = leader(at, early)
     v_r, way_r = follower(at, early)
@@ -277,7 +388,21 @@ def after(
     kind: int, at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """``after_front`` or ``after_rear``, or ``after_ramped``."""
+    """Return the least harm (m2/s2) at the other pair (and the obstacle) after a first contact with one neighbour.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        end: time until which the command of the earlier decision stays in force, s.
+        lack: least amount by which that command falls short of the best one, m/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
     if kind >= RAMPED_FRONT:
         return after_ramped(kind, at, early, late, closing, plan, other)
     if kind == FRONT_FIRST:

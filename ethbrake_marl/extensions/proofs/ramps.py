@@ -1,9 +1,9 @@
-"""Two vehicles whose forces change at finite rates: where they first meet, and how gently at least. Compiled.
+"""Two vehicles whose forces change at finite rates: where they first meet, and the least closing speed there.
 
-A plan is an array [3, LEGS]: row ENDS holds the end of each leg (s from now, the last one infinite), row FORCES the
-acceleration in force at its start (m/s2), row JERKS how fast that changes (m/s3). A vehicle at rest holds until its
-force is above 0, one at its speed limit until it is below. No time step: a gap is one cubic after the other.
-docs/proofs/lower-bound-cases.md has the proof, under "Brakes that build up".
+A *plan* is an array [3, LEGS]: row ENDS holds the end of each leg (s from now, the last one infinite), row FORCES the
+acceleration in force at its start (m/s2), row JERKS its rate of change (m/s3). A vehicle at rest stays until its force
+is above 0; a vehicle at its speed limit keeps that speed until its force is below 0. There is no time step: the gap is
+a sequence of cubics. docs/proofs/lower-bound-cases.md has the proof, under "Brakes that build up".
 """
 
 from __future__ import annotations
@@ -26,19 +26,28 @@ _MEETING_HALVINGS = 30
 
 @compiled
 def empty_legs() -> Floats:
-    """Memory of a plan."""
+    """Return an uninitialised plan [3, LEGS] to fill in: the end (s), initial acceleration (m/s2) and jerk (m/s3) of
+    each leg.
+    """
     return np.empty((3, LEGS))
 
 
 @compiled
 def put_leg(plan: Floats, k: int, end: float, force: float, jerk: float) -> None:
-    """Leg ``k``, the last one so far: all later ones never begin."""
+    """Write leg ``k`` of a plan [3, LEGS], in place: its end (s), its initial force (m/s2) and its jerk (m/s3).
+
+    A *leg* is a time interval of constant jerk; a *force* is an acceleration.
+    """
     plan[ENDS, k], plan[FORCES, k], plan[JERKS, k] = end, force, jerk
 
 
 @compiled
 def fill_build_up(plan: Floats, since: float, force: float, wanted: float, rate: float) -> None:
-    """``force`` until ``since``, from then on towards ``wanted`` at this rate, which may be infinite."""
+    """Write a plan [3, LEGS]: ``force`` until ``since`` (s), then towards ``wanted`` at ``rate`` (m/s3, may be
+    infinite).
+
+    Forces are accelerations in m/s2.
+    """
     rise = abs(wanted - force) / rate
     put_leg(plan, 0, since, force, 0.0)
     put_leg(plan, 1, since + rise, force, (wanted - force) / rise if rise > 0.0 else 0.0)
@@ -50,10 +59,23 @@ def fill_switch(
     plan: Floats, sign: float, force: float, high: float, rise: float, low: float, fall: float, switch: float,
     time: float, final: float,
 ) -> None:  # fmt: skip
-    """From ``force`` up to ``high`` until ``switch``, then down to ``-low``, but so as to be at ``final`` at ``time``.
+    """Write a plan: the force rises from ``force`` to at most ``high`` until ``switch``, then falls to ``-low``.
 
-    Rates are ``rise`` and ``fall``. All forces are given, and come out, times ``sign``. A ``switch`` from -1 to 0, for
-    an infinite ``rise``, is one at once from a part of the way up.
+    Before ``time`` the force turns up again, so that it is ``final`` at ``time``.
+
+    Args:
+        plan: [3, LEGS] receives the plan.
+        sign: 1 or -1; all forces below are times ``sign``. A force is an acceleration in m/s2.
+        force: force now.
+        high: largest force.
+        rise: rate at which the force rises, m/s3; may be infinite.
+        low: size of the least force.
+        fall: rate at which the force falls, m/s3.
+        switch: time at which it begins to fall, s. A value from -1 to 0, for an infinite ``rise``, means to start at
+            once from a part of the way up.
+        time: time at which ``final`` holds, s.
+        final: force at ``time``; -inf: no such condition.
+
     """
     full = (high - force) / rise
     top = high if switch >= full else force + rise * switch
@@ -75,7 +97,18 @@ def fill_switch(
 
 @compiled
 def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, float, float, float]:
-    """Acceleration and jerk at ``now`` and speed ``v``, until when, and the speed that is reached then, else NaN."""
+    """Return acceleration (m/s2) and jerk (m/s3) in force at ``now``, when they end (s), and the speed reached then
+    (m/s).
+
+    That speed is NaN if the interval ends otherwise than at rest or at the speed limit.
+
+    Args:
+        plan: [3, LEGS] end (s), initial acceleration (m/s2) and jerk (m/s3) of each leg of the motion.
+        now: present time, s.
+        v: present speed, m/s.
+        limit: speed limit, m/s.
+
+    """
     k = 0
     while now >= plan[ENDS, k]:
         k += 1
@@ -87,7 +120,7 @@ def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, flo
         free = now - u / jerk if u * jerk < 0.0 else math.inf
         if free > now:
             return 0.0, 0.0, min(end, free), v
-        u = 0.0  # it is free just now, but for rounding
+        u = 0.0  # the vehicle becomes free at this moment, up to rounding
     reached = math.nan
     stands = now + first_return(v, u, jerk)
     if v <= 0.0 and stands <= now:
@@ -103,13 +136,22 @@ def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, flo
 
 @compiled
 def speed_after(v: float, u: float, jerk: float, step: float, reached: float) -> float:
-    """Speed at the end of a leg, or of the part of it that is ``step`` long (``reached`` is NaN then)."""
+    """Return the speed (m/s) after ``step`` seconds with initial acceleration ``u`` (m/s2) and constant ``jerk``
+    (m/s3).
+
+    ``v`` is the speed at the start. ``reached`` is the known speed at the end, or NaN if it is not known.
+    """
     return max(v + (u + 0.5 * jerk * step) * step, 0.0) if math.isnan(reached) else reached
 
 
 @compiled(apart=True)
 def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, float]:
-    """Speed and way at ``until`` of one that starts at 0 with ``v``."""
+    """Return speed (m/s) and distance (m) at ``until`` (s) of a vehicle that starts with speed ``v`` and follows
+    ``plan``.
+
+    ``plan`` [3, LEGS] holds end (s), initial acceleration (m/s2) and jerk (m/s3) of each leg; ``limit`` is the speed
+    limit, m/s.
+    """
     now, way = 0.0, 0.0
     while now < until:
         u, jerk, end, reached = leg_at(plan, now, v, limit)
@@ -123,19 +165,24 @@ def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, f
 
 @compiled
 def force_of(plan: Floats, now: float) -> float:
-    """Force of a plan, at rest as well."""
+    """Return the force (acceleration, m/s2) that a plan [3, LEGS] commands at ``now`` (s), even for a vehicle at
+    rest.
+    """
     return leg_at(plan, now, 1.0, math.inf)[0]
 
 
 @compiled(apart=True)
 def least_on_cubic(constant: float, pressing: float, jerk: float, since: float, until: float) -> float:
-    """Least value of ``constant / t + pressing t / 2 + jerk t^2 / 3`` from ``since`` to ``until``; -inf at 0, if so."""
+    """Return the least ``(constant / t) + (pressing * t / 2) + (jerk * t^2 / 3)`` for t from ``since`` to ``until``.
+
+    The result is -inf if the function falls without bound towards t = 0.
+    """
     if since <= 0.0 and constant <= 0.0:
         return -math.inf
     least = constant / until + (0.5 * pressing + jerk * until / 3.0) * until
     turn = -0.5 * pressing / jerk if jerk != 0.0 else since
     turn = min(max(turn, since), until)
-    for low, high in ((since, turn), (turn, until)):  # on each the sign of the slope changes once at most
+    for low, high in ((since, turn), (turn, until)):  # the sign of the slope changes at most once on each part
         if low > 0.0:
             least = min(least, constant / low + (0.5 * pressing + jerk * low / 3.0) * low)
         if (0.5 * pressing + 2.0 / 3.0 * jerk * high) * high * high <= constant or low >= high:
@@ -155,10 +202,24 @@ def meeting(
     gap: float, slack: float, v_front: float, front: Floats, front_limit: float, v_rear: float, rear: Floats,
     rear_limit: float, since: float, until: float,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """When two first meet after ``since``, with which closing speed w, and the least forced one; inf, 0, 0: never.
+    """Return the time at which two vehicles first meet, their closing speed w then, and the least forced closing speed.
 
-    That is the least of ``w + (gap - slack) / t`` until then, t counted from ``since``: of a run that is never behind
-    these extremes, ``slack`` nearer than they at ``since``, and ever faster by more.
+    Returns inf, 0, 0 if they never meet. The last value is the least of ``w + (gap - slack) / t`` until then, t counted
+    from ``since``. It bounds every motion of the pair that is never behind these two, is ``slack`` nearer at ``since``,
+    and is faster by a growing amount.
+
+    Args:
+        gap: gap at ``since``, m.
+        slack: distance by which the pair may be nearer, m.
+        v_front: speed of the front vehicle at ``since``, m/s.
+        front: [3, LEGS] its plan.
+        front_limit: its speed limit, m/s.
+        v_rear: speed of the rear vehicle at ``since``, m/s.
+        rear: [3, LEGS] its plan.
+        rear_limit: its speed limit, m/s.
+        since: start, s.
+        until: end, s.
+
     """
     now, least = since, math.inf
     while now < until:

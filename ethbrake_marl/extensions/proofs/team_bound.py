@@ -1,6 +1,7 @@
-"""The front three vehicles of a line whose second one is controlled, bounded together: rows of the compiled bound.
+"""``team_bound``: a proven lower bound on the harm of every world, whatever several controlled vehicles do.
 
-An obstacle ahead of a controlled Vehicle 1 is a first vehicle that nothing moves. docs/avoidability.md, "Teams".
+The first three vehicles are bounded together if Vehicle 2 is the first controlled one. If Vehicle 1 is controlled, an
+obstacle ahead takes the place of a first vehicle that nothing moves. docs/avoidability.md, "Teams", has the proofs.
 """
 
 from __future__ import annotations
@@ -34,17 +35,25 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Vehicles, Worlds
 
 _MIDDLE, _REAR = 1, 2
 
-_UNMOVED_T = 1e30  # an obstacle: its share of any two masses is 1
+_UNMOVED_T = 1e30  # mass of an obstacle: its share of two masses is 1
 
 
 def _combined_bound_of_line(
     now: Worlds, onset: Floats, counts: Bools, chosen: Ints, until: Floats, pairs: Floats, time_step_s: float | None
 ) -> Floats:
-    """The bound of the front two pairs together, [n] m2/s2, ``until`` [n] s from now; 0 where nothing is proven.
+    """Return the combined bound of the first two pairs, [n] m2/s2, or 0 if nothing is proven.
 
-    ``onset`` [n, N] is counted from now; ``counts`` [n, P] says of which pairs the next impact counts, and which move
-    forward. It asks that the first vehicle brakes by now; the second one, which is among the ``chosen``, is taken to
-    act from now on. ``pairs`` [n, 2] are the bounds of both pairs alone.
+    The first vehicle must brake by now. The second one is treated as if it may act from now on.
+
+    Args:
+        now: the worlds now, [n].
+        onset: [n, N] time from now at which each vehicle may act, s.
+        counts: [n, P] True for pairs whose next impact counts and whose vehicles move forward.
+        chosen: indices of the controlled vehicles; the second vehicle is one of them.
+        until: [n] horizon, s from now.
+        pairs: [n, 2] bounds of both pairs alone, m2/s2.
+        time_step_s: time between two decisions, s; None: commands may change at any time.
+
     """
     v = now.vehicles
     stops = (
@@ -52,7 +61,7 @@ def _combined_bound_of_line(
         < now.obstacle_gap_m
     )
     rows = np.flatnonzero((onset[:, 0] <= 0.0) & counts[:, 0] & counts[:, 1] & stops & ~now.obstacle_hit)
-    # The first three vehicles of these worlds, Vehicle 2 free to act at once.
+    # the first three vehicles of these worlds; Vehicle 2 may act at once
     some = now.take(rows)
     given = some.vehicles
     braking, driving, latency, mass, limit = (
@@ -81,7 +90,7 @@ def _combined_bound_of_line(
     rows, three = rows[unavoidable], three.take(np.flatnonzero(unavoidable))
     steps = np.where(onset[rows, _MIDDLE] <= 0.0, 0.0 if time_step_s is None else time_step_s, 0.0)
     since, power = np.zeros(len(rows)), np.full(len(rows), np.inf)
-    if now.N == 3:  # nobody pushes the last one
+    if now.N == 3:  # nobody pushes the last vehicle
         full = v.braking_capacity_mps2[rows, _REAR] + v.driving_capacity_mps2[rows, _REAR]
         since, power = onset[rows, _REAR], full if _REAR in chosen else np.zeros(len(rows))
     found, out = np.zeros(now.n), np.empty(len(rows))
@@ -92,17 +101,19 @@ def _combined_bound_of_line(
 
 @dataclass(frozen=True, slots=True)
 class TeamBound:
-    """What is proven about each world [n], in m2/s2."""
+    """Proven bounds on the harm of each world, [n] m2/s2 each."""
 
-    harm: Floats  # no joint command does less harm than this
-    early: Floats  # done before any controlled vehicle may act
-    obstacle: Floats  # Vehicle 1 and the obstacle ahead
-    pairs: Floats  # [n, P] of each pair alone, from then on
-    combined: Floats  # of the front two pairs together (see ``team_bound``); 0 where nothing is proven
+    harm: Floats  # lower bound on the total harm, whatever the controlled vehicles do
+    early: Floats  # harm before any controlled vehicle may act
+    obstacle: Floats  # bound of Vehicle 1 and the obstacle ahead, from that moment on
+    pairs: Floats  # [n, P] bound of each pair alone, from that moment on
+    combined: Floats  # bound of the first two pairs together (see ``team_bound``); 0 if nothing is proven
 
     @property
     def impact_proven(self) -> Bools:
-        """Whether every joint command has an impact, [n]; elsewhere none is proven."""
+        """True for worlds in which an impact is certain whatever the controlled vehicles do, [n]. False means that none
+        is proven.
+        """
         return np.asarray(self.harm > 0.0, np.bool_)
 
 
@@ -115,24 +126,32 @@ def team_bound(
     scripts: Mapping[int, str] | None = None,
     time_step_s: float | None = None,
 ) -> TeamBound:
-    """Proven lower bound on the harm from now to ``horizon_s`` (absolute), over all joint commands of ``vehicles``.
+    """Return a proven lower bound on the harm of every world, whatever several controlled vehicles do together.
 
-    ``harm = early + obstacle + max(pairs[:, 0] + pairs[:, 1], combined) + pairs[:, 2:]``, each part rounded outward;
-    where Vehicle 1 is controlled, ``combined`` is that of the obstacle and Vehicles 1 and 2: ``early + max(obstacle +
-    pairs[:, 0], combined) + pairs[:, 1:]``.
-    All other vehicles brake with their whole capacity from their latencies on; ``scripts`` (index -> name) is only
-    checked to say the same. What may come only after the horizon counts as 0, and so does the next impact of a pair
-    that was hit before where ``harm_count`` is "first". One controlled vehicle is allowed; ``lower_bound`` is sharper
-    where it covers the line.
+    ``harm = early + obstacle + max((pairs[:, 0] + pairs[:, 1]), combined) + pairs[:, 2:].sum(axis=1)``, each part
+    lowered by the largest possible rounding error. If Vehicle 1 is controlled, ``combined`` covers the obstacle and
+    Vehicles 1 and 2: ``early + max((obstacle + pairs[:, 0]), combined) + pairs[:, 1:].sum(axis=1)``. Harm that may come
+    only after the horizon counts as 0.
 
-    With ``time_step_s`` it is proven only for commands that change at decisions, the first one when the first of the
-    vehicles may act, one every ``time_step_s`` after it. That is sharper where Vehicle 2 is the first.
+    All other vehicles brake with their whole capacity from their latencies on. A single controlled vehicle is allowed;
+    ``lower_bound`` is sharper where it covers the line.
 
-    Raises ``InvalidInput`` for vehicles that are none, not there or given twice, another script, an unknown count, a
-    time step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before any of them may act.
+    Args:
+        worlds: the worlds now, [n].
+        vehicles: indices of the controlled vehicles, from 0.
+        harm_count: ``first`` or ``total``. With ``first``, the next impact of a pair that was hit before counts as 0.
+        horizon_s: time until which harm counts, s (absolute).
+        scripts: name of each other vehicle's script by index; only checked to be full_brake. None: full_brake.
+        time_step_s: time between two decisions, s. The bound is then proven only for commands that change at decisions:
+            the first one when the first of the vehicles may act, then one every ``time_step_s``. That is sharper if
+            Vehicle 2 is the first one. None: commands may change at any time.
+
+    Raises ``InvalidInput`` for vehicles that are empty, unknown or repeated, another script, an unknown count, a time
+    step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before any of them may act.
+
     """
     check_asked("team_bound", harm_count, horizon_s, time_step_s)
-    # The controlled vehicles in order; refuse what the bound does not cover.
+    # sort the controlled vehicles, and refuse what the bound does not cover
     if not isinstance(vehicles, Iterable):
         raise InvalidInput(f"team_bound: vehicles {vehicles!r}: must be a list of vehicles, for instance (1, 2)")
     given = tuple(vehicles)
@@ -167,7 +186,7 @@ def team_bound(
     pairs = np.stack([_pair_bound(columns, until, counts[:, p]) for p, columns in enumerate(each)], axis=1)
     ahead = np.isfinite(now.obstacle_gap_m) & ~(now.obstacle_hit & (harm_count == "first"))
     ahead &= now.speeds_mps[:, 0] >= 0.0
-    standing: dict[int, Floats | float] = {  # the obstacle, as the front vehicle of a pair
+    standing: dict[int, Floats | float] = {  # the obstacle as the front vehicle of a pair
         PAIR_GAP: np.where(ahead, now.obstacle_gap_m, 0.0),
         LEADER_A: 1.0,
         FOLLOWER_V: now.speeds_mps[:, 0],
@@ -177,12 +196,14 @@ def team_bound(
     obstacle = _pair_bound(standing, until, ahead)
     combined, walled = np.zeros(worlds.n), bool(chosen[0] == 0)
     if walled and ahead.any():
-        # the line with its obstacle as a first vehicle that stands and that nothing moves
+        # the line with its obstacle as a standing first vehicle that nothing moves
         line = now.with_obstacle()
         braking, mass = line.vehicles.braking_capacity_mps2.copy(), line.vehicles.mass_t.copy()
         braking[:, 0], mass[:, 0] = 1.0, _UNMOVED_T
         behind = replace(line.vehicles, braking_capacity_mps2=braking, mass_t=mass)
-        line = replace(line, vehicles=behind, obstacle_gap_m=np.ones(line.n))  # thrown back: no centre of mass
+        line = replace(
+            line, vehicles=behind, obstacle_gap_m=np.ones(line.n)
+        )  # finite: disables the centre-of-mass bounds
         onsets, counted = np.column_stack([np.zeros(line.n), onset]), np.column_stack([ahead, counts])
         both = np.stack([obstacle, pairs[:, 0]], axis=1)
         combined = _combined_bound_of_line(line, onsets, counted, chosen + 1, until, both, time_step_s)
@@ -198,7 +219,14 @@ def team_bound(
 
 
 def _pair_bound(columns: Mapping[int, Floats | float], until: Floats, counts: Bools) -> Floats:
-    """The bound of one pair alone, [n], of which these columns are not 0; 0 where its next impact does not count."""
+    """Return the bound on the harm of one pair alone, [n] m2/s2; 0 where its next impact does not count.
+
+    Args:
+        columns: maps a column of a pair (``PAIR_GAP`` to ``FOLLOWER_A``) to its values; missing columns are 0.
+        until: [n] horizon, s.
+        counts: [n] True for worlds in which the next impact of the pair counts.
+
+    """
     at, found, out = np.zeros((len(until), PAIR_WIDTH)), np.zeros(len(until)), np.empty(int(counts.sum()))
     for column, values in columns.items():
         at[:, column] = values

@@ -1,4 +1,4 @@
-"""The command ``scenario from-data``: a scenario of recorded traffic."""
+"""The command ``scenario from-data``: make a scenario from recorded traffic."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def from_data_command(
             partial.write_text(text, "utf-8")
             if draw == "rows":
                 out.write(rows, table, what="rows")
-            else:  # those of before would be left behind, unnamed
+            else:  # remove the rows of an earlier run, to which no scenario refers any more
                 rows.unlink(missing_ok=True)
         out.note(f"written: {output}; try it: ethbrake scenario validate {output}")
         out.result({"scenario": str(output), "rows": str(rows) if draw == "rows" else None, "found": told}, *told)

@@ -1,7 +1,7 @@
-"""Scenarios from recorded traffic: chains of vehicles in highD, NGSIM or OpenACC become rows of initial states.
+"""Make scenarios from recorded traffic: chains of vehicles in highD, NGSIM or OpenACC become rows of initial states.
 
-A file is read once, in pieces. What was recorded every so many seconds is kept in a private file on disk, from which it
-comes back ordered by time: no more stands in memory than a piece of a file, one moment, and the rows that are kept.
+Each file is read once, in pieces. Its states at regular times go into a private file on disk, which returns them
+ordered by time. So memory holds only one piece of a file, one moment, and the rows of the result.
 """
 
 from __future__ import annotations
@@ -33,37 +33,42 @@ from ethbrake_marl.scenario.vehicle_types import MOST_NUMBERS
 
 DataFormat = Literal["highd", "ngsim", "openacc"]
 
-DataDraw = Literal["rows", "normal", "lognormal", "quantiles"]  # how worlds are drawn from it
+DataDraw = Literal["rows", "normal", "lognormal", "quantiles"]  # how the scenario draws its worlds
 
-PIECE, HEAD = 50_000, 10  # lines that are read at once, and those of which one names the columns
+PIECE, HEAD = 50_000, 10  # lines read at once; number of first lines in which the header is searched
 
-LONGEST_LINE, LARGEST_BYTES = 1 << 16, 1 << 40  # characters; of a file
+LONGEST_LINE, LARGEST_BYTES = 1 << 16, 1 << 40  # limits of a line (characters) and of a file
 
-FASTEST_MPS, LONGEST_M = 75.0, 40.0  # of road vehicles: 270 km/h, and more than any road train in the data
+FASTEST_MPS, LONGEST_M = 75.0, 40.0  # limits of a road vehicle: 270 km/h, and more than any road train in the data
 
-CAR_M, LEAST_CARS = (2.5, 8.0), 1 / 3  # the length of cars and vans, and their share; 4.5 m are 14.8 feet
+CAR_M, LEAST_CARS = (2.5, 8.0), 1 / 3  # range of lengths of cars and vans, and their least share, to detect feet
 
-SLOPE, CORRELATED = (0.5, 2.0), 0.7  # of what gaps change by over what speeds say; feet per metre are 3.28
+# Allowed ratio of the change of gaps to the change by the speeds (3.28 if units mix feet and metres), and the least
+# correlation of the two for this check.
+SLOPE, CORRELATED = (0.5, 2.0), 0.7
 
 QUANTILES = 40
 
-SLOWEST_MPS, LONGEST_S = 0.5, 60.0  # of rows that have time gaps, to which fits are made
+SLOWEST_MPS, LONGEST_S = 0.5, 60.0  # least speed and longest time gap of rows that are used for fits
 
 
 class _Format(NamedTuple):
-    """One of the data sets: its files, its columns, its units, and what its licence allows."""
+    """One of the formats of recorded traffic: its files, columns, units and licence."""
 
-    title: str
-    files: str
-    columns: tuple[str, ...]  # the first seven of ``_State`` in turn; what ends in 1 has a 2, 3, ... behind it
-    units: str
-    licence: str
-    metres: float = 1.0  # of a unit of length
-    ticks: float = 1.0  # in a unit of the first column
-    hertz: float = 10.0  # ticks in a second
-    impossible: float = 0.0  # share of vehicles, at most, that may overlap or follow nobody, and are left out
-    elsewhere: tuple[str, ...] = ()  # places whose lines are left out: streets with crossings
-    blanks: bool = False  # stand where nothing was measured
+    title: str  # name of the data set, for users
+    files: str  # pattern of the names of its files
+    # Names of the columns to read, in the order of the fields of ``_State``. A name ending in 1 stands for one column
+    # per vehicle: ``Speed1``, ``Speed2``, ...
+    columns: tuple[str, ...]
+    units: str  # units of lengths and speeds, for messages
+    licence: str  # sentence about its licence, for the scenario's ``source``
+    metres: float = 1.0  # number of metres in a unit of length of the files
+    ticks: float = 1.0  # number of ticks (intervals between recorded moments) per unit of time of the files
+    hertz: float = 10.0  # number of ticks in a second
+    # Largest accepted share of vehicles with a fault (overlap, missing leader). Faulty vehicles are left out.
+    impossible: float = 0.0
+    elsewhere: tuple[str, ...] = ()  # lines of a file that contain one of these texts (names of streets) are left out
+    blanks: bool = False  # True if empty cells mean that nothing was measured
 
 
 FORMATS: dict[DataFormat, _Format] = {
@@ -89,9 +94,10 @@ _OF_A_ROW = QUANTITY.usual["gaps_m"], QUANTITY.usual["speeds_mps"]
 
 _REPLACED = ("gaps_m", "speeds_mps", "time_gaps_s", "line_speed_mps", "speed_deviations_mps")
 
-_OTHER_NAMES = {"preceeding": "preceding"}  # in some files of NGSIM
+_OTHER_NAMES = {"preceeding": "preceding"}  # misspelt column in some files of NGSIM
 
-# A vehicle at a moment; ``front`` in m along the direction of travel; ``length`` is 0 where gaps were recorded.
+# A vehicle at a moment. ``front`` is its position in m along the direction of travel; ``length`` is 0 if the data hold
+# gaps.
 _State = namedtuple("_State", "tick id lane preceding front length speed line")
 
 
@@ -105,13 +111,24 @@ def scenario_from_data(
     draw: DataDraw = "rows",
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> tuple[str, str, list[str]]:
-    """A scenario ``name`` of the states in a folder of recordings: its YAML, the CSV of its rows, and what was found.
+    """Make a scenario from a folder of recordings. Return its YAML text, the CSV text of its rows, and notes.
 
-    Every ``every_s`` seconds, queues are cut from the front into chains of as many vehicles as ``based_on`` has: each
-    vehicle stands in one row at most. ``draw`` says how worlds are drawn: a row, whole, or each quantity by a fit to
-    the rows. What is not recorded is as in ``based_on``. Of more rows than a table holds each k-th is kept.
+    At regular times, queues of vehicles are cut from the front into chains of as many vehicles as ``based_on`` has; a
+    vehicle belongs to at most one chain. Each chain is a row of speeds and gaps. If there are more rows than a table
+    may hold, every k-th row is kept.
 
-    Raises ``InvalidInput`` naming file, line and column for what is missing, no number, or not possible.
+    Args:
+        name: name of the scenario.
+        folder: folder with the files.
+        format: format of the files.
+        based_on: scenario for everything that is not recorded, and for the number of vehicles.
+        every_s: time between two moments that become rows (s).
+        draw: how the scenario draws worlds: whole ``rows``, or each quantity from a fit to the rows.
+        progress: called with the name of a file, the KiB read of it, and its size in KiB.
+
+    Raises ``InvalidInput`` with file, line and column for a missing column, a cell that is not a number, or an
+    impossible value.
+
     """
     entry, base = FORMATS[format], load_scenario(based_on)
     check_file_name("scenario", name)
@@ -127,7 +144,7 @@ def scenario_from_data(
     files = sorted(each for each in folder.glob(entry.files) if not each.name.startswith("."))
     if not files:
         raise InvalidInput(f"{folder}: must be a folder with {entry.files}, the files of {entry.title}")
-    with closing(sqlite3.connect("")) as store:  # on disk, without a name
+    with closing(sqlite3.connect("")) as store:  # a temporary file on disk
         store.executescript(f"CREATE TABLE chain({','.join(columns)}); CREATE TABLE state({','.join(_State._fields)})")
         try:
             for file in files:
@@ -169,7 +186,10 @@ def scenario_from_data(
 
 
 def _fits(rows: Floats, draw: DataDraw) -> dict[str, Any]:
-    """Fits to time gaps, to the mean speed of a row, and to what each vehicle is off it, each by itself."""
+    """Return keys of a scenario with independent fits to time gaps, mean speed of a row, and deviations from it.
+
+    ``rows`` [k, 2 N - 1] holds the gaps (m) and speeds (m/s) of each chain; ``draw`` is the kind of fit.
+    """
     gaps, speeds = np.split(rows, [rows.shape[1] // 2], axis=1)
     times = gaps / np.maximum(speeds[:, 1:], SLOWEST_MPS)
     used = (speeds >= SLOWEST_MPS).all(axis=1) & ((times > 0.0) & (times <= LONGEST_S)).all(axis=1)
@@ -180,13 +200,18 @@ def _fits(rows: Floats, draw: DataDraw) -> dict[str, Any]:
     signed: DataDraw = "normal" if draw == "lognormal" else draw
     return {
         "time_gaps_s": [_fit(each, draw) for each in times[used].T],
-        "line_speed_mps": _fit(np.clip(line, -off.min(), speeds.max() - off.max()), signed),  # the sum stays in range
+        "line_speed_mps": _fit(
+            np.clip(line, -off.min(), speeds.max() - off.max()), signed
+        ),  # so that mean plus deviation stays in range
         "speed_deviations_mps": [_fit(each, signed) for each in off.T],
     }
 
 
 def _fit(values: Floats, draw: DataDraw) -> Any:
-    """A number or a distribution, as a scenario file writes it, within the values."""
+    """Return a distribution for a scenario file, fitted to ``values`` [k] and limited to their range.
+
+    ``draw`` is its kind: ``normal``, ``lognormal`` or ``quantiles``.
+    """
     low, high = float(values.min()), float(values.max())
     if draw == "quantiles" or low == high:
         return {"choice": np.quantile(values, (np.arange(QUANTILES) + 0.5) / QUANTILES).tolist()}
@@ -200,7 +225,10 @@ def _fit(values: Floats, draw: DataDraw) -> Any:
 def _keep_states(
     store: sqlite3.Connection, file: Path, format: DataFormat, stride: int, progress: Callable[[int, int], None]
 ) -> None:
-    """Keep the vehicles of a file at every so many ticks."""
+    """Write the vehicles of a file at every ``stride``-th tick (recorded moment) into the table ``state`` of ``store``.
+
+    ``progress`` is called with the KiB read and the size of the file in KiB.
+    """
     entry, turned, first, cars, states = FORMATS[format], np.empty((0, 2)), None, 0, 0
     if format == "highd":
         meta = _numbers(Path(f"{str(file)[:-4]}Meta.csv"), entry, ("id", "drivingDirection"), lambda *_: None)
@@ -226,7 +254,18 @@ def _keep_states(
 
 
 def _states(values: Floats, lines: Floats, file: Path, format: DataFormat, turned: Floats) -> Floats:
-    """What ``_State`` names, [vehicles at moments, 8]."""
+    """Return the fields of ``_State`` for each vehicle and moment, [rows, 8], in m and m/s.
+
+    Args:
+        values: [rows, columns] numbers of the file, in the order of the format's columns.
+        lines: [rows] line number of each row in the file.
+        file: the file, for messages.
+        format: its format.
+        turned: [vehicles, 2] id and driving direction of each vehicle, sorted by id; only used for highD.
+
+    Raises ``InvalidInput`` with file, line and column for an impossible value.
+
+    """
     entry = FORMATS[format]
     states, fastest = np.column_stack([values, lines]), entry.columns[-1]
     if format == "openacc":
@@ -252,7 +291,7 @@ def _states(values: Floats, lines: Floats, file: Path, format: DataFormat, turne
         place = np.searchsorted(turned[:, 0], states[:, 1]).clip(max=len(turned) - 1)
         odd = (turned[place, 0] != states[:, 1]) | ~np.isin(turned[place, 1], (1.0, 2.0))
         _refuse(odd, file, lines, "id", states[:, 1], "must have the drivingDirection 1 or 2 in its tracksMeta.csv")
-        right_hand = turned[place, 1] == 2.0  # x, of the left edge, grows to the right
+        right_hand = turned[place, 1] == 2.0  # x is the left edge of the vehicle and grows to the right
         states[:, 4] = np.where(right_hand, states[:, 4] + states[:, 5], -states[:, 4])
         states[:, 6] *= np.where(right_hand, 1.0, -1.0)
     right = f"m/s; must be at most {FASTEST_MPS:g}; {entry.title} has {entry.units}"
@@ -263,14 +302,26 @@ def _states(values: Floats, lines: Floats, file: Path, format: DataFormat, turne
 def _cut_chains(
     store: sqlite3.Connection, file: Path, entry: _Format, stride: int, vehicles: int, left_out: Counter[str]
 ) -> None:
-    """Link the vehicles of each moment to those ahead, cut queues into rows, and see whether gaps fit speeds."""
+    """Cut the queues of vehicles of one file into rows, and write them into the table ``chain`` of ``store``.
+
+    Vehicles are linked to those ahead at each moment. Gaps are checked against speeds.
+
+    Args:
+        store: database whose table ``state`` holds the vehicles of the file.
+        file: the file, for messages.
+        entry: its format.
+        stride: ticks between two moments.
+        vehicles: number of vehicles in a row.
+        left_out: counts what was left out, by description; it is updated.
+
+    """
     first_fault, faults, states, last = "", 0, 0, math.nan
     before: dict[float, tuple[float, float, Any]] = {}
-    sums = np.zeros(3)  # of what gaps opened by and of what speeds say: squares, and their product
+    sums = np.zeros(3)  # sums of squares and product of the change of gaps and of the change by the speeds
     for tick, moment in groupby(store.execute("SELECT * FROM state ORDER BY tick, line"), itemgetter(0)):
         there = [_State(*state) for state in moment]
         by_id = {state.id: state for state in reversed(there)}
-        behind: dict[float, tuple[float, float, Any]] = {}  # of a vehicle: gap to it, how fast it opens, who follows
+        behind: dict[float, tuple[float, float, Any]] = {}  # by vehicle id: gap behind it, opening speed, follower
         for state in there:
             ahead: Any = by_id.get(state.preceding) if state.preceding else None
             gap = ahead.front - ahead.length - state.front if ahead else math.nan
@@ -320,9 +371,10 @@ def _cut_chains(
 def _numbers(
     file: Path, entry: _Format, columns: Sequence[str], progress: Callable[[int, int], None]
 ) -> Iterator[tuple[Floats, Floats]]:
-    """These columns of a file, piece by piece, [rows, columns], and the line of each row.
+    """Yield the numbers of a CSV file piece by piece: selected columns [rows, columns], line numbers [rows].
 
-    They are finite numbers, but for NaN in place of a blank where the format has such.
+    All values are finite numbers. In formats with blanks an empty cell is NaN. ``progress`` is called with the KiB read
+    and the size of the file in KiB.
     """
     with open_plain(file, LARGEST_BYTES) as stream:
         text = io.TextIOWrapper(stream, "utf-8-sig")
@@ -363,7 +415,10 @@ def _numbers(
 def _header(
     file: Path, entry: _Format, columns: Sequence[str], source: Iterator[tuple[int, str]]
 ) -> tuple[list[str], list[int]]:
-    """The names of all columns, and which of them are wanted; what stands above them is read over."""
+    """Find the header among the first lines, and return the names of all columns and the indices of ``columns``.
+
+    ``source`` yields (line number, line); lines up to the header are consumed.
+    """
     least, have = list(columns), set[str]()
     for number, line in islice(source, HEAD):
         names = [cell.strip() for cell in line.split(",")]
@@ -385,7 +440,10 @@ def _header(
 
 
 def _refuse(bad: Bools, file: Path, lines: Floats, column: str, values: Floats, right: str) -> None:
-    """Refuse the first row that is bad."""
+    """Raise ``InvalidInput`` with file, line and column for the first row in which ``bad`` [rows] is true.
+
+    ``lines`` and ``values`` [rows] are the rows' line numbers and values; ``right`` says what would be right.
+    """
     if bad.any():
         line, value = lines[bad][0], values[bad][0]
         raise InvalidInput(f"{file}, line {line:.0f}, column {column}: {value:.12g} {right}")

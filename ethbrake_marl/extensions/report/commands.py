@@ -1,4 +1,4 @@
-"""The command ``watch``: films of episodes."""
+"""The command ``watch``: write films of episodes."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ def watch_command(
     settings: SettingsOption = None,
     force: ForceOption = False,
 ) -> None:
-    """Film agents in one world, in real time.
+    """Write a film of agents in one world, in real time.
 
-    It shows the road to scale, commands, impacts and harm.
+    The film shows the road to scale, commands, impacts and harm.
     """
-    # matplotlib takes a second to load, and the other commands draw nothing
+    # imported here, because matplotlib takes a second to load and most commands do not draw
     from ethbrake_marl.extensions.report.film import check_film, film
 
     with Out(force=force) as out:

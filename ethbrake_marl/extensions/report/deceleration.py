@@ -1,4 +1,4 @@
-"""Harm over the constant deceleration of one vehicle in one world: predicted, realised and best known."""
+"""Harm against the constant deceleration of one vehicle in one world: predicted, simulated and best known."""
 
 from __future__ import annotations
 
@@ -25,44 +25,52 @@ from ethbrake_marl.physics.forecast import forecast
 from ethbrake_marl.physics.state import Floats, Worlds, make_worlds
 from ethbrake_marl.scenario.task import Task
 
-POINTS = 2001  # evenly spaced decelerations; the breakpoints of the closed form come on top
+POINTS = 2001  # number of evenly spaced decelerations; the breakpoints of the closed form are added
 
-_LONG_S = 1e4  # whoever still coasts has met or will never meet
+_LONG_S = 1e4  # long enough for every meeting to have happened
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """A constant deceleration that E-V2X-BM takes in the world, and the harm that it minimises there (m2/s2)."""
+    """Constant deceleration that a method chooses in one world, and its minimal harm there."""
 
-    deceleration_mps2: float
-    harm: float
+    deceleration_mps2: float  # chosen deceleration, m/s2
+    harm: float  # harm at that deceleration, m2/s2, predicted or simulated
 
 
 @dataclass(frozen=True, slots=True)
 class DecelerationCurve:
-    """Harm (m2/s2) of one world at K constant decelerations of one vehicle, in rising order."""
+    """Harm in one world at K constant decelerations of one vehicle, in rising order."""
 
-    task: Task  # its one vehicle has the deceleration
-    world: Worlds  # n = 1, at the alert
+    task: Task  # scenario, and the one vehicle that has the deceleration
+    world: Worlds  # the world, n = 1, at the alert
     deceleration_mps2: Floats  # [K] from 0 to the braking capacity
-    predicted: Floats  # [K] pairwise, in closed form
-    first_impact_harm: Floats  # [K] realised
-    total_harm: Floats  # [K] realised
-    regimes: dict[str, NDArray[np.str_]]  # per pair of the vehicle ("front pair", "rear pair"): [K] how it first meets
-    closed_form: Choice  # its harm is the predicted one
-    coupled: Mapping[HarmCount, Choice]  # minimising either count in the simulation
-    limits: Limits | Unproven  # what is known of the world over all time-varying commands
+    predicted: Floats  # [K] harm predicted by the pairwise closed form, m2/s2
+    first_impact_harm: Floats  # [K] simulated first-impact harm, m2/s2
+    total_harm: Floats  # [K] simulated total harm, m2/s2
+    # by pair ("front pair", "rear pair"): [K] how the pair first meets, a value of ``regimes_of``
+    regimes: dict[str, NDArray[np.str_]]
+    closed_form: Choice  # deceleration that the pairwise closed form chooses, with its predicted harm
+    coupled: Mapping[HarmCount, Choice]  # by harm count: deceleration with the least simulated harm
+    limits: Limits | Unproven  # best known harm and proven bound over all time-varying commands
 
     def harm(self, harm_count: HarmCount) -> Floats:
-        """The realised harm under a counting rule, [K] m2/s2."""
+        """Return the simulated harm, [K] m2/s2, under ``harm_count``: ``first`` or ``total``."""
         return self.first_impact_harm if harm_count == "first" else self.total_harm
 
 
 def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> DecelerationCurve:
-    """The three harms of one world at evenly spaced decelerations of the vehicle, and at those of the closed form.
+    """Compute predicted, first-impact and total harm of one world at many constant decelerations of one vehicle.
 
-    The prediction lets all others brake fully; in the simulation they follow the scenario's scripts. Raises
-    ``InvalidInput`` unless there is exactly one world, ``points`` is at least 2 and every script is fixed at the alert.
+    The decelerations are ``points`` evenly spaced ones and the breakpoints of the pairwise closed form. The prediction
+    assumes that all others brake fully; in the simulation they follow the scenario's scripts. Raises ``InvalidInput``
+    unless there is exactly one world, ``points`` is at least 2 and every script is fixed at the alert.
+
+    Args:
+        world: the world at the alert, n = 1.
+        task: the scenario, and the one vehicle that has the deceleration.
+        points: number of evenly spaced decelerations from 0 to the braking capacity.
+
     """
     if world.n != 1:
         raise InvalidInput(f"deceleration curve: {world.n} worlds given; exactly one is drawn")
@@ -96,10 +104,17 @@ def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> De
 
 
 def regimes_of(worlds: Worlds, pair: int, deceleration_mps2: Floats) -> NDArray[np.str_]:
-    """How one pair, alone, first meets under constant decelerations [n, N] from now (t = 0) on, [n].
+    """Return how one pair, alone, first meets in each world, [n], if both vehicles brake constantly from t = 0 on.
 
-    ``A``, ``A'``, ``B`` or ``C`` as in docs/proofs/constant-deceleration.md, ``early``: before the pair's leader
-    brakes, or ``none``.
+    Values: ``early`` (before the front vehicle of the pair brakes), ``A`` (the rear vehicle still coasts), ``A'`` (it
+    coasts and the front one stands), ``B`` (both brake), ``C`` (the rear one brakes and the front one stands), ``none``
+    (they never meet). docs/proofs/constant-deceleration.md has the formulas.
+
+    Args:
+        worlds: the worlds, [n].
+        pair: index of the pair: vehicles ``pair`` and ``pair + 1``.
+        deceleration_mps2: [n, N] constant deceleration of each vehicle, m/s2.
+
     """
     own = slice(pair, pair + 2)
     v = worlds.vehicles
@@ -108,7 +123,7 @@ def regimes_of(worlds: Worlds, pair: int, deceleration_mps2: Floats) -> NDArray[
         driving_capacity_mps2=0.0, latency_s=v.latency_s[:, own], mass_t=1.0, restitution=0.0,
         speed_limit_mps=v.speed_limit_mps[:, own],
     )  # fmt: skip
-    with np.errstate(divide="ignore", invalid="ignore"):  # when each would stand; inf without braking
+    with np.errstate(divide="ignore", invalid="ignore"):  # standstill time; infinite without braking
         speed = worlds.speeds_mps[:, own]
         stop_s = np.where(speed > 0.0, v.latency_s[:, own] + speed / deceleration_mps2[:, own], 0.0)
     rows = advance(alone, -deceleration_mps2[:, own], until_s=_LONG_S, record=True)[1].rows
@@ -127,7 +142,7 @@ _COUNTS: tuple[tuple[HarmCount, str, str, str], ...] = (
     ("total", "total harm", COLOURS[0], "--"),
 )
 
-_REGIMES = {  # name of how a pair first meets: its colour and meaning
+_REGIMES = {  # colour and meaning of each regime
     "early": ("#d7c2e8", "before the front vehicle brakes"),
     "A": ("#8f8f8f", "A: rear vehicle still coasts"),
     "A'": ("#5f5f5f", "A': rear vehicle coasts, front one stands"),
@@ -137,10 +152,11 @@ _REGIMES = {  # name of how a pair first meets: its colour and meaning
 
 
 def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
-    """Predicted and realised harm of one world over the constant deceleration of one vehicle.
+    """Draw predicted and simulated harm of one world against the constant deceleration of one vehicle.
 
-    Above: the three curves, the decelerations that E-V2X-BM takes (closed form and coupled, both counts), and as level
-    lines the best known harm of any profile, where it is known. Below: how each pair alone first meets.
+    Top: the three curves, the decelerations that E-V2X-BM chooses (by the closed form, and by simulation for both
+    counts), and level lines at the best known harm of any profile, if known. Bottom: how each pair alone first meets.
+    ``curve`` is the result of ``deceleration_curve``; ``title`` is written above, if empty the name of the scenario.
     """
     scenario, vehicle = curve.task.scenario, curve.task.vehicle
     figure = new_figure(8.0, 5.4)
@@ -172,7 +188,7 @@ def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
             label=f"a* = {best.deceleration_mps2:.3f} m/s², coupled, least {name}: {best.harm:.2f}",
         )  # fmt: skip
     limits = curve.limits
-    if not isinstance(limits, Unproven) and limits.known[0]:  # of any profile, over all time-varying commands
+    if not isinstance(limits, Unproven) and limits.known[0]:  # best known harm over all time-varying commands
         first, total = float(limits.first_impact_harm[0]), float(limits.total_harm[0])
         for (_, _, colour, dashes), harm in zip(_COUNTS, (first, total), strict=True):
             axes.axhline(harm, color=colour, linewidth=0.9, linestyle=dashes, alpha=0.7)

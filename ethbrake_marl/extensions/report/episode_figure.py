@@ -1,4 +1,4 @@
-"""The figure of one episode: where the vehicles are, where they hit each other, and what the driven one asked for."""
+"""Figure of one episode: positions of the vehicles, their impacts, and the command of the controlled vehicle."""
 
 from __future__ import annotations
 
@@ -19,10 +19,15 @@ from ethbrake_marl.game.harm import HARM_COUNTS
 
 
 def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> Figure:
-    """Positions with impacts marked, gaps, and the command of the driven vehicle, over time.
+    """Draw positions with impacts, gaps, and the command of the controlled vehicle over time.
 
-    One column per record (by its title), on common scales: agents in the same world compare at a glance. Without a
-    ``caption`` the conditions of the first record stand there. Raises ``InvalidInput`` without records.
+    There is one column for each record on common scales, to compare agents in the same world. Raises ``InvalidInput``
+    without records.
+
+    Args:
+        records: recorded episodes, by the title of their column.
+        caption: text below the figure; if empty, the conditions of the first record.
+
     """
     if not records:
         raise InvalidInput("trajectories: no records given")
@@ -40,7 +45,7 @@ def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> 
         name_axes(axes, x="Time since Vehicle 1 began to brake (s)")
     positions, gaps, commands = panels[::columns]
     moving = [np.flatnonzero((each.speeds_mps != 0.0).any(axis=1)) for each in records.values()]
-    # to the first sampled time from which no vehicle moves any more, or the end
+    # the axis ends at the first sample after which no vehicle moves, or at the last sample
     ends = [
         float(each.time_s[min(rows[-1] + 1 if len(rows) else 0, len(each.time_s) - 1)])
         for each, rows in zip(records.values(), moving, strict=True)
@@ -68,7 +73,7 @@ def _positions(axes: Axes, record: EpisodeRecord) -> None:
     if np.isfinite(record.initial.obstacle_gap_m[0]):
         axes.axhline(float(record.initial.obstacle_gap_m[0]), color="black", linewidth=2.5, label="obstacle")
     rows = record.impacts
-    front = np.maximum(rows.pair, 0)  # of each impact's pair; at the obstacle, Vehicle 1
+    front = np.maximum(rows.pair, 0)  # front vehicle of each impact's pair; Vehicle 1 at the obstacle
     at = np.array([
         np.interp(t, record.time_s, record.positions_m[:, i]) for t, i in zip(rows.time_s, front, strict=True)
     ])  # fmt: skip
@@ -80,7 +85,7 @@ def _positions(axes: Axes, record: EpisodeRecord) -> None:
         )  # fmt: skip
     for k in np.flatnonzero(rows.first):
         speed_mps = rows.closing_speed_mps[k]
-        words = f"{speed_mps:.1f}" if speed_mps >= 0.05 else "< 0.1"  # an impact never reads 0.0
+        words = f"{speed_mps:.1f}" if speed_mps >= 0.05 else "< 0.1"  # so that no impact reads 0.0
         axes.annotate(
             words, (rows.time_s[k], at[k]), xytext=(7, -7), textcoords="offset points",
             fontsize=8.5, va="top", zorder=6,
@@ -111,5 +116,5 @@ def _command(axes: Axes, record: EpisodeRecord) -> None:
 
 
 def _vehicle_style(i: int) -> dict[str, Any]:
-    """Colour and dashes of Vehicle ``i + 1``, and of the gap ahead of it."""
+    """Return colour and dashes of Vehicle ``i + 1``, also used for the gap ahead of it."""
     return {"color": vehicle_colour(i), "linestyle": DASHES[i % len(DASHES)], "linewidth": 1.6}

@@ -1,4 +1,4 @@
-"""An episode as a film, in real time: the environment's own pictures as a GIF or MP4, or a moving drawing as SVG."""
+"""Films of episodes in real time: the environment's own pictures as GIF or MP4, or an animated drawing as SVG."""
 
 from __future__ import annotations
 
@@ -11,34 +11,34 @@ import numpy as np
 
 from ethbrake_marl.agents.driving import episode_engine
 from ethbrake_marl.agents.protocol import Driver, Team
-from ethbrake_marl.envs.motion import Trace
 from ethbrake_marl.envs.rendering import Frame, Scene
+from ethbrake_marl.envs.trace import Trace
 from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, need
 from ethbrake_marl.extensions.report.moving_drawing import animate_films
 from ethbrake_marl.physics.state import Worlds
 from ethbrake_marl.scenario.schema import Scenario
 
-Films = Mapping[str, Sequence[Scene]]  # of one world, by title
+Films = Mapping[str, Sequence[Scene]]  # scenes of each film of one world, by title
 
 FILM_FPS = 25
 
-MOST_FILMS = 12  # one below the other
+MOST_FILMS = 12  # most films in one file, one below the other
 
-MOST_PICTURES = 2_500  # of all films together: 1.8 GB in memory
+MOST_PICTURES = 2_500  # most pictures of all films together, which need 1.8 GB of memory
 
 _COLOURS = 64
 
 
 def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float = FILM_FPS) -> list[Scene]:
-    """What one world shows from the alert to the end of its episode, ``fps`` moments per second, then its end.
+    """Return the scenes of one world from the alert to the end of its episode, ``fps`` per second, and the final scene.
 
     Args:
-        world: at the alert, n = 1.
-        agent: drives the learner, or, as a team, its vehicles; it is left as it is.
-        scenario: of the world; its scripts drive the other vehicles.
-        fps: moments per second of the world.
+        world: the world at the alert, n = 1.
+        agent: agent of the learner, or a team of agents. It is not changed.
+        scenario: scenario of the world; its scripts control the other vehicles.
+        fps: scenes per second.
 
-    Raises ``InvalidInput`` for more than one world, ``PhysicsError`` for one that could not be advanced.
+    Raises ``InvalidInput`` for more than one world, ``PhysicsError`` for a world that could not be advanced.
 
     """
     if world.n != 1:
@@ -60,19 +60,34 @@ def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float 
 
 
 def film(world: Worlds, agents: Mapping[str, Driver], ending: str, *, scenario: Scenario) -> bytes:
-    """``film_bytes`` of what agents, each under its title, do in one world; refuses before any work what it can."""
+    """Let several agents control the same world, and return a film of their episodes as the bytes of a file.
+
+    Args:
+        world: the world at the alert, n = 1.
+        agents: the agents, by the title above their film.
+        ending: ``.gif``, ``.mp4`` or ``.svg``. Other endings raise ``InvalidInput`` before any work.
+        scenario: scenario of the world.
+
+    """
     check_film(ending, len(agents))
     films = {title: film_scenes(world, agent, scenario=scenario) for title, agent in agents.items()}
     return film_bytes(films, ending)
 
 
 def film_bytes(films: Films, ending: str, *, fps: int = FILM_FPS) -> bytes:
-    """Films of one world, titled and one below the other, in real time: an endless GIF or SVG, or an MP4.
+    """Return films of one world, one below the other, in real time, as the bytes of a GIF, SVG (both endless) or MP4
+    file.
 
-    A film that ends before the others shows its end. Raises ``InvalidInput`` without films, for more than
-    ``MOST_FILMS`` or ``MOST_PICTURES``, for an ``ending`` that is
-    none of ``.gif``, ``.mp4`` and ``.svg``, for an ``fps`` whose frames do not last whole hundredths of a second, as a
-    GIF needs, and for an MP4 where the library that writes it is missing.
+    A film that ends before the others keeps showing its end. Raises ``InvalidInput`` without films, for more than
+    ``MOST_FILMS`` films or ``MOST_PICTURES`` pictures, for an ``ending`` other than ``.gif``, ``.mp4`` and ``.svg``,
+    and for an ``fps`` that does not divide 100 (a GIF counts hundredths of a second). Raises ``MissingExtra`` for an
+    MP4 without the library that writes it.
+
+    Args:
+        films: scenes of each film, by its title.
+        ending: ``.gif``, ``.mp4`` or ``.svg``.
+        fps: scenes per second.
+
     """
     check_film(ending, len(films))
     if not films or not all(films.values()):
@@ -89,7 +104,10 @@ def film_bytes(films: Films, ending: str, *, fps: int = FILM_FPS) -> bytes:
 
 
 def check_film(ending: str, films: int = 1) -> None:
-    """Refuse, before any work, what ``film_bytes`` cannot write: that ending, or so many films."""
+    """Raise ``InvalidInput`` if ``film_bytes`` cannot write a file with this ``ending``, or this number of ``films``.
+
+    Raises ``MissingExtra`` for an MP4 without the library that writes it.
+    """
     if ending not in _WRITERS:
         raise InvalidInput(f"a film that ends in {ending!r}: films are written as {', '.join(_WRITERS)}")
     if ending == ".mp4":
@@ -99,7 +117,7 @@ def check_film(ending: str, films: int = 1) -> None:
 
 
 def _stacked(films: Films) -> Iterator[Frame]:
-    """The frames of all films, one below the other."""
+    """Yield the pictures of the film file: each shows the present frame of all films, one below the other."""
     for k in range(max(map(len, films.values()))):
         each = (shown[min(k, len(shown) - 1)]._replace(title=title) for title, shown in films.items())
         yield np.concatenate([scene.frame() for scene in each])

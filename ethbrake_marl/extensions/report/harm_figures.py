@@ -1,4 +1,4 @@
-"""Figures of harm: a bar for each agent, the distribution of regret, and what was avoidable of it."""
+"""Figures of harm: a bar for each agent, the distribution of regret, and the avoidable part of harm."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ethbrake_marl.extensions.report.svg import SLIM_IN
 from ethbrake_marl.extensions.search.regret import regrets_of
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 
-_POINTS = 250  # of a curve; more cannot be told apart
+_POINTS = 250  # points of a curve; more would not be visible
 
 _PARTS = (
     ("best known of these worlds", "#bbbbbb", ""),
@@ -32,9 +32,16 @@ def harm_by_agent(
     harm_count: HarmCount = "first",
     elsewhere: Mapping[str, Sequence[SummaryRow]] | None = None,
 ) -> Figure:
-    """Mean harm of each agent with its 95 % interval; a line: the best known; marks: the same agent elsewhere.
+    """Draw the mean harm of each agent with its 95 % interval, a line at the best known harm, and marks for other
+    tests.
 
-    As narrow as a phone. ``elsewhere``: rows of other tests, by title. Raises ``InvalidInput`` without rows.
+    The figure is narrow enough for the screen of a phone. Raises ``InvalidInput`` without rows.
+
+    Args:
+        rows: summary of each agent, one ``SummaryRow`` each.
+        harm_count: harm to draw, ``first`` or ``total``.
+        elsewhere: summaries of the agents on other tests, by the title of the test; None: no marks.
+
     """
     if not rows:
         raise InvalidInput("harm_by_agent: no rows; evaluate at least one agent")
@@ -62,22 +69,22 @@ def harm_by_agent(
 
 
 def _name_rows(axes: Axes, agents: Sequence[str], most: int = 40) -> None:
-    """One row per agent, the first on top; no name longer than ``most`` signs."""
+    """Label one row of a figure for each agent, the first on top. Names are cut to ``most`` characters."""
     axes.set_yticks(range(len(agents)), [label_text(agent, most) for agent in agents])
     axes.invert_yaxis()
 
 
 def regret_distribution(evaluation: Evaluation) -> Figure:
-    """Share of the worlds in which an agent's harm is above the best known by more than x, under both counts.
+    """Draw the share of worlds in which an agent's regret (harm minus best known harm) exceeds x, under both counts.
 
-    Where nothing is known to be the best, the same of the harm itself.
+    There is one curve per agent. Without a best known harm, the harm itself is drawn.
     """
     regrets = regrets_of(evaluation)
     figure, panels = new_panels((10.0, 3.8), columns=2, sharey=True)
     for axes, count in zip(panels, HARM_COUNTS, strict=True):
         for number, (agent, outcome) in enumerate(evaluation.outcomes.items()):
             values = outcome.ledger.world_harm(count) if regrets is None else regrets.regret(outcome, count)
-            ordered = np.sort(values)  # thresholds: the values themselves, or so many of them
+            ordered = np.sort(values)  # thresholds: the values themselves, thinned to _POINTS
             chosen = np.unique(np.linspace(0, len(ordered) - 1, min(_POINTS, len(ordered))).astype(np.int64))
             thresholds = np.concatenate([[0.0], ordered[chosen]])
             share = [float((ordered > threshold).mean()) for threshold in thresholds]
@@ -96,9 +103,10 @@ def regret_distribution(evaluation: Evaluation) -> Figure:
 
 
 def harm_in_parts(evaluation: Evaluation) -> Figure:
-    """Mean harm of each agent as what nobody is known to avoid, and what it did beyond that, under both counts.
+    """Draw each agent's mean harm in three parts: best known harm, regret in worlds with unavoidable contact, and
+    regret in worlds with avoidable contact.
 
-    Raises ``InvalidInput`` where nothing is proven of the worlds.
+    *Regret* is harm minus best known harm. Raises ``InvalidInput`` if nothing is proven about the worlds.
     """
     regrets = regrets_of(evaluation)
     if regrets is None:

@@ -1,4 +1,4 @@
-"""An episode as a moving drawing: one SVG file that any browser plays, light or dark, without a program inside."""
+"""Films of episodes as one animated SVG file, which any browser plays, light or dark, without a script inside."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from ethbrake_marl.errors import plain_text
 
 _FILM_WIDTH = 800
 
-_HOLD_S = 2.5  # the end stands so long before the drawing begins again
+_HOLD_S = 2.5  # time that the end is shown before the drawing starts again
 
 _STRIP = 132  # height of one agent's road
 
-_FOOT = 34  # below the last road: the clock
+_FOOT = 34  # height of the clock below the last road
 
-_FILM_LANE, _HALF_ROAD, _HALF_BODY = 82, 24, 13  # pixels from a strip's top; halves of heights
+_FILM_LANE, _HALF_ROAD, _HALF_BODY = 82, 24, 13  # distance of the lane from a strip's top; half heights
 
 _SHOWN_S = 1.0  # how long an impact is shown
 
@@ -37,10 +37,10 @@ text { font-family: system-ui, sans-serif; font-size: 14px; fill: var(--ink); }
 
 
 def animate_films(films: Mapping[str, Sequence[Scene]], *, fps: int) -> str:
-    """Films of one world, titled and one below the other, in real time, on one scale of the road.
+    """Return the text of an SVG that shows films of one world, one below the other, in real time and on one scale.
 
     Args:
-        films: the scenes of each film by its title, ``fps`` of them per second; none is empty.
+        films: the scenes of each film by its title; none is empty.
         fps: scenes per second.
 
     """
@@ -65,7 +65,10 @@ def animate_films(films: Mapping[str, Sequence[Scene]], *, fps: int) -> str:
 
 
 class _Strip:
-    """One film on its road."""
+    """Drawing of one agent's film on its own road, as a strip of the SVG picture.
+
+    ``left_m`` and ``right_m`` are the positions at the edges of the picture, ``fps`` the scenes per second.
+    """
 
     def __init__(self, film: Sequence[Scene], title: str, left_m: float, right_m: float, fps: int) -> None:
         self.title = title
@@ -76,12 +79,12 @@ class _Strip:
         return (float(place_m) - self._left) * self._scale
 
     def drawn(self) -> Iterator[str]:
-        """Its elements."""
+        """Yield the SVG elements of the strip."""
         yield f'<text x="12" y="22" font-weight="bold">{escape(self.title)}</text>'
         texts = [
             f"harm {scene.first_harm:.1f} by first impacts, {scene.total_harm:.1f} in total" for scene in self._film
         ]
-        for words in dict.fromkeys(texts):  # the harm so far, at the times at which it is that
+        for words in dict.fromkeys(texts):  # each text is visible while it is the harm so far
             lit = [each == words for each in texts]
             yield (
                 f'<text x="{_FILM_WIDTH - 12}" y="22" text-anchor="end" opacity="{int(lit[0])}">{words}'
@@ -97,7 +100,7 @@ class _Strip:
             yield f'<rect x="{self._x(obstacle):.1f}" y="{top}" width="9" height="{2 * _HALF_ROAD}" fill="var(--ink)"/>'
         for i in range(len(self._film[0].front_m)):
             yield from self._vehicle(i)
-        for start, until, struck in self._events():  # above the road, the closing speed of each impact
+        for start, until, struck in self._events():  # the closing speed of each impact, above the road
             x = self._x(self._film[start].front_m[struck.pair + 1])
             lit = [start <= k < until for k in range(len(self._film))]
             yield (
@@ -106,7 +109,9 @@ class _Strip:
             )
 
     def _vehicle(self, i: int) -> Iterator[str]:
-        """The body that moves, with its number and the lights of its command."""
+        """Yield the SVG elements of vehicle ``i``: a moving body with its number, the lights of its command, and its
+        impacts.
+        """
         places = [self._x(scene.front_m[i]) for scene in self._film]
         length, top = BODY_M * self._scale, _FILM_LANE - _HALF_BODY
         yield f'<g transform="translate({places[0]:.1f} 0)">'
@@ -125,7 +130,7 @@ class _Strip:
                     f'<rect x="{x:.1f}" y="{top}" width="5" height="{2 * _HALF_BODY}" fill="var(--{name})"'
                     f' opacity="0">{self._switched(lit)}</rect>'
                 )
-        for start, until, struck in self._events():  # at its front, a star for each of its impacts with what is ahead
+        for start, until, struck in self._events():  # a star at the front for each impact ahead
             if struck.pair + 1 == i:
                 points = " ".join(f"{x:.1f},{y:.1f}" for x, y in star(0.0, _FILM_LANE, 17, 8))
                 lit = [start <= k < until for k in range(len(self._film))]
@@ -140,9 +145,9 @@ class _Strip:
         )
 
     def _events(self) -> list[tuple[int, int, Struck]]:
-        """Impacts that are shown: the number of the first scene, that behind the last one, and the impact.
+        """Return the impacts to show: first scene, scene after the last, and the impact.
 
-        One that is lighter than the one before it is left out while that one is shown.
+        One impact is shown at a time, for a short while; a weaker one is left out while a harder one is shown.
         """
         known: set[tuple[int, float]] = set()
         found: list[tuple[int, int, Struck]] = []
@@ -158,7 +163,7 @@ class _Strip:
         return found
 
     def _switched(self, lit: Sequence[bool]) -> str:
-        """An opacity of 1 in the scenes that are lit, and of 0 in the others."""
+        """Return an SVG animation with opacity 1 in the scenes in which ``lit`` is True, and 0 in the others."""
         values, times, k = [], [], 0
         for on, run in groupby(lit):
             values.append("1" if on else "0")
@@ -174,7 +179,15 @@ class _Strip:
 
 
 def _clock(y: int, last: int, frames: int, fps: int) -> Iterator[str]:
-    """Seconds since the alert as a line that fills."""
+    """Yield the SVG elements of the clock: the seconds since the alert, and a line that fills.
+
+    Args:
+        y: height of the line in the picture.
+        last: number of the last scene of the longest film.
+        frames: number of scenes until the animation begins again.
+        fps: scenes per second.
+
+    """
     left, width = 170, _FILM_WIDTH - 200
     yield f'<text class="quiet" x="12" y="{y + 4}">seconds since the alert</text>'
     yield f'<path d="M{left} {y}h{width}" stroke="var(--road)" stroke-width="4"/>'

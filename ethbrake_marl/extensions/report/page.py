@@ -1,8 +1,8 @@
-"""Every HTML page: one file that loads nothing, opens from disk, and shows whatever it is told as text.
+"""HTML pages: one file that loads nothing, can be opened from disk, and shows every input as text.
 
-A page is a title, a sentence or two, and sections. What a section holds are strings, which become paragraphs, and
-parts: tables, figures, the player of episodes. Strings are never markup: they are escaped, and control and direction
-characters are written as in Python.
+A page is a title, a short lead, and sections. A section holds strings, which become paragraphs, and parts: tables,
+figures, the episode player. Strings are never markup: they are escaped, and control and direction characters are
+written as in Python.
 """
 
 from __future__ import annotations
@@ -29,52 +29,58 @@ from ethbrake_marl.files.sheet import Sheet
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_STAY = "\u00a0"  # a blank at which no line is broken
+_STAY = "\u00a0"  # no-break space
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A piece of a page, and what it needs there: names of style sheets and scripts of this folder."""
+    """A piece of a page: its HTML, and the style sheets and scripts that it needs.
 
-    html: Markup
-    styles: tuple[str, ...] = ()
-    scripts: tuple[str, ...] = ()
+    Class methods make the usual parts, for instance ``Part.paragraph("Text")``.
+    """
+
+    html: Markup  # markup of the piece
+    styles: tuple[str, ...] = ()  # names of style sheets in this folder
+    scripts: tuple[str, ...] = ()  # names of scripts in this folder
 
     @classmethod
     def paragraph(cls, text: str, kind: str = "") -> Part:
-        """Text as a paragraph: ``quiet`` (conditions), ``note`` (what must not be overlooked), ``alarm``, or plain."""
+        """Return a part with ``text`` as a paragraph.
+
+        ``kind`` is its style: ``quiet`` (conditions), ``note`` (important remark), ``alarm``, or empty.
+        """
         return cls(Markup('<p class="{}">{}</p>\n').format(kind, shown(text)))
 
     @classmethod
     def heading(cls, text: str) -> Part:
-        """A heading inside a section."""
+        """Return a part with ``text`` as a heading inside a section."""
         return cls(Markup("<h3>{}</h3>\n").format(shown(text)))
 
     @classmethod
     def facts(cls, found: Mapping[str, object]) -> Part:
-        """Names and values, one below the other."""
+        """Return a part that lists names with their values, one below the other; ``found`` maps names to values."""
         lines = [Markup("<dt>{}</dt><dd>{}</dd>").format(shown(name), _text(value)) for name, value in found.items()]
         return cls(Markup("<dl>\n{}\n</dl>\n").format(Markup("\n").join(lines)))
 
     @classmethod
     def remarks(cls, texts: Sequence[str]) -> Part:
-        """A list of what must not be overlooked, one line each; nothing without any."""
+        """Return a part with ``texts`` as a list of important remarks, one line each; an empty part if none."""
         lines = [Markup("<li>{}</li>").format(shown(text)) for text in texts]
         return cls(Markup('<ul class="remarks">\n{}\n</ul>\n').format(Markup("\n").join(lines)) if lines else Markup())
 
     @classmethod
     def box(cls, title: str, meanings: Mapping[str, str]) -> Part:
-        """Words and what they mean, in a box."""
+        """Return a part that explains words in a box; ``meanings`` maps each word to its meaning."""
         return cls(Markup('<aside class="box"><strong>{}</strong>{}</aside>\n').format(title, cls.facts(meanings).html))
 
     @classmethod
     def beside(cls, parts: Sequence[Part]) -> Part:
-        """Parts of equal width side by side; on a narrow screen, one below the other."""
+        """Return one part that shows ``parts`` side by side in equal widths; below each other on a narrow screen."""
         return cls._around('<div class="beside">{}</div>\n', parts)
 
     @classmethod
     def opened(cls, title: str, parts: Sequence[Part]) -> Part:
-        """Parts that show when their title is chosen."""
+        """Return one part with ``parts`` under a title; they are hidden until the reader clicks on the title."""
         return cls._around("<details><summary>{}</summary>\n{}</details>\n", parts, shown(title))
 
     @classmethod
@@ -85,7 +91,17 @@ class Part:
 
     @classmethod
     def data(cls, name: str, content: object, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = ()) -> Part:
-        """Plain data for a script of the page: JSON in which nothing can end the element or begin another."""
+        """Return a part that holds ``content`` as JSON inside a script element, for a script of the page to read.
+
+        The text can neither end its element nor begin another one.
+
+        Args:
+            name: id of the element.
+            content: plain data: mappings, lists, texts and numbers.
+            styles: style sheets that the reading script needs.
+            scripts: names of the scripts that read it.
+
+        """
         text = json.dumps(content, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
         for sign in "<>&":
             text = text.replace(sign, f"\\u{ord(sign):04x}")
@@ -94,12 +110,19 @@ class Part:
 
     @classmethod
     def template(cls, file: str, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = (), **values: object) -> Part:
-        """A template of this folder with these values; all of them are text but what is Markup already."""
+        """Return a part: the template ``file`` of this folder, filled with ``values``. Text is escaped, ``Markup`` is
+        not.
+
+        ``styles`` and ``scripts`` are names of files in this folder that it needs.
+        """
         return cls(Markup(_environment().get_template(file).render(**values)), styles, scripts)
 
     @classmethod
     def table(cls, sheet: Sheet) -> Part:
-        """A table that scrolls by itself where it is wider than the page; a cell may be a ``Shown`` of Markup."""
+        """Return a part that shows ``sheet`` as a table, which scrolls if it is wider than the page.
+
+        A cell may be a ``Shown`` whose value is ``Markup``, for instance a button; other texts are escaped.
+        """
         return cls(Markup(sheet.html() + "\n"))
 
     @classmethod
@@ -113,17 +136,17 @@ class Part:
         known: str = "",
         where: object = "",
     ) -> Part:
-        """A figure, or the SVG of one of ours, with its title and, in words, what it shows.
+        """Return a part that shows a figure, or the SVG of a figure of this package, with a title and a description.
 
-        The caption is taken out of the SVG and stands below it as text of the page, which a phone can show.
+        The caption is removed from the SVG and becomes text of the page below it, which a phone can show.
 
         Args:
-            figure: in the colours of the page, light or dark.
-            title: above it.
-            description: in words, what it shows.
-            alone: in colours that must not change, such as those of a map; it then stands on white.
-            known: what its caption need not say, because the page does.
-            where: the file that the SVG was read from, for the error where that holds what no figure of ours does.
+            figure: the figure, or the bytes of its SVG. It takes the colours of the page, light or dark.
+            title: title above it.
+            description: what it shows, in words.
+            alone: keep the colours, as a map needs them, on a white background.
+            known: part of the caption that stands elsewhere on the page; it is left out here.
+            where: file that the SVG was read from, for the error message about a foreign SVG.
 
         """
         from ethbrake_marl.extensions.report.svg import inline_svg
@@ -152,14 +175,16 @@ class Part:
         shown_first: Sequence[int] = (),
         folded: bool = False,
     ) -> Part:
-        """The player of these worlds, all driven by the same agents.
+        """Return a part with the player of episodes, in which a reader watches the same worlds under different agents.
 
         Args:
-            worlds: at least one.
-            driven: indices (0 = front) of the vehicles that the agents drive; by agent where they drive others.
-            focus: the agent that is shown from the beginning, between the first and the last.
-            shown_first: numbers of the agents that are shown from the beginning, where those are others.
-            folded: traces show when their title is chosen.
+            worlds: at least one world, with its episode under each agent.
+            driven: indices (0 = front) of the controlled vehicles; a mapping by agent if agents control different
+                vehicles.
+            focus: name of an agent that is shown at first, besides the first and the last ones.
+            shown_first: positions (from 0) of the agents that are shown at first instead; empty: the first, the focus
+                and the last.
+            folded: hide the traces until their title is clicked.
 
         """
         agents, one = list(worlds[0].motions), next(iter(worlds[0].motions.values())).world
@@ -182,7 +207,7 @@ class Part:
         content = {
             "vehicles": one.N,
             "agents": [shown(agent) for agent in agents],
-            # the first, the focus, and as many of the last as there is room for
+            # the first agent, the focus, and the last ones, up to three
             "shown": list(shown_first) or sorted(list(order)[:3]),
             "worlds": told,
         }
@@ -202,26 +227,26 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A section of a page: strings, which become paragraphs, and parts."""
+    """Section of a page."""
 
-    title: str
-    body: Sequence[str | Part]
+    title: str  # heading, and entry in the table of contents
+    body: Sequence[str | Part]  # strings, which become paragraphs, and parts
 
     @property
     def parts(self) -> list[Part]:
-        """The body, every string as a paragraph."""
+        """The body of the section as parts; every string becomes a paragraph."""
         return [Part.paragraph(each) if isinstance(each, str) else each for each in self.body]
 
 
 @dataclass(frozen=True)
 class Page:
-    """A whole page.
+    """A whole HTML page.
 
     Args:
-        title: of the page.
-        sections: in this order, each with an entry in the table of contents.
-        lead: what the page is about, in a sentence or two below its title.
-        opening: parts between these and the table of contents.
+        title: title of the page.
+        sections: sections in order; each has an entry in the table of contents.
+        lead: one or two sentences below the title that say what the page is about.
+        opening: parts between the lead and the table of contents.
 
     >>> from ethbrake_marl.extensions.report.page import Page, Part, Section
     >>> section = Section("Results", ["Text with <b> stays text.", Part.paragraph("small print")])
@@ -230,10 +255,10 @@ class Page:
 
     """
 
-    title: str
-    sections: Sequence[Section]
-    lead: str = ""
-    opening: Sequence[Part] = ()
+    title: str  # title of the page
+    sections: Sequence[Section]  # sections in order
+    lead: str = ""  # text below the title
+    opening: Sequence[Part] = ()  # parts between the lead and the table of contents
 
     @cached_property
     def _parts(self) -> list[Part]:
@@ -241,14 +266,14 @@ class Page:
 
     @cached_property
     def _code(self) -> tuple[str, str]:
-        """Its own styles and script: each file once, one after the other."""
+        """Text of all style sheets and of all scripts of the page; each file is included once."""
         styles = dict.fromkeys(["page.css", *(name for part in self._parts for name in part.styles)])
         scripts = dict.fromkeys(name for part in self._parts for name in part.scripts)
         return "\n".join(map(read_file, styles)), "\n".join(map(read_file, scripts))
 
     @property
     def policy(self) -> str:
-        """Its content security policy: its own styles and script, pictures inside it, and nothing else."""
+        """Content security policy of the page: its own styles and scripts, embedded pictures, and nothing else."""
         styles, script = (
             f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" if text else "'none'"
             for text in self._code
@@ -260,7 +285,7 @@ class Page:
 
     @staticmethod
     def anchors(titles: Sequence[str]) -> list[str]:
-        """The name of each section of a page with these titles, for links: of letters and digits, no two alike."""
+        """Return a unique link name for each title, of letters, digits and hyphens, for instance "worst-ten-worlds"."""
         found: list[str] = []
         for k, title in enumerate(titles):
             name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:40]
@@ -269,7 +294,7 @@ class Page:
 
     @cached_property
     def html(self) -> str:
-        """The page as text."""
+        """The whole page as HTML text."""
         styles, script = self._code
         names = self.anchors([section.title for section in self.sections])
         whole = Part.template(
@@ -286,13 +311,13 @@ class Page:
 
 
 def shown(value: object) -> str:
-    """A value as the text that a page shows: no control or direction character, whoever wrote it."""
+    """Return ``value`` as text for a page, with control and direction characters escaped."""
     return plain_text(str(value), keep=_STAY)
 
 
 @cache
 def read_file(name: str) -> str:
-    """A file of this folder, as text."""
+    """Return the text of the file ``name`` in this folder."""
     return files(__package__).joinpath(name).read_text("utf-8")
 
 

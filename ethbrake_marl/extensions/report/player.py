@@ -1,4 +1,4 @@
-"""The episode player: what a page holds of each episode, exact between events, and the script that plays it."""
+"""Data of the episode player: what a page holds of each episode, exact between events."""
 
 from __future__ import annotations
 
@@ -16,31 +16,32 @@ from ethbrake_marl.scenario.schema import Scenario
 
 PLAYER_SCRIPTS = ("player-motion.js", "player-view.js", "player.js")
 
-DATA = "episode_data"  # the name of its data in a page, which no section has
+DATA = "episode_data"  # id of the data in a page; no section has it
 
-_BIN_S = 1e-3  # of the later impacts of a pair in so short a time the last one is drawn; all are counted
+_BIN_S = 1e-3  # of several impacts of a pair within this time only the last is drawn; all are counted
 
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """One world, driven by every agent."""
+    """One world of the episode player, with the motion of the vehicles under every agent."""
 
-    number: int  # in the list
-    kind: str  # why it was chosen, as a heading
-    why: str  # what is special about it, in a few words
-    motions: dict[str, EpisodeMotion] = field(default_factory=dict)  # by agent
-    title: str = ""  # what the world is called; empty: World and its number
+    number: int  # number of the world in its list
+    kind: str  # reason why the world is shown, as a heading
+    why: str  # special property of the world, in a few words
+    motions: dict[str, EpisodeMotion] = field(default_factory=dict)  # motion of the vehicles, by name of the agent
+    title: str = ""  # name of the world; empty: "World" and its number
 
     @staticmethod
     def drive(played: Sequence[Played], worlds: Worlds, name: str, agent: Driver, scenario: Scenario) -> None:
-        """Let one agent drive the worlds of ``played`` and keep each motion there, by the agent's name.
+        """Let one agent control the worlds of ``played``, and store the motion in the ``motions`` of each entry, under
+        the agent's name.
 
         Args:
-            played: one for each world.
-            worlds: at the alert, in the same order.
-            name: of the agent on the page.
-            agent: is left as it is.
-            scenario: of the worlds, with the vehicles that are driven as its learners.
+            played: one entry for each world.
+            worlds: the worlds at the alert, in the same order.
+            name: name of the agent on the page.
+            agent: the agent; it is not changed.
+            scenario: scenario of the worlds; its learners are the controlled vehicles.
 
         """
         for one, motion in zip(played, follow_episodes(worlds, agent, scenario), strict=True):
@@ -48,7 +49,13 @@ class Played:
 
     @staticmethod
     def episode(motion: EpisodeMotion, driven: Sequence[int]) -> dict[str, Any]:
-        """What the player needs of one episode, in which an agent drove these vehicles."""
+        """Return the data of one episode for the player's script, as a mapping.
+
+        Args:
+            motion: motion of the vehicles.
+            driven: indices of the controlled vehicles.
+
+        """
         obstacle = float(motion.world.obstacle_gap_m[0])
         without = 1 + 3 * motion.world.N
         jerks = bool(motion.pieces[:, without:].any())
@@ -66,7 +73,14 @@ class Played:
 
 
 def _impacts(motion: EpisodeMotion) -> list[list[float]]:
-    """Each impact with what has been counted by then; at the last one, that is the ledger to the bit."""
+    """Return the impacts of an episode as lists, in order of time.
+
+    Entries of a list: time (s), index of the pair, closing speed (m/s), 1 for the first impact of the pair (else 0),
+    number of the impact in the episode from 1, first-impact harm so far, total harm so far (m2/s2).
+
+    Of several impacts of a pair within ``_BIN_S`` only the last is kept. The harm after the last impact is exactly the
+    recorded harm of the episode.
+    """
     rows = motion.impacts
     order = np.argsort(rows.time_s, kind="stable")
     harm = rows.closing_speed_mps[order] ** 2

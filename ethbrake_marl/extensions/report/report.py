@@ -1,4 +1,4 @@
-"""Sections of a report: the worst worlds, what was avoidable, and what the shield was good for."""
+"""The HTML report of an evaluation: results, episodes, worst worlds, avoidable harm, and the value of the shield."""
 
 from __future__ import annotations
 
@@ -33,11 +33,14 @@ from ethbrake_marl.files.store import write_output
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.scenario.task import Task
 
-SHIELD_WORLDS = 200  # in which what a shield replaced is simulated again
+SHIELD_WORLDS = 200  # number of worlds in which a shield's replacements are simulated again
 
 
 def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) -> Section:
-    """The ten worlds in which an agent did worst; those that the page plays have a button."""
+    """Return the section on the ten worlds in which the agent ``focus`` did worst.
+
+    ``watched`` are the numbers of worlds that the page's player shows; they get a button that starts it.
+    """
     regrets, outcome = regrets_of(evaluation), evaluation.outcome(focus)
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
     columns: dict[str, NDArray[Any] | None] = {
@@ -63,7 +66,9 @@ def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) ->
 
 
 def avoidable_section(evaluation: Evaluation) -> Section:
-    """Collisions and harm where contact could be avoided, and where nobody could; and the regret of each agent."""
+    """Return the section that shows collisions, harm and regret separately for avoidable and for unavoidable
+    contact.
+    """
     regrets, limits = regrets_of(evaluation), limits_of(evaluation)
     body: list[str | Part] = []
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
@@ -108,7 +113,11 @@ _SPLIT: tuple[Column | str, ...] = (
 
 
 def shield_section(rows: ShieldModes, conditions: str) -> Section:
-    """The modes of the shield on the same worlds, and what each intervention of step mode was good for."""
+    """Return the section that compares the shield's modes, and counts how many interventions of step mode were needed,
+    harmless or costly.
+
+    ``rows`` are the results by agent and mode, ``conditions`` a line on the worlds. The section is empty without rows.
+    """
     if not rows:
         return Section("Shield", ())
     told = (
@@ -122,7 +131,7 @@ def shield_section(rows: ShieldModes, conditions: str) -> Section:
     return Section("Shield", body)
 
 
-_SHORT = {"collision_rate", "first_impact_harm", "total_harm"}  # beside the agent, in the table that all begins with
+_SHORT = {"collision_rate", "first_impact_harm", "total_harm"}  # columns of the first table on the page
 
 _CAPTION = "Means with 95 % intervals, m²/s²"
 
@@ -131,30 +140,36 @@ _OTHERS = {"Knows", "sampled_harm", "vehicle_1_shoved_m", "vehicle_1_shoved_far_
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Everything on the page. ``settings`` and ``versions`` are printed as they are given, name and value."""
+    """Content of the HTML report of an evaluation.
 
-    title: str
-    rows: Sequence[SummaryRow]
-    evaluation: Evaluation  # that the rows sum up
+    ``html`` is the page, ``write`` writes it to a file, and ``driven`` adds episodes to watch.
+    """
+
+    title: str  # title of the page
+    rows: Sequence[SummaryRow]  # summary of each agent
+    evaluation: Evaluation  # evaluation that the rows summarise
     played: Sequence[Played] = ()  # episodes to watch
-    shield: Section | None = None  # what is behind a shield
-    focus: str = ""  # the agent whose worst worlds are shown
-    figures: Sequence[Part] = ()
-    tests: Sequence[tuple[str, str, Sequence[SummaryRow]]] = ()  # the same agents elsewhere: title, what differs, rows
-    harm_count: HarmCount = "first"  # that agents minimised
-    remarks: Sequence[str] = ()  # what must not be overlooked, below the first sentence
-    summary: str = ""  # what was compared, in a sentence or two
-    settings: Mapping[str, object] = field(default_factory=dict)  # command, seeds, training set-up
-    versions: Mapping[str, str] = field(default_factory=dict)
+    shield: Section | None = None  # section on the shield; None: no shield was measured
+    focus: str = ""  # agent whose worst worlds are shown; empty: no such section
+    figures: Sequence[Part] = ()  # figures to show, as parts of a page
+    # other tests: title, how the test differs, summary of each agent
+    tests: Sequence[tuple[str, str, Sequence[SummaryRow]]] = ()
+    harm_count: HarmCount = "first"  # harm count that the agents minimised
+    remarks: Sequence[str] = ()  # important remarks, below the first sentence
+    summary: str = ""  # one or two sentences on what was compared
+    # name -> value of command, seeds and training set-up, printed unchanged
+    settings: Mapping[str, object] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)  # name -> version of software, printed unchanged
 
     def driven(self, agents: Mapping[str, Driver], *, on_agent: Callable[[str], None] | None = None) -> Report:
-        """The same with episodes, which every agent drives once more, and with what any shields among them are worth.
+        """Return the report with episodes to watch and with the section on shields.
 
-        Shields are measured in the first worlds, alone and in every mode.
+        For the episodes every agent drives once more. Shields are measured in the first ``SHIELD_WORLDS`` worlds, in
+        every mode and without a shield.
 
         Args:
-            agents: that were evaluated, by name; they are left as they are.
-            on_agent: is told each agent that is done.
+            agents: the evaluated agents by name; they are not changed.
+            on_agent: called with the name of each agent that is done.
 
         """
         evaluation, focus, harm_count = self.evaluation, self.about, self.harm_count
@@ -176,13 +191,16 @@ class Report:
 
     @property
     def about(self) -> str:
-        """The agent that the page is about: its focus, or the last that drives by a trained policy, or the last."""
+        """Name of the agent that the page is about.
+
+        It is ``focus``, else the last agent with a trained policy, else the last agent.
+        """
         learned = [row.agent for row in self.rows if row.policy_sha256]
         return self.focus or (learned or [row.agent for row in self.rows] or [""])[-1]
 
     @property
     def html(self) -> str:
-        """The page; it loads nothing from anywhere."""
+        """The whole page as HTML text. It loads no other file."""
         sections: list[Section | None] = [self._results(), self._episodes()]
         if self.focus:
             sections.append(worst_section(self.evaluation, self.focus, [one.number for one in self.played]))
@@ -213,14 +231,19 @@ class Report:
         return Page(self.title, shown, self.first_sentence, opening=self._opening(all_rows)).html
 
     def write(self, path: str | Path, *, force: bool = False) -> None:
-        """Write the page; raises ``AlreadyExists`` unless ``force``, ``InvalidInput`` without a folder."""
+        """Write the page to the file ``path``.
+
+        Raises ``AlreadyExists`` for an existing file unless ``force``, ``InvalidInput`` if the folder does not exist.
+        """
         write_output(path, self.html.encode("utf-8"), force=force)
 
     @property
     def first_sentence(self) -> str:
-        """How much harm the agent does against full braking, beside the best known, and where it fails.
+        """Sentence at the top of the page: the agent's harm against full braking and the best known harm, and where it
+        fails.
 
-        It fails in the other tests where it does no less harm than full braking; if in none, in single worlds.
+        It fails in another test where it does no less harm than full braking. If it fails in none, the share of worlds
+        in which it does more harm is named.
         """
         rows, harm = {row.agent: row for row in self.rows}, NAMES[self.harm_count]
         if self.about not in rows:
@@ -241,7 +264,10 @@ class Report:
         return f"{name} does {told} full braking ({numbers}){joined}{fails or 'in none of these worlds more'}."
 
     def _fails(self, harm: str) -> str:
-        """Where the agent does no less harm than full braking; empty: nowhere."""
+        """Return a clause on where the agent does no less harm than full braking; empty if nowhere.
+
+        ``harm`` is the measure to compare, for instance ``total_harm``.
+        """
         found = []
         for title, _, others in self.tests:
             rows = {row.agent: row for row in others}
@@ -257,7 +283,7 @@ class Report:
         return f"more in {100.0 * share:.1f} % of these worlds, by {most:.2f} at most" if share else ""
 
     def _opening(self, rows: SummaryTable) -> list[Part]:
-        """What must not be overlooked, one figure and one table."""
+        """Return the parts at the top of the page: important remarks, one figure and one table."""
         if not rows:
             return []
         which = "First-impact" if self.harm_count == "first" else "Total"
@@ -275,7 +301,9 @@ class Report:
         return Section("Results", [*told, Part.box("Three words", WORDS), *_measured(rows, because)])
 
     def _episodes(self) -> Section:
-        """The episodes to watch; which agents drove otherwise when they drove once more, and where episodes end."""
+        """Return the section with episodes to watch. Notes name agents whose second drive differs from the
+        evaluation.
+        """
         evaluation, played = self.evaluation, self.played
         if not played:
             return Section("Episodes", ())
@@ -306,36 +334,40 @@ class Report:
 
 
 def _words(estimate: Estimate | None) -> str:
-    """A mean without its interval."""
+    """Return a mean as text, without its interval; a dash if there is no estimate."""
     return Column("").show(estimate).value
 
 
 def _change(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
-    """How the harm compares with that of full braking in the same worlds; "as much" if the interval holds 0."""
+    """Compare an agent's harm with full braking in the same worlds: "less", "more" or "as much".
+
+    It is "as much" if the interval of the difference contains 0. ``harm`` is the measure, for instance ``total_harm``.
+    """
     difference = row[f"{harm}_difference"]
     low, high = (0.0, 0.0) if difference is None else difference.ends
     return "less" if high < 0.0 else "more" if low > 0.0 else "as much"
 
 
 def _table_of(rows: Sequence[SummaryRow]) -> SummaryTable:
-    """The rows as a table, with those of other sources if they have some beside them."""
+    """Return ``rows`` as a summary table. A table is returned unchanged, with its rows of other sources."""
     return rows if isinstance(rows, SummaryTable) else SummaryTable(rows)
 
 
 def _short_table(rows: SummaryTable) -> Part:
-    """Each agent, how often it collides, and both harms."""
+    """Return a table of each agent's collision rate, first-impact harm and total harm."""
     return _table(SummaryTable(rows).sheet(), _CAPTION, _SHORT)
 
 
 def _remarks(rows: SummaryTable) -> list[str]:
-    """What must not be overlooked about these rows."""
+    """Return the texts of the important remarks about these rows."""
     return [text for kind, text in SummaryTable(rows).notes() if kind == "note"]
 
 
 def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
-    """The conditions of these rows, and folded every measure with the paper's rows.
+    """Return parts with the conditions of these rows and, hidden until clicked, a table of all measures with the
+    paper's rows.
 
-    ``because``: why columns may be empty.
+    ``because`` is a sentence with the reason for empty columns.
     """
     ours = SummaryTable(rows)
     whole, notes, empty = rows.sheet(), ours.notes(), _empty(rows)
@@ -355,14 +387,18 @@ def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
 
 
 def _empty(rows: SummaryTable) -> list[str]:
-    """Columns of the table of these rows in which no line has a value."""
+    """Return the headings of the columns of a summary in which no row has a value."""
     sheet = rows.sheet()
     filled = sheet.filled()
     return [name for k, name in enumerate(sheet.headings) if k not in filled]
 
 
 def _table(sheet: Sheet, caption: str, names: set[str]) -> Part:
-    """Columns of a table by name, beside those of the agent; what is empty is left out."""
+    """Return a table of some columns of ``sheet``: its first column (the agent) and the columns in ``names`` that have
+    a value.
+
+    ``caption`` is the title of the table.
+    """
     filled = set(sheet.filled())
     some = sheet.only(k for k, name in enumerate(sheet.names) if k == 0 or (name in names and k in filled))
     rows = [
@@ -381,9 +417,19 @@ def write_evaluation(
     force: bool = False,
     tell: Callable[[int, int], None] | None = None,
 ) -> None:
-    """The page of ``ethbrake evaluate --report``, with episodes that ``agents`` drive again.
+    """Write the page of ``ethbrake evaluate --report`` to the file ``path``.
 
-    ``tell`` hears how many agents of how many have driven theirs. Raises what ``Report.write`` raises.
+    Raises the exceptions of ``Report.write``.
+
+    Args:
+        path: the HTML file.
+        evaluation: the evaluation of the agents.
+        rows: its summary.
+        agents: the evaluated agents by name, which drive some worlds again to be watched.
+        harm_count: harm that the agents minimise.
+        force: replace an existing file.
+        tell: called with the number of agents that are done and their total.
+
     """
     done: list[str] = []
 

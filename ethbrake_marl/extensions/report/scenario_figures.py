@@ -1,4 +1,4 @@
-"""The worlds of a scenario: how each quantity is distributed, which go together, and three worlds to scale."""
+"""Figure of a scenario's worlds: the distribution of each quantity, quantities in pairs, and three worlds to scale."""
 
 from __future__ import annotations
 
@@ -32,27 +32,37 @@ from ethbrake_marl.scenario.schema import Scenario
 
 _ABREAST = 4  # distributions in a row
 
-_MOST_APART = 4  # outlines in one of them that are named
+_MOST_APART = 4  # most outlines in a distribution that get a legend
 
-_MOST_PAIRED = 5  # quantities that are drawn in pairs
+_MOST_PAIRED = 5  # most quantities that are drawn in pairs
 
-_LABEL_CHARACTERS = 18  # of a line beside such a pair
+_LABEL_CHARACTERS = 18  # characters in a line of a pair's label
 
-_MOST_NAMED = 8  # vehicles of a line whose gaps and speeds are written
+_MOST_NAMED = 8  # longest line of vehicles whose gaps and speeds are written
 
-_SHOWN = {0.0: "shortest line", 0.5: "median line", 1.0: "longest line"}  # by the rank of the sum of gaps
+_SHOWN = {0.0: "shortest line", 0.5: "median line", 1.0: "longest line"}  # by relative rank of the sum of gaps
 
 
 def write_worlds(path: Path, scenario: Scenario, sample: Sample, *, seed: int, force: bool = False) -> None:
-    """The picture of ``ethbrake scenario sample``; raises what ``write_picture`` raises."""
+    """Write the picture of ``ethbrake scenario sample`` to the file ``path``. Raises the exceptions of
+    ``write_picture``.
+
+    ``seed`` is the seed of the list from which ``sample`` comes; ``force`` replaces an existing file.
+    """
     write_picture(path, worlds_figure(scenario, sample, seed=seed), force=force)
 
 
 def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
-    """How each quantity that varies is distributed, the most important ones in pairs, and three worlds to scale.
+    """Draw the distribution of each quantity that varies, the most important ones in pairs, and three worlds to scale.
 
-    In pairs are quantities of the first learner, and of the pair ahead of it, before those of others. Colours tell
-    the scenarios of a mixture apart, or the types of that vehicle.
+    Pairs show quantities of the first learner, and of the pair ahead of it, before quantities of other vehicles.
+    Colours separate the scenarios of a mixture, or the types of the first learner.
+
+    Args:
+        scenario: the scenario of the worlds.
+        sample: the worlds.
+        seed: seed of their list, for the caption.
+
     """
     worlds, panels = sample.worlds, drawn_alike(sample.worlds, scenario)
     focus = scenario.learners[0] if scenario.learners else 0
@@ -78,11 +88,17 @@ def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
 
 
 def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
-    """Label -> values [n] of what is drawn in pairs: one entry of each quantity that varies, then further ones."""
+    """Return the quantities of ``worlds`` to draw in pairs: label -> values [n].
+
+    Only quantities that vary between the worlds are drawn. Of each, the value of the vehicle (or pair) nearest to
+    vehicle ``focus`` is chosen first, then values of others while there is room.
+    """
     found: list[tuple[int, str, Floats]] = []
     for rule in QUANTITY.of(worlds).values():
         values, own = rule.of(worlds), {"vehicle": focus, "pair": max(focus - 1, 0), "world": 0}[rule.per]
-        varying = np.flatnonzero(np.ptp(values, axis=0) > 0.0)  # not where only some have an obstacle
+        varying = np.flatnonzero(
+            np.ptp(values, axis=0) > 0.0
+        )  # leaves out an obstacle that only some worlds have (infinite values)
         nearest = varying[np.argsort(np.abs(varying - own), kind="stable")].tolist()
         for i in sorted(nearest):
             owner = "" if rule.per == "world" else f"{rule.per.capitalize()} {i + 1}, "
@@ -92,7 +108,11 @@ def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
 
 
 def _distributions(panels: Mapping[str, Mapping[str, Floats]], part: Any) -> None:
-    """Shares of each quantity's values: an outline for all who draw alike."""
+    """Draw the distribution of each quantity, with one outline for all vehicles that are drawn alike.
+
+    ``panels`` maps each quantity to the values [n, ...] of each group of vehicles; ``part`` is a sub-figure of
+    matplotlib.
+    """
     columns = min(len(panels), _ABREAST)
     every = part.subplots(-(-len(panels) // columns), columns, squeeze=False).ravel()
     for axes in every[len(panels) :]:
@@ -116,7 +136,11 @@ def _distributions(panels: Mapping[str, Mapping[str, Floats]], part: Any) -> Non
 
 
 def _pairs(paired: Mapping[str, Floats], kinds: Any, part: Any) -> None:
-    """Each pair of quantities as points, below the diagonal; a colour for each kind of world."""
+    """Draw each pair of quantities as points, below the diagonal, with a colour for each kind of world.
+
+    ``paired`` maps labels to values [n], ``kinds`` [n] names the kind of each world, ``part`` is a sub-figure of
+    matplotlib.
+    """
     labels, values, names = list(paired), list(paired.values()), np.unique(kinds)
     grid = part.subplots(len(paired) - 1, len(paired) - 1, squeeze=False, sharex="col", sharey="row")
     for axes in grid[np.triu_indices(len(grid), 1)]:
@@ -138,12 +162,15 @@ def _pairs(paired: Mapping[str, Floats], kinds: Any, part: Any) -> None:
 
 
 def _lines(sample: Sample, shown: Mapping[int, str], part: Any) -> None:
-    """Some of the worlds at the alert, to scale."""
+    """Draw some worlds at the alert, to scale.
+
+    ``shown`` maps rows of the sample to descriptions; ``part`` is a sub-figure of matplotlib.
+    """
     worlds, every = sample.worlds, part.subplots(len(shown), 1, squeeze=False, sharex=True).ravel()
     for axes, (row, name) in zip(every, shown.items(), strict=True):
         style_axes(axes, 7)
         axes.set(yticks=[], ylim=(-1.5, 1.0))
-        axes.use_sticky_edges = False  # some road ahead and behind
+        axes.use_sticky_edges = False  # leaves some road ahead and behind
         axes.axhline(-0.4, color=GREY, linewidth=0.8)
         name_axes(axes, f"World {sample.index[row]}, {name}")
         gaps, ahead = worlds.gaps_m[row], worlds.obstacle_gap_m[row]

@@ -17,14 +17,17 @@ from ethbrake_marl.physics.state import Floats
 
 @dataclass(frozen=True, slots=True)
 class SeedCurve:
-    """One figure of several trainings of one recipe, at the same steps."""
+    """One quantity during several trainings of one recipe that differ in their seeds, at common steps."""
 
-    steps: Floats  # [k]
-    values: Floats  # [seeds, k]
+    steps: Floats  # [k] training steps (or another quantity of the x axis)
+    values: Floats  # [seeds, k] value of the quantity
 
     @classmethod
     def of(cls, trainings: Sequence[Mapping[int, float]]) -> Self:
-        """Of several trainings, by step, at the steps that all of them have. Raises ``InvalidInput`` for none."""
+        """Return the curve of several trainings, at the steps that all of them have.
+
+        Each training maps steps to values. Raises ``InvalidInput`` if there is no common step.
+        """
         common = sorted(set.intersection(*(set(training) for training in trainings))) if trainings else []
         if not common:
             raise InvalidInput("curves of several seeds: the trainings were never evaluated at the same step")
@@ -40,10 +43,18 @@ def seed_curves(
     x_label: str = "Training steps",
     known: Mapping[str, float] | None = None,
 ) -> Figure:
-    """One panel per label, one line per recipe: the mean over seeds, bands one standard deviation to either side.
+    """Draw one panel per quantity and one line per recipe: the mean over seeds, with a band of one standard deviation.
 
-    Panels in ``logarithmic`` have a logarithmic axis if their means allow it: harm falls to a tenth, and the last
-    tenth is what matters. A dashed line is the best that is ``known``. Raises ``InvalidInput`` without panels or lines.
+    Raises ``InvalidInput`` without panels or lines.
+
+    Args:
+        panels: label of a quantity -> name of a recipe -> its curve.
+        logarithmic: labels of panels with a logarithmic axis, on which small harm late in the training is still
+            visible. The axis stays linear if a value is not positive.
+        caption: text below the figure.
+        x_label: label of the x axis.
+        known: best known value by label, marked by a dashed line; None: no line.
+
     """
     if not panels or not all(panels.values()):
         raise InvalidInput("seed_curves: nothing to draw; at least one training with one evaluation is needed")
@@ -52,7 +63,7 @@ def seed_curves(
         for number, (recipe, curve) in enumerate(curves.items()):
             style = series_style(number + 1)
             mean, seeds = curve.values.mean(axis=0), len(curve.values)
-            spread = curve.values.std(axis=0, ddof=1) if seeds > 1 else mean * 0.0  # of one seed nothing is known
+            spread = curve.values.std(axis=0, ddof=1) if seeds > 1 else mean * 0.0  # one seed has no spread
             axes.plot(curve.steps, mean, label=f"{recipe}, {seeds} seed{'s' * (seeds != 1)}", **style)
             band(axes, curve.steps, mean - spread, mean + spread, style)
         if label in logarithmic and all((curve.values > 0.0).all() for curve in curves.values()):

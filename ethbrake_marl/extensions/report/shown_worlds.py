@@ -1,4 +1,4 @@
-"""The worlds that a report shows: the worst, the typical, and some drawn at random; and every agent in each."""
+"""Choice of the worlds that a report shows: the worst, the typical, and some at random."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MOST_WORLDS = 50
 
 WORST = 10
 
-_EACH = 5  # of the other kinds
+_EACH = 5  # number of worlds of each other kind
 
 _RANDOM_SEED = 0
 
@@ -34,7 +34,13 @@ WORDS = {
 
 
 def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS) -> dict[int, Played]:
-    """Up to ``most`` worlds to look at, by row: where ``focus`` did worst, best against full braking, as usual."""
+    """Choose up to ``most`` worlds to show. Return a mapping: index of the world in the evaluation -> its entry for the
+    episode player.
+
+    The worlds come in this order: those in which the agent ``focus`` did worst, had an avoidable collision, saved most
+    harm against full braking, or did more harm than full braking; then worlds with typical harm, and worlds drawn at
+    random. The entries hold no motion yet.
+    """
     outcome = evaluation.outcome(focus)
     found: dict[int, Played] = {}
     total, first = outcome.total_harm, outcome.first_impact_harm
@@ -61,7 +67,11 @@ def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS)
 
 
 def worst_rows(evaluation: Evaluation, focus: str) -> Ints:
-    """The ten worlds of the largest regret in total harm, or of the largest total harm where no best is known."""
+    """Return the indices of at most ten worlds in which the agent ``focus`` did worst, the worst first.
+
+    These have the largest regret in total harm, or the largest total harm if no best harm is known. Worlds in which
+    that value is 0 are left out.
+    """
     outcome, regrets = evaluation.outcome(focus), regrets_of(evaluation)
     value = outcome.total_harm if regrets is None else regrets.regret(outcome, "total")
     return _largest(value, value > 0.0)[:WORST]

@@ -1,4 +1,4 @@
-"""The style of all figures: colours, axes, caption, and how a figure is written to a file."""
+"""Style of all figures: colours, axes, caption, and writing a figure to a file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ethbrake_marl.errors import InvalidInput, plain_text
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.physics.state import Floats
 
-# Markers and dashes repeat the distinction of the colours.
+# Series differ by marker and dashes as well as by colour.
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 DASHES: tuple[str | tuple[int, tuple[int, ...]], ...] = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1)), "-", "--")
@@ -32,13 +32,13 @@ ALARM = "#b00020"
 
 DPI = 150
 
-CAPTION = "caption"  # the name of a caption's group in an SVG
+CAPTION = "caption"  # id of the caption's group in an SVG
 
 CAPTION_PT = 7.5
 
-_CHARACTERS_PER_INCH = 17.0  # of a caption
+_CHARACTERS_PER_INCH = 17.0  # characters per inch of a caption
 
-_NO_DATES: dict[str, dict[str, None]] = {  # what would differ from one writing to the next, and from one version too
+_NO_DATES: dict[str, dict[str, None]] = {  # metadata to leave out, because they would differ from file to file
     ".png": {"Software": None},
     ".svg": {"Date": None, "Creator": None},
     ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
@@ -46,10 +46,13 @@ _NO_DATES: dict[str, dict[str, None]] = {  # what would differ from one writing 
 
 
 class ShownFigure(Figure):
-    """A figure that a notebook shows, whether or not pyplot is loaded there."""
+    """A figure that a notebook displays by itself, with or without pyplot."""
 
     def draw(self, renderer: RendererBase) -> None:
-        """Draw it; the first of the two times that a writing draws it, where nothing is kept, it is only laid out."""
+        """Draw the figure with matplotlib's ``renderer``.
+
+        Saving a file draws twice; the first pass only computes the layout, because its picture is not used.
+        """
         engine = self.get_layout_engine()
         if self.axes and isinstance(engine, ConstrainedLayoutEngine) and self.canvas.is_saving():
             engine.execute(self)
@@ -61,13 +64,16 @@ class ShownFigure(Figure):
 
 
 def series_style(number: int) -> dict[str, Any]:
-    """Colour, marker and dashes of the series with this number (from 0); they repeat after seven."""
+    """Return colour, marker, dashes and sizes of line number ``number`` (from 0), as keywords of matplotlib's ``plot``.
+
+    Styles repeat after seven lines.
+    """
     k = number % len(COLOURS)
     return {"color": COLOURS[k], "marker": MARKERS[k], "linestyle": DASHES[k], "linewidth": 1.6, "markersize": 4.5}
 
 
 def label_text(text: str, most: int = 40) -> str:
-    """Text as a figure may have it, whoever wrote it: no formula, no sign that the font lacks, not too long."""
+    """Return text that is safe in a figure: no formula, only characters that the font has, at most ``most`` of them."""
     signs = font_signs()
     told = "".join(c if ord(c) in signs else c.encode("unicode_escape").decode() for c in plain_text(text))
     return (told if len(told) <= most else f"{told[: most - 16]}…{told[-15:]}").replace("$", r"\$")
@@ -75,17 +81,20 @@ def label_text(text: str, most: int = 40) -> str:
 
 @cache
 def font_signs() -> frozenset[int]:
-    """Code points that the font of figures has."""
+    """Return the code points of all characters that the font of figures has."""
     return frozenset(get_font(findfont("DejaVu Sans")).get_charmap())
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure that lays itself out; it belongs to no window."""
+    """Return an empty figure with automatic layout that belongs to no window; sizes are in inches."""
     return ShownFigure(figsize=(width_in, height_in), layout="constrained")
 
 
 def style_axes(axes: Axes, labelsize: float = 9) -> None:
-    """Thin grid behind the data, no frame where nothing is read off."""
+    """Set a thin grid behind the data, and remove the top and right frame lines.
+
+    ``labelsize`` is the font size of the numbers at the ticks.
+    """
     axes.grid(visible=True, color="#dddddd", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -93,7 +102,10 @@ def style_axes(axes: Axes, labelsize: float = 9) -> None:
 
 
 def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, list[Axes]]:
-    """A figure and its axes, row by row, in the style of all; ``how`` as matplotlib's ``subplots``."""
+    """Return a styled figure with ``rows`` times ``columns`` panels, and its axes, row by row.
+
+    ``size_in`` is width and height in inches; ``how`` are further arguments of matplotlib's ``subplots``.
+    """
     figure = new_figure(*size_in)
     panels = list(figure.subplots(rows, columns, squeeze=False, **how).ravel())
     for axes in panels:
@@ -102,7 +114,7 @@ def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **
 
 
 def name_axes(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
-    """What a panel shows, above it, and what its axes mean."""
+    """Set the title of a panel and the labels ``x`` and ``y`` of its axes; empty texts are left out."""
     in_style = ((title, partial(axes.set_title, loc="left"), 10), (x, axes.set_xlabel, 9), (y, axes.set_ylabel, 9))
     for text, write, size in in_style:
         if text:
@@ -118,7 +130,17 @@ def finish(
     fontsize: float = 9,
     loc: Literal["outside upper left", "outside upper right"] = "outside upper left",
 ) -> Figure:
-    """The figure with its caption, and one legend for all panels above them: that of the axes given."""
+    """Add the caption and a legend to a figure. Return the figure.
+
+    Args:
+        figure: the figure, which is changed.
+        caption: text below it.
+        legend: axes whose lines the legend names, for all panels; None: no legend.
+        columns: number of columns of the legend.
+        fontsize: font size of the legend.
+        loc: place of the legend.
+
+    """
     if legend is not None:
         named = legend.get_legend_handles_labels()
         figure.legend(*named, loc=loc, ncols=columns, frameon=False, fontsize=fontsize)
@@ -127,19 +149,21 @@ def finish(
 
 
 def band(axes: Axes, x: Sequence[float] | Floats, low: Any, high: Any, style: Mapping[str, Any]) -> None:
-    """What a line's intervals reach, in the line's colour."""
+    """Fill the band between ``low`` and ``high`` at the places ``x``, in the colour of ``style`` (from
+    ``series_style``).
+    """
     axes.fill_between(x, low, high, color=str(style["color"]), alpha=0.18, linewidth=0.0)
 
 
 def add_caption(figure: Figure, text: str) -> None:
-    """The conditions of a figure, small, below it."""
+    """Write ``text`` (the conditions of a figure) below the figure, in small type."""
     width = int(figure.get_figwidth() * _CHARACTERS_PER_INCH)
     label = figure.supxlabel(textwrap.fill(text, width), x=0.01, ha="left", fontsize=CAPTION_PT, color=GREY)
     label.set_gid(CAPTION)
 
 
 def picture_ending(path: str | Path) -> str:
-    """The ending that says how a picture is written; raises ``InvalidInput`` for any but .png, .svg and .pdf."""
+    """Return the ending of a picture's file name: .png, .svg or .pdf. Raises ``InvalidInput`` for any other."""
     ending = Path(path).suffix.lower()
     if ending not in _NO_DATES:
         raise InvalidInput(f"{path}: pictures are written as PNG, SVG or PDF; end the name in .png, .svg or .pdf")
@@ -147,13 +171,13 @@ def picture_ending(path: str | Path) -> str:
 
 
 def picture_bytes(figure: Figure, path: str | Path) -> bytes:
-    """The figure as the ending of ``path`` says: ``.png``, ``.svg`` or ``.pdf``; the same figure gives the same bytes.
+    """Return the figure as the bytes of a PNG, SVG or PDF file, by the ending of ``path``. Nothing is written.
 
-    Raises ``InvalidInput`` for another ending.
+    The same figure always gives the same bytes. Raises ``InvalidInput`` for another ending.
     """
     ending = picture_ending(path)
     buffer = io.BytesIO()
-    # Fonts travel with the file: as outlines in SVG, as TrueType in PDF.
+    # embed fonts: as outlines in SVG, as TrueType in PDF
     with matplotlib.rc_context(
         {"savefig.facecolor": "white", "svg.hashsalt": "ethbrake", "svg.fonttype": "path", "pdf.fonttype": 42}
     ):
@@ -162,10 +186,9 @@ def picture_bytes(figure: Figure, path: str | Path) -> bytes:
 
 
 def write_picture(path: str | Path, figure: Figure, *, force: bool = False) -> None:
-    """Write a figure as the ending of ``path`` says, whole or not at all.
+    """Write ``figure`` to a PNG, SVG or PDF file, by the ending of ``path``. The file is written whole or not at all.
 
-    Raises ``InvalidInput`` for an ending other than ``.png``, ``.svg`` and ``.pdf`` or a file that cannot be written,
-    ``AlreadyExists`` unless ``force``.
+    Raises ``InvalidInput`` for another ending or a file that cannot be written, and ``AlreadyExists`` unless ``force``.
     """
     write_output(path, picture_bytes(figure, path), force=force)
 
@@ -174,5 +197,8 @@ TITLES = {"first": "First-impact harm (m²/s²)", "total": "Total harm (m²/s²)
 
 
 def plain(value: float, _: int) -> str:
-    """A tick without powers."""
+    """Format the number at a tick of an axis without powers of ten.
+
+    The second argument, the index of the tick, is not used.
+    """
     return f"{value:g}"

@@ -1,4 +1,4 @@
-"""A figure inside a page."""
+"""Put a figure into an HTML page as inline SVG."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SVG, _LINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 
 _DROPPED = {f"{{{_SVG}}}metadata", f"{{{_SVG}}}style"}
 
-_PALETTE = {  # colours of figures by what a page calls them: it has others for the dark
+_PALETTE = {  # names of a figure's colours in a page, which has other values for dark mode
     "#000000": "var(--series-0)",
     "#d55e00": "var(--series-1)",
     "#0072b2": "var(--series-2)",
@@ -38,7 +38,9 @@ _CLIP = re.compile(r"url\(#[A-Za-z][\w.:-]*\)")
 
 _HREF = f"{{{_LINK}}}href"
 
-_TAGS = {f"{{{_SVG}}}{name}" for name in ("svg", "g", "defs", "path", "use", "clipPath", "rect")}  # of a figure of ours
+_TAGS = {
+    f"{{{_SVG}}}{name}" for name in ("svg", "g", "defs", "path", "use", "clipPath", "rect")
+}  # elements of our figures
 
 _ATTRIBUTES = {
     "id", "d", "x", "y", "width", "height", "viewBox", "transform", "clip-path", "fill", "fill-opacity", "opacity",
@@ -48,7 +50,7 @@ _ATTRIBUTES = {
 
 _MOST_DEEP = 50
 
-_LINE_PT = 1.2 * CAPTION_PT  # of a caption, from one line to the next
+_LINE_PT = 1.2 * CAPTION_PT  # line spacing of a caption
 
 _NARROW_PT = 540.0  # figures up to this width have one panel
 
@@ -56,17 +58,24 @@ SLIM_IN = 3.8  # a figure of this width can be read on a phone without scrolling
 
 
 def inline_svg(figure: Figure | bytes, label: str, *, recolour: bool = True) -> tuple[str, str]:
-    """A figure as an SVG element of a page, whose policy allows no ``style``, and its caption, which is taken out.
+    """Return a figure as an SVG element without ``style`` (the page's policy allows none), and its caption as text.
 
-    No two names in a page may be alike. Raises ``InvalidInput`` for the bytes of an SVG with what no figure of ours
-    holds: somebody else may have changed the file.
+    The caption is removed from the SVG. All ids get a prefix, so that they are unique in a page. Raises
+    ``InvalidInput`` for the bytes of an SVG with anything that our figures do not contain, because somebody may have
+    changed the file.
+
+    Args:
+        figure: the figure, or the bytes of its SVG.
+        label: description for readers who do not see it; it also makes the ids unique.
+        recolour: True: use the colours of the page, light or dark; False: keep the colours.
+
     """
     svg = figure if isinstance(figure, bytes) else picture_bytes(figure, "figure.svg")
     if svg is figure and not _is_ours(svg):
         raise InvalidInput("is not a figure as it was drawn; make it again (--force)")
     root = ElementTree.fromstring(svg, ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True)))
     group, caption = root.find(f".//{{{_SVG}}}g[@id='{CAPTION}']"), ""
-    if group is not None:  # its text stands in comments; outlines of its letters stay: texts drawn after it use them
+    if group is not None:  # its text is in comments; the outlines of its letters stay, because later texts use them
         lines = [(each.text or "").strip() for each in group.iter(ElementTree.Comment)]  # type: ignore[arg-type]
         outlines = list(group.iter(f"{{{_SVG}}}defs"))
         for child in list(group):
@@ -79,13 +88,13 @@ def inline_svg(figure: Figure | bytes, label: str, *, recolour: bool = True) -> 
     prefix = f"f{hashlib.sha256(svg + label.encode()).hexdigest()[:8]}-"
     for parent in list(root.iter()):
         for child in list(parent):
-            if child.tag in _DROPPED or not isinstance(child.tag, str):  # the latter are comments
+            if child.tag in _DROPPED or not isinstance(child.tag, str):  # a tag that is no string is a comment
                 parent.remove(child)
     for element in root.iter():
         _restyle(element, recolour)
         if "id" in element.attrib:
             element.attrib["id"] = prefix + element.attrib["id"]
-        for name, value in element.attrib.items():  # every name that it points to
+        for name, value in element.attrib.items():  # every id that it refers to
             if name == _HREF or (name in ("clip-path", "fill", "mask") and value.startswith("url(")):
                 element.attrib[name] = value if value.startswith("data:") else _ID.sub(rf"#{prefix}\1", value)
     for name in ("width", "height", "version"):
@@ -106,16 +115,16 @@ def inline_svg(figure: Figure | bytes, label: str, *, recolour: bool = True) -> 
 
 
 def _size_pt(root: ElementTree.Element) -> tuple[float, float]:
-    """Width and height of a figure; 0 where it does not say them as ours do."""
+    """Return width and height of an SVG figure in points; 0, 0 if its viewBox has another form than in our figures."""
     found = re.fullmatch(r"0 0 (\d+(?:\.\d+)?) (\d+(?:\.\d+)?)", root.attrib.get("viewBox", ""))
     return (float(found[1]), float(found[2])) if found else (0.0, 0.0)
 
 
 def _is_ours(svg: bytes) -> bool:
-    """Whether all that a page would take from an SVG is what our figures are made of."""
+    """Return whether the bytes of an SVG contain only elements and attributes that our figures have."""
     try:
         level = [ElementTree.fromstring(svg)]
-    except (ElementTree.ParseError, LookupError, ValueError):  # no XML, or in a coding that nobody knows
+    except (ElementTree.ParseError, LookupError, ValueError):  # not XML, or an unknown encoding
         return False
     for _ in range(_MOST_DEEP):
         level = [element for element in level if element.tag not in _DROPPED]
@@ -123,7 +132,7 @@ def _is_ours(svg: bytes) -> bool:
             _restyle(element, recolour=False)
             if element.tag not in _TAGS:
                 return False
-            for name, value in element.attrib.items():  # each only draws, and points to nothing outside its figure
+            for name, value in element.attrib.items():  # may only draw, and refer to nothing outside
                 inside = name == "transform" or "(" not in value or _CLIP.fullmatch(value) is not None
                 if not (_ID.fullmatch(value) if name == _HREF else name in _ATTRIBUTES and inside):
                     return False
@@ -132,7 +141,10 @@ def _is_ours(svg: bytes) -> bool:
 
 
 def _restyle(element: ElementTree.Element, recolour: bool) -> None:
-    """Write each declaration of ``style`` as the attribute of that name."""
+    """Replace each declaration of the ``style`` attribute by an attribute of that name, in place.
+
+    ``recolour`` also replaces the colours by the page's colours.
+    """
     for declaration in element.attrib.pop("style", "").split(";"):
         name, colon, value = declaration.partition(":")
         if colon:

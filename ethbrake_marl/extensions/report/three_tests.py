@@ -1,4 +1,4 @@
-"""The three tests that are shown beside each other, and a table of all three on one screen."""
+"""The three tests whose results are shown together, and a table of all three on one screen."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TESTS = {
 
 
 def is_as_shipped(scenario: Scenario) -> bool:
-    """Whether every value of the scenario is that of the shipped one of its name, whatever its texts say."""
+    """Return whether the scenario equals the shipped one of the same name, apart from title, description and source."""
     one, other = (
         each.model_dump(exclude={"title", "description", "source"}) for each in (scenario, load_scenario(scenario.name))
     )
@@ -30,19 +30,27 @@ def is_as_shipped(scenario: Scenario) -> bool:
 
 
 def other_tests(scenario: Scenario) -> tuple[Scenario, ...]:
-    """The two tests that belong beside results on ``scenario``; none where it is not one of the three as shipped."""
+    """Return the other two of the three tests (``TESTS``) if ``scenario`` is one of them, as shipped; else an empty
+    tuple.
+    """
     if scenario.name not in TESTS or not is_as_shipped(scenario):
         return ()
     return tuple(load_scenario(name) for name in TESTS if name != scenario.name)
 
 
-_KEPT = ("collision_rate", "first_impact_harm", "total_harm")  # columns of the brief table
+_KEPT = ("collision_rate", "first_impact_harm", "total_harm")  # columns of the short table
 
 
 def brief(table: SummaryTable, beside: Mapping[str, SummaryTable]) -> Sheet:
-    """A table on one screen: collisions and both harms, also in the tests ``beside``, and what must be said of them.
+    """Return a table for one screen: each agent's collisions and both harms, and its harm in other tests, and notes
+    below.
 
-    Rows of other sources, and the other measures, are not in it.
+    Rows of other sources and other measures are left out.
+
+    Args:
+        table: summary of the agents on the main test.
+        beside: summaries of the agents on other tests, by name of the test.
+
     """
     ours = SummaryTable(table)
     sheet = ours.terminal()

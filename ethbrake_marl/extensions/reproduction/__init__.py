@@ -1,1 +1,1 @@
-"""The paper's tables and figures, made again: ``ethbrake reproduce``."""
+"""Reproduce the paper's tables and figures: ``ethbrake reproduce``."""

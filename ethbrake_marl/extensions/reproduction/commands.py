@@ -1,4 +1,4 @@
-"""The command ``reproduce``: the paper's figures and tables, made again."""
+"""The command ``reproduce``: reproduce the paper's figures and tables."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The paper's hybrid around a policy that has not converged: ``Fig:hybrid illu`` and ``Table:hybrid``."""
+"""The paper's hybrid (``Fig:hybrid illu``, ``Table:hybrid``) and its random test (``Table:Random``)."""
 
 from __future__ import annotations
 
@@ -46,13 +46,26 @@ _ALONE, _REALISED, _AS_PRINTED = "policy alone", "hybrid, realised H*", "hybrid,
 
 
 def _drive_hybrid(name: str, settings: Reproduction, reading: Reading) -> Evaluation:
-    """The strategies on the worlds of a scenario."""
+    """Evaluate E-V2X-BM, a policy that has not converged, and the paper's hybrid of both on a list of worlds.
+
+    The *hybrid* is the paper's Algorithm 1: it chooses one of the two at the alert.
+
+    Args:
+        name: name of a shipped scenario.
+        settings: settings of the reproduction, with the number of worlds.
+        reading: assumption on when Vehicle 2 may act.
+
+    """
     return _driven_hybrid(name, settings, reading, unconverged_policy(settings)[1])
 
 
-@lru_cache(maxsize=2 * len(READINGS))  # figure and table share what they drive
+@lru_cache(maxsize=2 * len(READINGS))  # figure and table share the evaluations
 def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: str) -> Evaluation:
-    """... with the policy that is told ``about``: a training that has ended since takes the place of a shipped one."""
+    """Evaluate the strategies of ``_drive_hybrid``, once for each set of arguments.
+
+    ``about`` describes the policy that has not converged. It is part of the cache key, so that a training that ends
+    meanwhile replaces a shipped policy.
+    """
     scenario, (policy, _) = reading.scenario(name), unconverged_policy(settings)
     agents: dict[str, Agent] = {
         **lineup(scenario, PAIRWISE, COUPLED),
@@ -64,9 +77,12 @@ def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: s
 
 
 def reproduce_illustration(settings: Reproduction) -> Made:
-    """Harm of E-V2X-BM, of a policy that has not converged, and of the hybrid, over the total distance.
+    """Reproduce harm against the sum of both gaps, for E-V2X-BM, a policy that has not converged, and the hybrid of
+    both.
 
-    Judged is whether it "consistently selects the strategy that results in lower harm": in each world, in each group.
+    Returns figure, tables and verdicts. The *hybrid* is the paper's Algorithm 1: it chooses one of the two at the
+    alert. The paper's claim that it "consistently selects the strategy that results in lower harm" is judged in each
+    world and in each group.
     """
     found, verdicts = {}, []
     for reading in READINGS:
@@ -92,7 +108,10 @@ def reproduce_illustration(settings: Reproduction) -> Made:
 
 
 def reproduce_hybrid_table(settings: Reproduction) -> Made:
-    """The 5,000 episodes of the paper's table, with both speeds that it may mean."""
+    """Reproduce the paper's table of 5,000 episodes (``Table:hybrid``); return tables and verdicts.
+
+    The paper allows two sets of initial speeds; both are used.
+    """
     ours = {
         "E-V2X-BM": (NAMES[PAIRWISE], NAMES[COUPLED]),
         "Standalone DRL": (_ALONE,),
@@ -123,7 +142,9 @@ def reproduce_hybrid_table(settings: Reproduction) -> Made:
 
 
 def reproduce_random_table(settings: Reproduction) -> Made:
-    """Collisions, harm and its decrease of the four strategies in the random test (``Table:Random``)."""
+    """Reproduce collisions, harm and decrease of harm in the random test (``Table:Random``); return tables and
+    verdicts.
+    """
     episodes, besides = min(_RANDOM_WORLDS, settings.episodes), []
     ours: dict[str, tuple[str, ...]] = {
         "Non-E": (NAMES[FULL_BRAKE],),

@@ -1,4 +1,4 @@
-"""The items of a reproduction, in the order of the paper."""
+"""List of the items of a reproduction (the paper's figures and tables), in the order of the paper."""
 
 from __future__ import annotations
 
@@ -109,9 +109,9 @@ ITEMS = (  # in the order of the paper
 
 
 def read_results(folder: Path) -> list[Result]:
-    """The results that are there, in the order of the paper.
+    """Return the results of all items that exist in ``folder``, in the order of the paper.
 
-    Raises ``InvalidInput`` for one that is damaged, or another item's.
+    Raises ``InvalidInput`` for a damaged result, or a result of another item.
     """
     files = {item.name: folder / item.name / RESULT for item in ITEMS}
     return [checked_result(read_object(file), file, name) for name, file in files.items() if file.is_file()]

@@ -1,4 +1,4 @@
-"""Make the items that are asked for, in their folder."""
+"""Make the requested items in their folder."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ from ethbrake_marl.files.store import write_file, write_output
 
 
 def choose_items(names: Sequence[str]) -> list[Item]:
-    """The items of these names in the order of the paper, all of them for none.
+    """Return the items (figures and tables of the paper) with these names, in the order of the paper; if none is named,
+    all.
 
-    Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for one that is given twice.
+    Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for a repeated name.
     """
     known = {item.name: item for item in ITEMS}
     for k, name in enumerate(names):
@@ -43,15 +44,16 @@ def choose_items(names: Sequence[str]) -> list[Item]:
 
 
 def open_folder(asked: Reproduction, *, force: bool = False) -> StudyFolder:
-    """The folder, in which the same settings go on; with ``force`` its results go and its trainings stay.
+    """Return the folder of a reproduction as a ``StudyFolder``, which continues an earlier one with the same settings.
 
-    Raises ``InvalidInput`` for a link.
+    ``asked`` are the settings. With ``force`` the results in the folder are deleted; its trainings stay. Raises
+    ``InvalidInput`` if the folder is a link.
     """
     path, question = asked.folder, {"episodes": asked.episodes, "version": __version__}
     if path.is_symlink():
         raise InvalidInput(f"{path}: is no plain folder; give another (--output)")
     if force and (path / SETTINGS).is_file() and read_object(path / SETTINGS).get("format") == FORMAT["format"]:
-        for item in ITEMS:  # figures and data are replaced as they are made again
+        for item in ITEMS:  # figures and data are replaced when the item is made again
             (path / item.name / RESULT).unlink(missing_ok=True)
         write_file(path / SETTINGS, json_text({**FORMAT, **question}))
     advice = "give another folder (--output), or replace it with force (--force)"
@@ -62,12 +64,18 @@ def open_folder(asked: Reproduction, *, force: bool = False) -> StudyFolder:
 
 
 def make_items(asked: Reproduction, items: Sequence[Item], *, force: bool = False) -> tuple[list[Result], bool]:
-    """Make the items; gives every result that the folder then holds, and whether nothing stopped the trainings.
+    """Reproduce items (figures and tables of the paper). Return all results in the folder, and whether all trainings
+    ended.
 
-    Items that need no training come first. One whose result is there, with the same trainings behind it, is kept.
-    After each item the page is written anew. Ctrl-C during a training ends all trainings, and the items are made
-    of those that are finished; a second one stops at once. Raises what ``open_folder`` and ``StudyFolder.work``
-    raise.
+    Items without trainings come first. An existing result from the same trainings is kept. After each item the page is
+    rewritten. Ctrl-C during a training ends all trainings, and items use the finished ones; a second Ctrl-C stops at
+    once. Raises the exceptions of ``open_folder`` and ``StudyFolder.work``.
+
+    Args:
+        asked: settings of the reproduction.
+        items: items to reproduce.
+        force: make existing results again.
+
     """
     full, finished = asked.mode == "full", True
     with open_folder(asked, force=force).work():
@@ -86,7 +94,10 @@ def make_items(asked: Reproduction, items: Sequence[Item], *, force: bool = Fals
 
 
 def _make_item(asked: Reproduction, item: Item, trained: Sequence[str]) -> None:
-    """Make an item, and write its figures and data, then its result, which makes them count."""
+    """Reproduce an item; write its figures and data, then its result file, which marks it as complete.
+
+    ``trained`` names the trainings that it uses, as ``group/recipe``.
+    """
     place, started = asked.folder / item.name, time.process_time()
     made = item.make(asked)
     result = Result(

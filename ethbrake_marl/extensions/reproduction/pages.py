@@ -1,6 +1,4 @@
-"""The pages: one HTML file that holds its figures and loads nothing from anywhere, and Markdown with figures beside
-it.
-"""
+"""Pages of a reproduction: one self-contained HTML file, and a Markdown page with figures beside it."""
 
 from __future__ import annotations
 
@@ -32,9 +30,10 @@ _NUMERAL = re.compile(r"[-+−]?\d[\d,.]*( ?%)?|–|")
 
 
 def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
-    """What a page of these results is about; the command that makes them; when, where and in how much time they were.
+    """Return four texts on the results and the run that made them.
 
-    Then that lists are shorter than the paper's, where they are.
+    These are the lead sentence; the command that makes the results; date, machines and processor time; and a list with
+    a remark if lists are shorter than the paper's, else empty.
     """
     every = len(results) == len(ITEMS)
     most = max((result.episodes for result in results), default=MOST_EPISODES)
@@ -42,7 +41,9 @@ def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
     names = [] if every else [result.name for result in results]
     mode = "--full" if any(result.mode == "full" for result in results) else "--quick"
     command = ["ethbrake reproduce", *names, mode, *(["--episodes", str(most)] if fewer else [])]
-    unloaded = [re.sub(r", load [0-9.]+", "", each.machine) for each in results]  # the load differs item by item
+    unloaded = [
+        re.sub(r", load [0-9.]+", "", each.machine) for each in results
+    ]  # without the load, which differs between items
     machines = (f"{each.made_utc[:10]}, {machine}" for each, machine in zip(results, unloaded, strict=True))
     seconds = sum(each.processor_s for each in results)
     return (
@@ -54,9 +55,9 @@ def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
 
 
 def render_page(folder: Path, results: Sequence[Result]) -> str:
-    """The page as HTML; whatever the results say is shown as text.
+    """Return the page with all results as HTML text; ``folder`` holds their figures.
 
-    Raises ``InvalidInput`` for a figure that is not there or holds more than a figure of ours does.
+    Raises ``InvalidInput`` for a missing figure, or a figure with elements that our figures do not contain.
     """
     lead, command, made, few = _account(results)
     _, *names = Page.anchors(["Overview", *(result.title for result in results)])
@@ -111,15 +112,19 @@ def _section(folder: Path, result: Result) -> Section:
 
 
 def _outcome(word: str) -> Markup:
-    """The word of a verdict, with a sign and a colour."""
+    """Return the outcome of a verdict, such as "agrees", as HTML with a sign and a colour."""
     return Markup('<span class="outcome {}">{}</span>').format(word.replace(" ", "-"), word)
 
 
-FIGURES, PREFIX = "figures", "reproduction-"  # of the figures beside docs/reproduction.md
+FIGURES, PREFIX = "figures", "reproduction-"  # folder and file prefix of the figures of docs/reproduction.md
 
 
 def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
-    """Write the page, the results as ``.json`` beside it, and the figures into ``figures/``; all are replaced."""
+    """Write the Markdown page to ``file``, the results as ``.json`` beside it, and the figures into a folder
+    ``figures``.
+
+    Existing files are replaced. ``folder`` holds the figures of the results.
+    """
     figures = file.parent / FIGURES
     figures.mkdir(exist_ok=True)
     for result in results:
@@ -132,7 +137,7 @@ def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
 
 
 def docs_page(results: Sequence[Result]) -> str:
-    """The page of these results as Markdown: verdicts; the site shows everything else from the ``.json`` beside it."""
+    """Return the Markdown page of these results, with the verdict on each item. The ``.json`` file has all the rest."""
     lead, command, made, few = _account(results)
     blocks = [
         f"# {_TITLE}",
@@ -158,12 +163,12 @@ def docs_page(results: Sequence[Result]) -> str:
 
 
 def _wrapped(text: str) -> str:
-    """A paragraph in lines of the pages' width; no line of it begins a list or a heading."""
+    """Return a paragraph wrapped to lines of 99 characters, of which none starts a list or a heading."""
     lines = textwrap.wrap(text, 99, break_long_words=False, break_on_hyphens=False)
     return "\n".join(re.sub(r"^(?=[-+#>] )", r"\\", line) for line in lines)
 
 
 def _escaped(text: str) -> str:
-    """Text that is no markup: what would be is escaped."""
+    """Return ``text`` with the special characters of Markdown escaped."""
     plain = plain_text(text, keep="\u00a0").replace("<", "&lt;")
     return re.sub(r"([\\|*_`])", r"\\\1", plain).replace("](", "]\\(")

@@ -1,4 +1,4 @@
-"""Strategies on the paper's worlds, at the latencies that it states and with Vehicle 2 acting at 0.2 s."""
+"""The paper's strategies on its worlds, with the stated latencies and with Vehicle 2 acting at 0.2 s."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FULL_BRAKE, PAIRWISE, COUPLED = "full_brake", "e_v2x_bm:pairwise", "e_v2x_bm"
 
 SAC, PPO, UNIVERSAL = "sac@shipped/sac", "ppo@shipped/ppo", "universal@shipped"
 
-NAMES = {  # of the strategies in tables and figures
+NAMES = {  # names of the strategies in tables and figures
     FULL_BRAKE: "Non-ethical (full braking)",
     PAIRWISE: "E-V2X-BM, realised",
     COUPLED: "E-V2X-BM, coupled",
@@ -42,13 +42,15 @@ NAMES = {  # of the strategies in tables and figures
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """A time from which Vehicle 2 acts."""
+    """An assumption on the time at which Vehicle 2 may act; the paper allows two."""
 
-    name: str
-    acts_s: float | None = None  # None: the scenario's own
+    name: str  # name of the assumption
+    acts_s: float | None = None  # time at which Vehicle 2 may act; None: the scenario's latency
 
     def scenario(self, name: str, **changes: object) -> Scenario:
-        """A shipped scenario so read."""
+        """Return the shipped scenario ``name`` under this assumption; ``changes`` replace further keys of the
+        scenario.
+        """
         found = load_scenario(name).replace(**changes) if changes else load_scenario(name)
         if self.acts_s is None:
             return found
@@ -60,12 +62,14 @@ READINGS = (Reading("as stated"), Reading("Vehicle 2 acts at 0.2 s", 0.2))
 
 
 def lineup(scenario: Scenario, *specs: str) -> dict[str, Agent]:
-    """Agents by their names in ``NAMES``, else by their spec."""
+    """Return the agents of ``specs`` (texts such as ``"full_brake"``), by their names in ``NAMES``, or else by spec."""
     return {NAMES.get(spec, spec): agent for spec, agent in make_agents(specs, scenario).items()}
 
 
 def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, settings: Reproduction) -> Evaluation:
-    """Let every agent drive the first worlds of the list."""
+    """Evaluate every agent on the first ``episodes`` worlds of the scenario's list. ``settings`` receives the
+    progress.
+    """
     return evaluate(
         scenario.sample(episodes, LIST_SEED),
         agents,
@@ -77,7 +81,11 @@ def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, s
 
 
 def harms(evaluation: Evaluation) -> dict[str, Floats]:
-    """First-impact harm of each strategy in each world, what E-V2X-BM predicts, what nobody undercuts, [n] m2/s2."""
+    """Return the first-impact harm of each strategy, by its name, [n] m2/s2.
+
+    The mapping also has the harm that E-V2X-BM predicts (``PREDICTED``) and the proven lower bound (``PROVEN``), if
+    known.
+    """
     found = {name: outcome.first_impact_harm for name, outcome in evaluation.outcomes.items()}
     pairwise = evaluation.outcomes.get(NAMES[PAIRWISE])
     if pairwise is not None and pairwise.predicted_harm is not None:
@@ -88,13 +96,13 @@ def harms(evaluation: Evaluation) -> dict[str, Floats]:
     return found
 
 
-_STAND_IN = "ppo-paper-random-obstacle"  # for one that has not converged, where nothing is trained
+_STAND_IN = "ppo-paper-random-obstacle"  # shipped policy that replaces an unconverged one without trainings
 
 
 def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:
-    """What stands for the paper's "PPO model obtained from training before convergence occurred", and what it is.
+    """Return a policy in place of the paper's "PPO model obtained from training before convergence occurred".
 
-    The one stopped early that ``--full`` has trained, else a shipped policy that stands in for it.
+    It is the policy that ``--full`` stopped early, or else a shipped policy. Also returns its description.
     """
     for (path,) in settings.trained([STOPPED]).values():
         about = f"PPO stopped early: the last policy of {EARLY.decisions:,} decisions on paper-random"
@@ -104,11 +112,15 @@ def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:
 
 
 def hybrid(policy: Policy, scenario: Scenario, bound: Literal["coupled", "pairwise"]) -> Agent:
-    """Algorithm 1 around a policy."""
+    """Return the paper's hybrid (Algorithm 1): at the alert it chooses ``policy`` or E-V2X-BM, whichever expects less
+    harm.
+
+    ``bound`` is the harm expected of E-V2X-BM: ``coupled`` simulates it, ``pairwise`` predicts it by a closed form.
+    """
     return HybridAgent(LearnedAgent(policy, "policy"), scenario, bound=bound)
 
 
-FOUR = (FULL_BRAKE, PAIRWISE, COUPLED, SAC, PPO)  # the paper's four, E-V2X-BM twice
+FOUR = (FULL_BRAKE, PAIRWISE, COUPLED, SAC, PPO)  # the paper's four strategies, with two versions of E-V2X-BM
 
 BASELINES = (NAMES[PAIRWISE], NAMES[COUPLED], PREDICTED)
 

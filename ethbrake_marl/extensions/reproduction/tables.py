@@ -1,4 +1,4 @@
-"""Our rows beside those of the paper's tables: what agrees, what differs, and what no strategy can reach."""
+"""Compare our rows with the paper's tables: what agrees, what differs, and what no strategy can reach."""
 
 from __future__ import annotations
 
@@ -28,21 +28,24 @@ _UNDERCUT = {_RATE: "worlds in which no command avoids an impact", _MEAN_HARM: "
 
 
 def collision_rate(collided: Bools) -> Estimate:
-    """Share of worlds with an impact."""
+    """Return the share of worlds with an impact, with its 95 % interval. ``collided`` [n] is True for such worlds."""
     return rate(int(collided.sum()), len(collided))
 
 
 @dataclass(frozen=True)
 class Beside:
-    """Our results in one reading, to stand beside the paper's rows."""
+    """Our results under one assumption on when Vehicle 2 may act, for comparison with the paper's rows."""
 
-    title: str
-    evaluation: Evaluation
-    ours: Mapping[str, Sequence[str]]  # the paper's row -> our strategies, the first is the one compared
+    title: str  # description of the assumption
+    evaluation: Evaluation  # outcomes of our strategies
+    ours: Mapping[str, Sequence[str]]  # row of the paper -> our strategies; the first one is compared
 
     @cached_property
     def numbers(self) -> dict[str, dict[str, Estimate]]:
-        """Every quantity of every strategy, and of nobody in particular what is proven to be the least."""
+        """Our results: strategy -> quantity (such as "collision rate") -> estimate.
+
+        The key "least possible (proven)" (``NOBODY``), if present, holds the proven minimum over all strategies.
+        """
         found, braking = {}, self.evaluation.outcomes.get(NAMES[FULL_BRAKE])
         for name, outcome in self.evaluation.outcomes.items():
             harm, predicted = outcome.first_impact_harm, outcome.predicted_harm
@@ -60,7 +63,15 @@ class Beside:
         return found
 
     def candidates(self, row: str, quantity: str) -> Iterator[tuple[str, Estimate]]:
-        """Everything of ours that may be meant by a number of a row, the compared one first."""
+        """Yield all results of ours that a number in the paper may mean, each as (name, estimate).
+
+        The first one is compared with the paper's number; the others are named if it differs.
+
+        Args:
+            row: name of the strategy in the paper.
+            quantity: "collision rate", "average harm" or "harm decrease".
+
+        """
         for name in self.ours[row]:
             if quantity in self.numbers[name]:
                 yield f"{name} ({self.title})", self.numbers[name][quantity]
@@ -72,14 +83,17 @@ class Beside:
 
 
 def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list[Verdict]:
-    """One verdict per reading, row and quantity."""
+    """Return a verdict on each printed number, once for each of ``besides`` (our results under one assumption).
+
+    ``printed`` are the rows of the paper's table.
+    """
     verdicts = []
     for beside in besides:
         least = beside.numbers.get(NOBODY, {})
         for row in printed:
             numbers = {_RATE: row.collision_rate, _MEAN_HARM: row.average_harm, _DECREASE: row.harm_decrease}
             for quantity, number in numbers.items():
-                if not number:  # the decrease of the baseline, or none is printed
+                if not number:  # 0 is the baseline's decrease; None is not printed
                     continue
                 (_, ours), *own = beside.candidates(row.agent, quantity)
                 others = [other.candidates(row.agent, quantity) for other in besides if other is not beside]
@@ -97,9 +111,10 @@ def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list
 
 
 def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdict:
-    """Whether a choice between two strategies, world by world, can avoid as many collisions as is printed.
+    """Return a verdict: can a choice between two strategies, world by world, avoid as many collisions as printed?
 
-    It avoids a collision only where one of the two does: at most as many as both together.
+    It avoids a collision only where one of the two strategies does, so at most as many as both together. ``one`` and
+    ``other`` are the paper's rows of the two strategies, ``chosen`` is its row of the choice.
     """
     avoided = [row.episodes - row.collisions for row in (one, other, chosen)]
     together = avoided[0] + avoided[1]
@@ -112,7 +127,10 @@ def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdi
 
 
 def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
-    """Whether a printed harm decrease follows from the printed harms, to the printed digits."""
+    """Return a verdict: does the decrease of harm printed in ``row`` follow from the harms printed in both rows?
+
+    ``baseline`` is the row to which the decrease refers. The two must agree within 0.01 percentage points.
+    """
     follows = 1.0 - row.average_harm / baseline.average_harm
     printed = row.harm_decrease or 0.0
     told = (
@@ -123,7 +141,7 @@ def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
 
 
 def rows_table(beside: Beside) -> Sheet:
-    """Our rows of one reading, with what no strategy undercuts."""
+    """Return the table of our results under one assumption (``beside``), with the proven minimum."""
     columns: dict[str, Column | str] = {
         _RATE: PERCENT, _MEAN_HARM: "First-impact harm", _TOTAL: "Total harm", _PREDICTED_HARM: "Predicted harm",
         _DECREASE: replace(PERCENT, heading="Harm decrease"),
@@ -143,7 +161,17 @@ def beside_printed(
     parameters: Sequence[Parameter],
     notes: Sequence[str] = (),
 ) -> Made:
-    """A table of the paper, and ours in each reading."""
+    """Return an item that compares a table of the paper with our results.
+
+    Args:
+        stem: name of its data file without ending.
+        printed: rows of the paper's table.
+        besides: our results, one entry for each assumption on when Vehicle 2 may act.
+        arithmetic: verdicts on the printed numbers alone.
+        parameters: quantities that affect the item.
+        notes: sentences on what was run and what was not.
+
+    """
     columns: dict[str, list[str]] = {
         "Strategy": [row.agent for row in printed],
         "Collisions": [f"{row.collisions:,}" for row in printed],

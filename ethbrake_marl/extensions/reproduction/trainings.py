@@ -1,7 +1,7 @@
-"""The trainings of ``ethbrake reproduce --full``: learning curves, a policy stopped early, open weights of the reward.
+"""The trainings of ``ethbrake reproduce --full``: learning curves, a policy stopped early, and open reward weights.
 
-Each group is a folder of learning curves: finished trainings are kept, begun ones go on, by the rules of
-``learning_curves.train_all``.
+Each group is a folder of learning curves (``learning_curves.LearningCurves``): finished trainings are kept, unfinished
+ones continue.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
 
 STOPPED, OPEN = "stopped", "open"
 
-CURVES = {delay: (delay, f"{delay}-ppo-paper", f"{delay}-sac-paper") for delay in ("low", "high")}  # -> groups
+CURVES = {delay: (delay, f"{delay}-ppo-paper", f"{delay}-sac-paper") for delay in ("low", "high")}  # delay -> groups
 
 HARM_COLUMN = "eval/first_impact_harm"  # column of a training's table
 
-_STATED_STATE = (  # positions and speeds of all, and the others' actions: no more is in the paper's state
+_STATED_STATE = (  # the paper's state: positions and speeds of all vehicles, and actions of the others
     "own.speed", "own.acceleration", "front_1.gap", "front_1.closing_speed", "front_1.acceleration", "rear_1.gap",
     "rear_1.closing_speed", "rear_1.acceleration",
 )  # fmt: skip
@@ -26,42 +26,40 @@ _STATED_STATE = (  # positions and speeds of all, and the others' actions: no mo
 
 @dataclass(frozen=True, slots=True)
 class TrainedRecipe:
-    """So many decisions of a recipe, measured every so many updates, and what they take.
+    """A training recipe with a number of decisions, and how often it is evaluated."""
 
-    ``per_s``: decisions per second of one core (Intel Xeon), for the estimate that is told beforehand.
-    """
-
-    recipe: str
-    decisions: int
-    every_updates: int
-    per_s: int
+    recipe: str  # name of a shipped recipe
+    decisions: int  # length of the training, in decisions
+    every_updates: int  # number of updates between two evaluations
+    per_s: int  # decisions per second of one core (Intel Xeon), to estimate the cost
 
     def load(self, name: str, **changes: Any) -> TrainingRecipe:
-        """The recipe under this name, with ``changes``."""
+        """Return the recipe, renamed to ``name``, with these settings and with ``changes`` of further keys."""
         found = load_recipe(self.recipe)
         evaluation = {**found.evaluation.model_dump(), "every_updates": self.every_updates}
-        if "log_every_updates" in type(found).model_fields:  # else a table has a row for every update
+        if "log_every_updates" in type(found).model_fields:  # otherwise the table has a row for every update
             changes["log_every_updates"] = self.every_updates
         return found.replace(name=name, total_steps=self.decisions, evaluation=evaluation, **changes)
 
 
 PPO_PAPER = TrainedRecipe("ppo-paper", 100_000, 1, 5_000)
 
-EARLY = TrainedRecipe("ppo", 100_000, 4, 16_000)  # a fifteenth of the recipe's own number
+EARLY = TrainedRecipe("ppo", 100_000, 4, 16_000)  # a fifteenth of the recipe's decisions
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Trainings on one scenario in one folder, in the order in which they are done."""
+    """Trainings on one scenario in one folder, in the order in which they run."""
 
-    name: str
-    scenario: str  # a shipped one
-    trained: Mapping[str, tuple[TrainedRecipe, TrainingRecipe]]  # by the name that the recipe has there
-    seeds: int
+    name: str  # name of the group and of its folder
+    scenario: str  # name of a shipped scenario
+    # name of the recipe in the group -> its settings, and the recipe itself
+    trained: Mapping[str, tuple[TrainedRecipe, TrainingRecipe]]
+    seeds: int  # number of seeds of each recipe, from 0 on
 
 
 def groups() -> dict[str, Group]:
-    """Every group by its name, the quickest first, so that results are there early."""
+    """Return every group of trainings by its name, the quickest first, so that first results exist early."""
     base = PPO_PAPER.load("ppo-paper").reward.model_dump(exclude_defaults=True)
     changed = {
         "risk-0": {"risk": 0.0},

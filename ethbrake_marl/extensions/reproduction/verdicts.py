@@ -1,10 +1,9 @@
-"""Verdicts on the paper's numbers and statements, computed from ours; nobody writes one by hand.
+"""Verdicts on the paper's numbers and statements, computed from our results.
 
-A number that the paper prints agrees with ours where the two differ by no more than chance between two lists of
-worlds, or by no more than ``TOLERANCE`` of the printed number. Where chance alone makes more than ``WIDE`` of it, it
-is undecided. It cannot agree where a bound that holds for every strategy lies beyond it by more than chance. A
-statement agrees where every comparison that it makes comes out as it says; where one does not but its interval holds
-0, it is undecided.
+A printed number *agrees* with ours if they differ by no more than chance between two lists of worlds, or by no more
+than ``TOLERANCE`` of the printed number. It is *undecided* if chance alone is more than ``WIDE`` of it. It *cannot
+agree* if a bound for all strategies lies beyond it by more than chance. A statement agrees if all its comparisons come
+out as it says; it is undecided if one does not, but its interval contains 0.
 """
 
 from __future__ import annotations
@@ -23,9 +22,9 @@ from ethbrake_marl.physics.state import Floats
 
 Judgement = Literal["cannot agree", "differs", "undecided", "not run", "agrees"]  # the worst first
 
-TOLERANCE = 0.02  # of the printed number
+TOLERANCE = 0.02  # allowed difference, as a share of the printed number
 
-WIDE = 0.15  # of the printed number: where chance alone makes more, nothing is shown
+WIDE = 0.15  # largest chance, as a share of the printed number, with which a comparison is decided
 
 HOW_JUDGED = (
     "Every verdict is computed: a number agrees where it is within the chance between two lists of worlds or"
@@ -34,19 +33,19 @@ HOW_JUDGED = (
     " those of the paper's text; its figures hold no printed numbers."
 )
 
-WRITTEN = ConfigDict(strict=True, extra="forbid")  # what a file holds, and nothing else
+WRITTEN = ConfigDict(strict=True, extra="forbid")  # for types that are read from files
 
 
 @model(frozen=True, config=WRITTEN)
 class Verdict:
-    """The outcome of one comparison with the paper, and the numbers that it follows from."""
+    """Outcome of one comparison with the paper, and the numbers behind it."""
 
-    what: str
-    outcome: Judgement
-    because: str
+    what: str  # what was compared
+    outcome: Judgement  # ``agrees``, ``differs``, ``undecided``, ``cannot agree`` or ``not run``
+    because: str  # the numbers behind the outcome, as text
 
 
-# How a quantity is written.
+# Formats of quantities.
 HARM = Column("Harm")
 
 PERCENT = Column("Collision rate", digits=1, scale=100.0, unit=" %")
@@ -61,15 +60,15 @@ def compare_number(
     least: tuple[str, Estimate] | None = None,
     others: Mapping[str, Estimate] | None = None,
 ) -> Verdict:
-    """Compare a number that the paper prints with ours.
+    """Return a verdict on whether a number that the paper prints agrees with ours.
 
     Args:
-        what: which number.
-        printed: the paper's.
-        ours: the same quantity, with its interval over worlds.
-        show: how both are written.
-        least: what no strategy undercuts, in words, and how much that is over our list, proven world by world.
-        others: the same quantity under other readings; the nearest of them is named where ours differs.
+        what: name of the number.
+        printed: the paper's number.
+        ours: the same quantity in our results, with its interval over worlds.
+        show: format of both numbers.
+        least: description and value of a proven lower bound over our list for all strategies; None: no bound.
+        others: the same quantity under other assumptions, by description; if ours differs, the nearest one is named.
 
     """
     told = f"ours {show.show(ours).in_words}, printed {show.scale * printed:.{show.digits + 1}f}{show.unit}"
@@ -93,7 +92,11 @@ def compare_number(
 
 
 def _off(printed: float, ours: Estimate) -> str:
-    """How far off ours is; empty where it is by no more than ``TOLERANCE``, or than chance where that is not wide."""
+    """Return a text on how far ``ours`` is from the printed number, such as "+3.1 %"; empty if the two agree.
+
+    They agree if they differ by at most 2 % of the printed number (``TOLERANCE``), or by no more than chance (see
+    ``_chance``). Chance does not count if it is above 15 % of the larger number (``WIDE``).
+    """
     chance = _chance(ours)
     told = chance if chance <= WIDE * max(abs(printed), abs(ours.value)) else 0.0
     if abs(ours.value - printed) <= max(told, TOLERANCE * abs(printed)):
@@ -102,39 +105,57 @@ def _off(printed: float, ours: Estimate) -> str:
 
 
 def _chance(estimate: Estimate) -> float:
-    """How far apart two such estimates over two lists may lie: sqrt 2 times the half-width."""
+    """Return by how much this estimate and that of another list of as many worlds may differ by chance.
+
+    It is sqrt(2) times the half-width of the interval.
+    """
     low, high = estimate.ends
     return math.sqrt(2.0) * 0.5 * (high - low)
 
 
 @dataclass(frozen=True, slots=True)
 class Less:
-    """One comparison that a statement makes: ``difference`` (smaller minus larger) should be below 0.
+    """Difference of two quantities, as evidence for or against a statement that the first is smaller than the second.
 
-    ``neither`` says that both are 0, where nothing is left to compare. ``least`` is what no strategy undercuts minus
-    the larger one, where that is proven: above 0, nobody can bring the smaller one below it.
+    A statement can need several of them, for example one for each group of worlds.
     """
 
-    where: str
-    difference: Estimate
-    neither: bool = False
+    where: str  # worlds or strategies that are compared, in words
+    difference: Estimate  # smaller quantity minus larger one; below 0 if the statement is right
+    neither: bool = False  # True if both are 0 in every world, so that nothing is left to compare
+    # proven lower bound minus the larger quantity; above 0, no strategy can make the statement right. None: no bound
     least: Estimate | None = None
 
     @classmethod
     def of_lists(cls, where: str, smaller: Floats, larger: Floats) -> Less:
-        """Of two lists that are not of the same worlds."""
+        """Compare two samples from different worlds: is ``smaller`` [n] below ``larger`` [m] on average?
+
+        ``where`` says in words what is compared.
+        """
         return cls(where, unpaired_difference(mean(smaller), len(smaller), mean(larger), len(larger)))
 
     @classmethod
     def of_harms(cls, where: str, harm: Mapping[str, Floats], smaller: str, larger: str) -> Less:
-        """That one strategy harms less than another in the same worlds, and whether anybody could."""
+        """Compare the harm of two strategies in the same worlds, with the proven lower bound.
+
+        ``harm`` maps strategies to their harm [n]; ``smaller`` and ``larger`` are names of strategies; ``where``
+        describes the comparison.
+        """
         low, high = harm[smaller], harm[larger]
         least = paired_difference(harm[PROVEN], high) if PROVEN in harm else None
         return cls(where, paired_difference(low, high), not low.any() and not high.any(), least)
 
 
 def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False, show: Column = HARM) -> Verdict:
-    """Whether every comparison of a statement comes out below 0, or at most 0, by its interval."""
+    """Return a verdict on a statement of the paper: it agrees if the interval of every comparison lies below 0.
+
+    Args:
+        what: the statement.
+        parts: its comparisons.
+        or_equal: True: a difference of 0 also agrees.
+        show: format of the differences.
+
+    """
     compared, ties = [part for part in parts if not part.neither], [part.where for part in parts if part.neither]
     places = ", ".join(ties) if len(ties) <= 2 else f"{len(ties)} more"
     if not compared:
@@ -165,7 +186,7 @@ def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False,
 
 
 def summarise_verdicts(verdicts: Sequence[Verdict]) -> Verdict:
-    """All of an item in one line: how many came out how, and the first of the worst."""
+    """Return one verdict on an item from all its verdicts: the number of each outcome, and the first of the worst."""
     if not verdicts:
         return Verdict("all", "not run", "nothing was compared")
     counted = {outcome: sum(each.outcome == outcome for each in verdicts) for outcome in get_args(Judgement)}

@@ -1,4 +1,4 @@
-"""A search around the own episode of a policy at the alert: what it finds then drives."""
+"""The shield ``+search``: at the alert it searches around the policy's own episode and then drives the result."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from ethbrake_marl.agents.driving import record_commands
 from ethbrake_marl.agents.protocol import Agent, AgentAround, Source, check_agent, fixed_commands
-from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.engine.memory import Memory
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import check_whole_number
@@ -22,19 +22,19 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 class Searched(AgentAround):
-    """Drives the commands that a search around the policy's episode found at the alert, step by step.
+    """Agent that searches around another agent's episode at the alert and then plays the best commands it found.
 
-    It knows the model of the line and the other vehicles' scripts, and does not react to what happens otherwise.
-    ``predicted_harm`` [n] (m2/s2) is never above the policy's own, and is realised to the bit if the others follow
-    their scripts. A world's commands do not depend on its batch. Raises ``InvalidInput`` for what is not an agent, a
-    number of candidates outside 1 to 1,000,000 and, when an episode begins, for another vehicle's script whose command
-    is not fixed at the alert.
+    It knows the model of the line and the other vehicles' scripts, and does not react to anything unexpected.
+    ``predicted_harm`` [n] (m2/s2) is never above the policy's own harm, and equals the simulated harm exactly if the
+    others follow their scripts. Raises ``InvalidInput`` for an object that is not an agent, a number of candidates
+    outside 1 to 1,000,000 and, when an episode begins, another vehicle's script whose command is not fixed at the
+    alert.
 
     Args:
-        policy: any agent.
-        scenario: in which it searches.
-        candidates: tried in each world.
-        harm_count: which harm is least, ``first`` or ``total``.
+        policy: the agent around whose episode it searches.
+        scenario: the scenario in which it searches.
+        candidates: number of candidates in each world.
+        harm_count: harm to minimise, ``first`` or ``total``.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -58,24 +58,41 @@ class Searched(AgentAround):
         self._outlook = Outlook(harm_count, scenario.horizon_s, scenario.time_step_s)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Search in these worlds."""
+        """Simulate the policy's episode from the alert, search around it, and return the best commands as memory.
+
+        Args:
+            alert: the worlds at the alert, [n].
+            vehicle: index of the controlled vehicle.
+            scripts: scripts of the other vehicles, by index.
+
+        """
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
         problem = self._outlook.problem(alert, vehicle, others)
         own = record_commands(self.policy, alert, self.scenario, vehicle, int(problem.last_step.max()))
         commands, harm = refine(problem, own, budget=self._candidates)
         return {
             "commands_mps2": np.pad(commands, ((0, 0), (0, self._outlook.decisions - own.shape[1])), mode="edge"),
-            "start_s": problem.clock[:, CLOCK.START].copy(),  # of the first decision
+            "start_s": problem.clock[:, CLOCK.START].copy(),  # time of the first decision
             "predicted_harm": harm,
         }
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """The command of the step, [n] m/s2."""
+        """Return the command of the present step, [n] m/s2, and the unchanged memory.
+
+        Args:
+            worlds: the worlds now, [n]; only their time is read.
+            memory: result of ``begin``.
+            vehicle: not used.
+
+        """
         return self._outlook.command(worlds, memory), memory
 
 
 def search_around(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """``+search`` around an agent, which takes no argument."""
+    """Return the agent ``+search``, which searches around the episode of ``policy``.
+
+    ``argument`` must be None; ``settings`` hold the scenario and the harm to minimise.
+    """
     return Searched(policy, settings.needed_scenario(), harm_count=settings.harm_count)
 
 

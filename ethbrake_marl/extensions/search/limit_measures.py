@@ -1,4 +1,4 @@
-"""Measures of how far agents are from the best: what is proven, what is known, and the regret that is left."""
+"""Measures of the distance to the best: proven bounds, best known harm, and the regret of each agent."""
 
 from __future__ import annotations
 
@@ -10,19 +10,22 @@ from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.agent_tally import AgentTally
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import HELD
-from ethbrake_marl.evaluation.measures import BASELINE, GroupColumn, Measure, MeasureSet, Silent
+from ethbrake_marl.evaluation.measure_sets import BASELINE, GroupColumn, Measure, MeasureSet, Silent
 from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.search.limits import Unproven
 from ethbrake_marl.extensions.search.regret import KNOWN_OF_WORLDS, Between, Regrets, limits_of, regrets_of
 from ethbrake_marl.files.sheet import DASH, Column
 
-NAME = "limits"  # of the entry point
+NAME = "limits"  # name of the entry point
 
 KNOWN, BELOW = "known", "below_best_known"
 
 
 class LimitMeasures(MeasureSet):
-    """What nobody could avoid, the best known harm, and each agent's distance from it. The context is ``Regrets``."""
+    """Measures of unavoidable contact, best known harm, and each agent's distance from it.
+
+    Their context is a ``Regrets`` object: the best known harm of every world.
+    """
 
     measures = (
         Measure(
@@ -108,7 +111,7 @@ class LimitMeasures(MeasureSet):
     not_in_long_lists = f"a list of more than {HELD:,} worlds is driven without proofs"
 
     def prepare(self, evaluation: Evaluation) -> Regrets | Silent:
-        """The best known harm of every world; ``Silent`` where nothing is proven."""
+        """Return the best known harm of every world, or ``Silent`` with the reason if nothing is proven."""
         limits, regrets = limits_of(evaluation), regrets_of(evaluation)
         if isinstance(limits, Unproven):
             return Silent(limits.because)
@@ -116,7 +119,18 @@ class LimitMeasures(MeasureSet):
         return regrets
 
     def row(self, tally: AgentTally, worlds: int, context: Regrets | Silent) -> dict[str, Any]:
-        """In how many worlds the best is known and the agent is below it, and what lies between the proofs."""
+        """Return further values of one agent's row, by name.
+
+        ``known_best_share`` is the share of worlds with a best known harm, ``below_best_known`` the number of worlds
+        where the agent is below it, ``best_known_warning`` a warning or None, and ``impact_unproven`` the summary of
+        worlds with proven contact but no proven impact (``Between``).
+
+        Args:
+            tally: counts and means of the agent.
+            worlds: number of worlds.
+            context: result of ``prepare``.
+
+        """
         between = None if isinstance(context, Silent) else context.between
         return {
             "known_best_share": tally.share(KNOWN, worlds),
@@ -126,12 +140,19 @@ class LimitMeasures(MeasureSet):
         }
 
     def warnings(self, rows: Sequence[SummaryRow]) -> Sequence[str]:
-        """That a table of best known harm holds some of the worlds, and not the others."""
+        """Return the warning that a table of best known harm covers only some of the worlds, as a list; empty if there
+        is none.
+
+        ``rows`` are the summaries of the agents.
+        """
         warning = rows[0].more[NAME]["best_known_warning"]
         return [warning] if warning else []
 
     def notes(self, rows: Sequence[SummaryRow]) -> Sequence[str]:
-        """What nobody could avoid here, and the best known harm; nothing where nothing is proven."""
+        """Return a note on unavoidable harm and the best known harm, as a list; empty if nothing is proven.
+
+        ``rows`` are the summaries of the agents.
+        """
         row, first, total = rows[0], rows[0]["best_known_first_impact_harm"], rows[0]["best_known_total_harm"]
         if first is None or total is None:
             return []
@@ -149,7 +170,9 @@ class LimitMeasures(MeasureSet):
 
 
 def _unavoidable(row: SummaryRow) -> str:
-    """In how many worlds contact and impact are proven, and what lies between the two."""
+    """Return a sentence on the shares of worlds with proven contact and proven impact, and on the worlds between the
+    two.
+    """
     vehicle = row.parameters.get("controlled_vehicle")
     command = f"command of {str(vehicle).replace('vehicle_', 'Vehicle ')}" if vehicle else "joint command"
     share = Column("", digits=1, scale=100.0, unit=" %")
@@ -162,7 +185,9 @@ def _unavoidable(row: SummaryRow) -> str:
 
 
 def _best(row: SummaryRow, first: float, total: float) -> str:
-    """The best known harm, beside what is proven."""
+    """Return a sentence on the best known harm (``first`` and ``total``, mean in m2/s2), the proven bound, and their
+    gap.
+    """
     least = 0.0 if row["proven_harm"] is None else row["proven_harm"].value
     gaps = [
         f"{best - least:.2f} ({f'{100 * (best - least) / best:.1f} %' if best > 0.0 else DASH})"

@@ -10,7 +10,7 @@ import numpy as np
 
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
 from ethbrake_marl.agents.protocol import Agent, Source, fixed_commands
-from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.engine.memory import Memory, renew_memory, take_memory
 from ethbrake_marl.engine.profiles import TIME_STEP_S, ProfileProblem, Profiles, profile_problem
 from ethbrake_marl.engine.scripts import Script
@@ -22,63 +22,77 @@ from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.registry import Part
 
-MOST_CANDIDATES = 1_000_000  # per world and decision
+MOST_CANDIDATES = 1_000_000  # most candidates per world and decision
 
 
 class Outlook(NamedTuple):
-    """How an agent looks ahead for its vehicle: whose harm counts, how far, and when the vehicle decides."""
+    """Settings of an agent that looks ahead, and the methods with which it decides when to plan and what to command."""
 
-    harm_count: HarmCount
-    horizon_s: float
-    time_step_s: float
+    harm_count: HarmCount  # harm to minimise: ``first`` or ``total``
+    horizon_s: float  # time up to which it looks ahead, s
+    time_step_s: float  # time between two decisions, s
 
     @property
     def decisions(self) -> int:
-        """Of a whole episode, at most."""
+        """Largest number of decisions in an episode."""
         return int(np.ceil(self.horizon_s / self.time_step_s)) + 1
 
     def problem(self, worlds: Worlds, vehicle: int, others_mps2: Floats) -> ProfileProblem:
-        """The search for the vehicle's profile from now on."""
+        """Return the search problem: choose the command profile of ``vehicle`` from the present time of ``worlds`` on.
+
+        ``others_mps2`` [n, N] are the commands of the other vehicles.
+        """
         return profile_problem(
             worlds, [vehicle], harm_count=self.harm_count, horizon_s=self.horizon_s, time_step_s=self.time_step_s,
             others_mps2=others_mps2,
         )  # fmt: skip
 
     def due(self, worlds: Worlds, planned_s: Floats) -> Ints:
-        """The worlds in which it is time to plan again: some vehicle moves, and a decision has come since."""
+        """Return the indices of worlds that need a new plan: something moves, and a decision was due since the last
+        plan.
+
+        ``planned_s`` [n] is the time of the last plan, s.
+        """
         moving = (worlds.speeds_mps != 0.0).any(axis=1)
         return np.flatnonzero((worlds.time_s > planned_s) & (worlds.time_s < self.horizon_s) & moving)
 
     def command(self, worlds: Worlds, memory: Memory) -> Floats:
-        """What ``commands_mps2`` [n, decisions], from ``start_s`` on, say now, [n]."""
+        """Return the present command in each world, [n] m/s2.
+
+        Args:
+            worlds: the worlds now, [n]; only their time is read.
+            memory: holds ``commands_mps2`` [n, decisions], one command for each decision, and ``start_s`` [n], the time
+                of the first one.
+
+        """
         step = Decisions(memory["start_s"], self.time_step_s).latest(worlds.time_s)
         now: Floats = memory["commands_mps2"][np.arange(worlds.n), np.clip(step, 0, self.decisions - 1)]
         return now
 
 
 def budget_of(argument: str) -> int | None:
-    """The number of candidates that an argument is; None: it is none."""
+    """Return ``argument`` as a number of candidates (1 to ``MOST_CANDIDATES``), or None if it is not such a number."""
     number = int(argument) if re.fullmatch("[0-9]{1,7}", argument) else 0
     return number if 1 <= number <= MOST_CANDIDATES else None
 
 
-CANDIDATES = 256  # per world and decision
+CANDIDATES = 256  # default number of candidates per world and decision
 
 
 class Planner:
-    """Receding horizon: the own profile is searched anew at each decision, the others following their scripts.
+    """Receding-horizon planner: at each decision it searches its own profile, while the others follow their scripts.
 
-    Each search starts from the plan so far, from constants and, at first, from the pairwise optimum. ``predicted_harm``
-    [n] is that of the first plan (m2/s2); no more is done if the others do as expected. Vehicles without a script
-    (learners) are taken to brake fully. Raises ``InvalidInput`` for an unusable argument or count and, when
-    an episode begins, for another vehicle's script whose command is not fixed at the alert.
+    Each search starts from the previous plan, from constants and, at the first decision, from the pairwise optimum.
+    ``predicted_harm`` [n] is the harm of the first plan (m2/s2); the simulated harm is no larger if the others behave
+    as expected. Vehicles without a script (learners) are assumed to brake fully. Raises ``InvalidInput`` for an invalid
+    argument or count and, when an episode begins, for another vehicle's script whose command is not fixed at the alert.
 
     Args:
-        argument: candidates per world and decision.
-        harm_count: which harm it minimises, ``first`` or ``total``.
-        horizon_s: until when it looks ahead, s.
-        most_candidates: of a search, whatever the argument says.
-        time_step_s: between two decisions, s.
+        argument: number of candidates per world and decision, as text; None: ``CANDIDATES``.
+        harm_count: harm to minimise, ``first`` or ``total``.
+        horizon_s: time up to which it looks ahead, s.
+        most_candidates: upper limit of the number of candidates, whatever ``argument`` says; None: no limit.
+        time_step_s: time between two decisions, s.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -112,7 +126,14 @@ class Planner:
         self._outlook = Outlook(harm_count, horizon_s, time_step_s)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Make the first plan of these episodes."""
+        """Make the first plan of these episodes, and return the memory.
+
+        Args:
+            alert: the worlds at the alert, [n].
+            vehicle: index of the controlled vehicle.
+            scripts: scripts of the other vehicles, by index.
+
+        """
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
         problem = self._outlook.problem(alert, vehicle, others)
         pairwise = -optimise_pairwise(alert, vehicle).deceleration_mps2
@@ -121,7 +142,15 @@ class Planner:
         return {"plan": plan, "planned_s": start_s, "others_mps2": others, "predicted_harm": harm}
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """The first command of the new plans, [n] m/s2."""
+        """Return the first command of each world's plan, [n] m/s2, and the new memory. A new plan is searched where a
+        decision is due.
+
+        Args:
+            worlds: the worlds now, [n].
+            memory: memory from ``begin`` or the previous ``act``.
+            vehicle: index of the controlled vehicle.
+
+        """
         rows = self._outlook.due(worlds, memory["planned_s"])
         if rows.size:
             now, held = worlds.take(rows), take_memory(memory, rows)
@@ -131,7 +160,14 @@ class Planner:
         return Profiles(*memory["plan"]).commands_mps2[:, 0, 0], memory
 
     def _rest(self, held: Memory, time_s: Floats, problem: ProfileProblem) -> Profiles:
-        """What is left of the plans from ``time_s`` on."""
+        """Return the part of each stored plan that is still ahead, as profiles [m] for the new problem.
+
+        Args:
+            held: memory of the worlds that plan again.
+            time_s: [m] present time, s.
+            problem: the search problem from that time on.
+
+        """
         plan = Profiles(*held["plan"])
         passed = np.rint((time_s - held["planned_s"]) / self._outlook.time_step_s).astype(np.int64)[:, np.newaxis]
         ends = np.minimum(np.maximum(plan.ends - passed, 0), problem.last_step[:, np.newaxis])
@@ -139,9 +175,11 @@ class Planner:
         return Profiles(ends, plan.commands_mps2)
 
     def _search(self, problem: ProfileProblem, plan: Profiles) -> tuple[Profiles, Floats]:
-        """The best plans found from these and from constants, with their harm under the own count."""
+        """Return the best plan of each world, and its harm [n] (m2/s2), from a search that starts with ``plan`` and
+        constants.
+        """
         constants = problem.constant(problem.even_grid(15))
-        n, K = plan.ends.shape  # each world's plan, then its constants: [n * Q]
+        n, K = plan.ends.shape  # [n * Q]: for each world its plan, then constants
         ends = np.concatenate([plan.ends[:, np.newaxis], constants.ends.reshape(n, -1, K)], axis=1)
         commands = constants.commands_mps2.reshape(n, -1, K, 1)
         commands = np.concatenate([plan.commands_mps2[:, np.newaxis], commands], axis=1)
@@ -151,7 +189,7 @@ class Planner:
 
 
 def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """``planner`` or ``planner:CANDIDATES``."""
+    """Make the agent ``planner`` or ``planner:CANDIDATES``. ``argument`` is the number of candidates, or None."""
     return Planner(
         argument, harm_count=settings.harm_count, horizon_s=settings.horizon_s,
         most_candidates=settings.most_candidates, time_step_s=settings.time_step_s,
@@ -159,7 +197,10 @@ def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
 
 
 def make_estimating_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """``planner:believed`` or ``planner:CANDIDATES:believed``: it searches in the estimated world."""
+    """Make the agent ``planner:believed`` or ``planner:CANDIDATES:believed``, which searches in the estimated world.
+
+    ``argument`` is the number of candidates, or None.
+    """
     return Believing(make_planner(argument, settings), settings.needed_scenario(), shows=True)
 
 

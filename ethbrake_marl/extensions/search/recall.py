@@ -1,4 +1,4 @@
-"""An agent that drives the best profile known: one kept beforehand where there is one, else searched at the alert."""
+"""``best_harm``: an agent that drives the best known profile, from a table if there is one, else from a search."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import numpy as np
 
 from ethbrake_marl.agents.driving import record_commands
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Source, fixed_commands
-from ethbrake_marl.agents.registry import AgentSettings, make_agent
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.engine.memory import Memory
 from ethbrake_marl.engine.profiles import TIME_STEP_S, ProfileProblem, Profiles
 from ethbrake_marl.engine.scripts import Script
@@ -22,23 +23,31 @@ from ethbrake_marl.physics.episode import CLOCK
 from ethbrake_marl.physics.state import Bools, Floats, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 
-PROFILE_BUDGET = 20_000  # candidates in a world of which nothing is known
+PROFILE_BUDGET = 20_000  # candidates in a world that is in no table
 
-START = "universal@shipped"  # whose episode a search also starts from
+START = "universal@shipped"  # policy whose episode a search also starts from
 
 Recall = Callable[[ProfileProblem, HarmCount], tuple[Profiles, Bools]]
 """Kept profiles [n] of a problem, and where there is one [n]; the others are ignored."""
 
 
 class BestHarm:
-    """Drives the profile of least harm known, while the others follow their scripts (without one: brake fully).
+    """Agent that plays the command profile of least known harm.
 
-    ``recall`` gives the kept profiles. A world without one is searched at the alert with ``budget`` candidates. Where
-    no other vehicle of a known ``scenario`` learns, a second search with as many candidates starts from the better of
-    that result and the episode of ``universal``: the harm is never above that policy's. Decisions fall every
-    ``time_step_s`` from the vehicle's latency on. ``predicted_harm`` [n] is what the engine will count (m2/s2), to the
-    same bits, if the engine's time step is that. Raises ``InvalidInput`` for a budget below 1 or an unknown count and,
+    A world without a stored profile is searched at the alert. If the ``scenario`` has no other learner, a second search
+    with as many candidates starts from the better of that result and the episode of ``universal`` (a trained policy in
+    the package), so the harm is never above that policy's. ``predicted_harm`` [n] (m2/s2) equals the engine's harm
+    exactly if the engine has the same time step. Raises ``InvalidInput`` for a budget below 1 or an unknown count and,
     when an episode begins, for another vehicle's script whose command is not fixed at the alert.
+
+    Args:
+        recall: returns the stored profile of each world of a problem, and a mask of the worlds that have one.
+        scenario: scenario of the worlds; None: unknown, without the second search.
+        harm_count: harm to minimise, ``first`` or ``total``.
+        horizon_s: end of the episode, s.
+        budget: candidates in a world without a stored profile.
+        time_step_s: time between two decisions, s.
+
     """
 
     name = "best_harm"
@@ -62,7 +71,14 @@ class BestHarm:
 
     @classmethod
     def make(cls, argument: str | None, settings: AgentSettings, recall: Recall) -> BestHarm:
-        """``best_harm`` or ``best_harm:CANDIDATES``; raises ``InvalidInput`` for an argument that is no such number."""
+        """Make the agent ``best_harm`` or ``best_harm:CANDIDATES``.
+
+        Args:
+            argument: number of candidates, or None for the default; ``InvalidInput`` if it is not such a number.
+            settings: scenario, harm to minimise and other settings of agents.
+            recall: returns the stored profile of each world of a problem, and a mask of the worlds that have one.
+
+        """
         budget = PROFILE_BUDGET if argument is None else budget_of(argument)
         if budget is None:
             raise InvalidInput(
@@ -76,7 +92,14 @@ class BestHarm:
         )  # fmt: skip
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Look these worlds up, and search those that are not known."""
+        """Look up the stored profiles of these worlds, search worlds without one, and return the commands as memory.
+
+        Args:
+            alert: the worlds at the alert, [n].
+            vehicle: index of the controlled vehicle.
+            scripts: scripts of the other vehicles, by index.
+
+        """
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
         problem, outlook = self._outlook.problem(alert, vehicle, others), self._outlook
         profiles, known = self._recall(problem, outlook.harm_count)
@@ -94,11 +117,21 @@ class BestHarm:
         }
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """The command of the phase in force, [n] m/s2."""
+        """Return the command of the present step, [n] m/s2, and the unchanged memory.
+
+        Args:
+            worlds: the worlds now, [n]; only their time is read.
+            memory: result of ``begin``.
+            vehicle: not used.
+
+        """
         return self._outlook.command(worlds, memory), memory
 
     def _search(self, worlds: Worlds, vehicle: int, others: Floats) -> tuple[Floats, Floats]:
-        """The best commands that are found in these worlds, [n, decisions] m/s2, and their harm [n] m2/s2."""
+        """Return the best commands from a search in these worlds, [n, decisions] m/s2, and their harm [n] m2/s2.
+
+        ``others`` [n, N] are the commands of the other vehicles, m/s2.
+        """
         problem, outlook = self._outlook.problem(worlds, vehicle, others), self._outlook
         coupled = optimise_coupled(
             worlds, vehicle, harm_count=outlook.harm_count, horizon_s=outlook.horizon_s, others_mps2=others
@@ -116,7 +149,7 @@ class BestHarm:
         return best, harm
 
     def _stepwise(self, profiles: Profiles) -> Floats:
-        """The commands of profiles decision by decision, [n, decisions] m/s2."""
+        """Return the command of each profile at each decision, [n, decisions] m/s2."""
         n = len(profiles.ends)
         steps = [profiles.at(np.full(n, step))[:, 0] for step in range(self._outlook.decisions)]
         return np.stack(steps, axis=1)

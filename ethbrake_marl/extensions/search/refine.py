@@ -1,9 +1,8 @@
-"""The refinement of an episode: a compiled search around the commands that somebody gives in its steps.
+"""Refine an episode: a compiled random search around the commands of its steps.
 
-Two climbs, each by random changes of a few neighbouring steps: one from the given commands, and one from the best of
-some random templates (one command, another one for a short while, then full braking), as what is best may lie in a
-valley of its own. Everything advances decision by decision, as the engine does: what is found will happen, to the
-bit.
+It climbs twice, by random changes of a few neighbouring steps: from the given commands, and from the best of some
+random templates, because the best may lie in a valley of its own. A *template* is one command, another one for a short
+while, then full braking. Everything advances decision by decision as in the engine, so the result is exact.
 """
 
 from __future__ import annotations
@@ -33,42 +32,48 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.rows import ROW
 from ethbrake_marl.physics.state import Bools, Floats, UInt64s
 
-TEMPLATE_SHARE, THEIR_CLIMB_SHARE = 0.3, 0.3  # of the budget; the rest is for the climb from the given commands
+TEMPLATE_SHARE, THEIR_CLIMB_SHARE = 0.3, 0.3  # shares of the budget; the rest is for the climb from the given commands
 
-ATTENTION_S = 3.0  # from the first decision on; later steps are changed only together with earlier ones
+ATTENTION_S = 3.0  # changes start within this time from the first decision
 
-LONGEST_CHANGE_S = 0.6
+LONGEST_CHANGE_S = 0.6  # longest change
 
-LONGEST_WHILE_S = 0.8  # of a template
+LONGEST_WHILE_S = 0.8  # longest second command of a template
 
-SET_SHARE = 0.1  # of the changes, which replace commands; the others add to them
+SET_SHARE = 0.1  # share of changes that replace commands; the others add to them
 
-FULL_BRAKE_SHARE = 0.8  # of the templates, which begin with full braking
+FULL_BRAKE_SHARE = 0.8  # share of templates that begin with full braking
 
 LN_SMALLEST_CHANGE = (
     -6.907755278982138
-)  # amounts that are added range over three decades below the whole range of commands
+)  # ln of the smallest added amount, relative to the whole range of commands: three decades
 
-WORSE = 5.0  # m2/s2: a template may be worse by so much before it is climbed from
+WORSE = 5.0  # m2/s2; a climb starts from a template only if it is worse by at most this
 
-NO_HARM = 1e-9  # m2/s2
+NO_HARM = 1e-9  # m2/s2; less harm than this counts as none
 
 
 class Plan(NamedTuple):
-    """Commands of one world, and where they lead."""
+    """Commands of one world in every step, and the states that they lead to."""
 
-    commands: Floats  # [T]
-    states: Floats  # [T + 1, S] at the start of each step
+    commands: Floats  # [T] command of the controlled vehicle in each step, m/s2
+    states: Floats  # [T + 1, S] state of the simulation at the start of each step
 
 
 def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
-    """Search around ``commands_mps2`` [n, T] of the one controlled vehicle, with ``budget`` candidates per world.
+    """Search around given commands of the one controlled vehicle. Return the best commands [n, T] (m/s2) and their harm
+    [n].
 
-    Returns the commands found, never worse than the given ones, and their harm [n] under the problem's count, as
-    the engine counts it (m2/s2).
-    Worlds are independent of each other. Raises ``InvalidInput`` for several vehicles, commands of another shape or
-    beyond a capacity, or a budget below 1, ``PhysicsError`` naming worlds in which the given commands cannot be
-    played.
+    The result is never worse than the given commands. Harm (m2/s2) is counted as the engine counts it. Worlds are
+    independent of each other. Raises ``InvalidInput`` for several vehicles, commands of another shape or beyond a
+    capacity, or a budget below 1, and ``PhysicsError`` with the worlds in which the given commands cannot be played.
+
+    Args:
+        problem: n worlds, with the commands of the other vehicles and the harm to minimise.
+        commands_mps2: [n, T] command of each step to start from.
+        budget: candidates per world.
+        seed: seed of the random search.
+
     """
     check_whole_number("budget", budget, 1)
     n, steps = problem.n, int(problem.last_step.max(initial=0))
@@ -90,7 +95,18 @@ def _refine_worlds(
     problem: ProfileProblem, random: UInt64s, budget: int, commands: Floats, first: Floats, total: Floats,
     failed: Bools,
 ) -> None:  # fmt: skip
-    """Improve ``commands`` in place, and fill the other outputs [n]."""
+    """Improve the commands of each world, in place.
+
+    Args:
+        problem: n worlds, with the commands of the other vehicles and the harm to minimise.
+        random: [n] initial state of each world's random stream.
+        budget: candidates per world.
+        commands: [n, T] commands of each step, m/s2; changed in place.
+        first: [n] receives the first-impact harm, m2/s2.
+        total: [n] receives the total harm, m2/s2.
+        failed: [n] receives True for worlds in which the commands cannot be played.
+
+    """
     start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
     mine, other = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))
     room = Plan(np.zeros(T), np.zeros((T + 1, S)))
@@ -109,7 +125,16 @@ def _refine_worlds(
 
 @compiled(apart=True)
 def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budget: int) -> bool:
-    """Improve ``mine``; False if it cannot be played."""
+    """Improve the commands ``mine`` of one world in place. Return False if they cannot be played.
+
+    Args:
+        world: the world, with its commands, bounds and random stream.
+        mine: commands to improve.
+        other: working memory.
+        room: working memory.
+        budget: number of candidates.
+
+    """
     templates, theirs = int(TEMPLATE_SHARE * budget), int(THEIR_CLIMB_SHARE * budget)
     value, reached = follow_steps(world.episode, mine, 0, math.inf)
     if reached < 0:
@@ -127,9 +152,17 @@ def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budge
 
 @compiled(apart=True)
 def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[float, int]:
-    """Play a plan from the start of step ``begin`` on, and fill its states; the value, and the steps up to the end.
+    """Play the commands of ``plan`` from a step on, and write its states. Return the harm (m2/s2) and the number of
+    steps.
 
-    Gives up as soon as the value is not below ``bound``: harm never falls again. -1 steps if the kernel failed.
+    The number of steps is -1 if the physics failed.
+
+    Args:
+        world: the world, with the commands of the other vehicles.
+        plan: commands to play, with the state at step ``begin``; the later states are written.
+        begin: first step to play.
+        bound: harm at which to stop, m2/s2, because harm never falls.
+
     """
     table, clock = world.table, world.clock
     grid, restitution, total, last = (
@@ -155,9 +188,18 @@ def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[
 
 @compiled(apart=True)
 def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int, budget: int) -> tuple[float, int]:
-    """Change a plan of this value for the better, in place, with ``budget`` candidates; its value and steps.
+    """Improve ``plan`` in place by random changes; return its harm (m2/s2) and its number of steps.
 
-    A success by addition is repeated twice as large.
+    If adding an amount to the commands of some steps lowers the harm, twice the amount is tried next.
+
+    Args:
+        world: the world, with its commands, bounds and random stream.
+        plan: commands and states, already simulated.
+        room: working memory.
+        value: harm of the plan, m2/s2.
+        reached: number of its steps until the end of the episode.
+        budget: number of candidates.
+
     """
     low, high = world.bounds[0, 0], world.bounds[0, 1]
     longest = steps_in(world.episode, LONGEST_CHANGE_S)
@@ -170,7 +212,7 @@ def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int
             first = draw_below(world.random, min(reached, steps_in(world.episode, ATTENTION_S)))
             u = draw(world.random)
             length = 1 + int(u * u * longest)
-            if adds:  # of either sign; its logarithm is uniform over the decades below the whole range
+            if adds:  # an amount of either sign, log-uniform
                 sign = 1.0 if draw(world.random) < 0.5 else -1.0
                 amount = sign * (high - low) * exp(LN_SMALLEST_CHANGE * draw(world.random))
             else:
@@ -198,7 +240,19 @@ def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int
 
 @compiled(apart=True)
 def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, number: int) -> tuple[float, int]:
-    """Fill ``best`` with the best of some random templates; its value and steps, 0 if none is below ``bound``."""
+    """Simulate random templates and write the best one to ``best``; return its harm (m2/s2) and its number of steps.
+
+    A *template* is one command, another one for a short while, then full braking. The number of steps is 0 if no
+    template is below ``bound``.
+
+    Args:
+        world: the world, with its commands, bounds and random stream.
+        best: receives the best template.
+        room: working memory.
+        bound: harm that a template must be below, m2/s2.
+        number: number of templates.
+
+    """
     low, high, T = world.bounds[0, 0], world.bounds[0, 1], room.commands.shape[0]
     attention, longest = steps_in(world.episode, ATTENTION_S), steps_in(world.episode, LONGEST_WHILE_S)
     reached = 0
@@ -218,12 +272,14 @@ def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, num
 
 @compiled
 def steps_in(world: Episode, duration_s: float) -> int:
-    """How many steps fit into a time, at least 1."""
+    """Return the number of decision steps in ``duration_s``, rounded to a whole number of at least 1. ``world`` holds
+    the length of a step.
+    """
     return max(int(duration_s / world.clock[CLOCK.TIME_STEP] + 0.5), 1)
 
 
 @compiled
 def copy_steps(commands: Floats, to: Floats, first: int) -> None:
-    """Copy the commands from step ``first`` on."""
+    """Copy the commands of one array to another, ``to``, from step ``first`` on."""
     for t in range(first, commands.shape[0]):
         to[t] = commands[t]

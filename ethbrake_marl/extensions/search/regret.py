@@ -1,6 +1,6 @@
 """Regret: an agent's harm minus the best known harm of the same world.
 
-The best known is the least of what ``limits`` knows beforehand and what the agents of the same evaluation achieved.
+The best known harm is the least of the ``limits`` known beforehand and the harm of the agents of the same evaluation.
 """
 
 from __future__ import annotations
@@ -18,41 +18,49 @@ from ethbrake_marl.extensions.search.limits import IncompleteTable, Limits, Unpr
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.state import Bools, Floats
 
-NO_HARM = 1e-3  # m2/s2: nobody is hurt by 0.03 m/s
+NO_HARM = 1e-3  # m2/s2; less harm (an impact at 0.03 m/s) counts as none
 
-TOLERANCE = 1e-6  # m2/s2; less than this below the best known harm is rounding
+TOLERANCE = 1e-6  # m2/s2; a harm below the best known by less than this is rounding
 
 
 @dataclass(frozen=True)
 class Regrets:
-    """The limits after all agents of one evaluation drove, [n] each."""
+    """Best known harm of each world after all agents of an evaluation drove, [n] each."""
 
-    limits: Limits
-    first_impact_harm: Floats  # best known, the agents of this evaluation among them (m2/s2)
-    total_harm: Floats
-    source: NDArray[np.str_]  # where these come from: witness, table, agents or below_table
+    limits: Limits  # proofs and best known harm before any agent drove
+    first_impact_harm: Floats  # best known first-impact harm, including the agents of this evaluation, m2/s2
+    total_harm: Floats  # best known total harm, including the agents of this evaluation, m2/s2
+    # origin of the best known harm: witness (contact proven avoidable), table, agents (in no table), below_table (an
+    # agent beat the table)
+    source: NDArray[np.str_]
 
     def best(self, harm_count: HarmCount) -> Floats:
-        """Best known harm under one count, [n] m2/s2."""
+        """Return the best known harm under ``harm_count`` (``first`` or ``total``), [n] m2/s2."""
         return self.first_impact_harm if harm_count == "first" else self.total_harm
 
     def regret(self, outcome: Outcome, harm_count: HarmCount) -> Floats:
-        """The outcome's harm minus the best known, [n] m2/s2, never negative."""
+        """Return an agent's harm minus the best known harm, [n] m2/s2, never negative.
+
+        ``outcome`` is the agent's outcome in these worlds; ``harm_count`` is ``first`` or ``total``.
+        """
         return outcome.ledger.world_harm(harm_count) - self.best(harm_count)
 
     def below(self, outcome: Outcome) -> Bools:
-        """Worlds in which the outcome is below what was known before, in either count, by more than rounding, [n]."""
+        """Return True for worlds in which an agent's outcome is below the best harm known before, beyond rounding, [n].
+
+        Either harm count suffices.
+        """
         first, total = self.limits.first_impact_harm, self.limits.total_harm
         return (outcome.first_impact_harm < first - TOLERANCE) | (outcome.total_harm < total - TOLERANCE)
 
     @property
     def avoidable(self) -> Bools | None:
-        """Where contact can be avoided, [n]; None where that is not decided."""
+        """True for worlds in which contact can be avoided, [n]; None if not decided."""
         return self.limits.proof.avoidable
 
     @property
     def between(self) -> Between | None:
-        """The worlds with proven contact and no proven impact; None where contact is not decided."""
+        """Summary of the worlds with proven contact but no proven impact; None if contact is not decided."""
         if self.avoidable is None:
             return None
         return Between.of(~self.avoidable, self.limits.proof.impact, self.first_impact_harm, self.total_harm)
@@ -60,16 +68,16 @@ class Regrets:
 
 @dataclass(frozen=True, slots=True)
 class Between:
-    """The worlds with proven contact in which no impact is proven, and the least harm known there (m2/s2)."""
+    """Summary of the worlds with proven contact but no proven impact, with the best known harm in them (m2/s2)."""
 
     rate: float  # share of all worlds
-    mean_first: float | None  # None where there is no such world, or the least harm of none of them is known
-    mean_total: float | None
-    harmless_rate: float | None  # share of them whose best known total harm is below 1e-3
+    mean_first: float | None  # mean best known first-impact harm; None if unknown in all of them
+    mean_total: float | None  # mean best known total harm
+    harmless_rate: float | None  # share of these worlds whose best known total harm is below NO_HARM
 
     @property
     def text(self) -> str:
-        """What is known of them, as a sentence after another; empty without such a world."""
+        """A sentence with the share of these worlds and their least known harm, to append; empty if there are none."""
         if self.rate == 0.0:
             return ""
         text = f" In {100 * self.rate:.1f} % contact is certain, but perhaps no impact"
@@ -82,7 +90,15 @@ class Between:
 
     @classmethod
     def of(cls, contact: Bools, impact: Bools, first: Floats, total: Floats) -> Between:
-        """Those of worlds with these proofs; ``first`` and ``total`` [n] are the least harms known, NaN: none is."""
+        """Return the summary of the worlds in which contact is proven but no impact.
+
+        Args:
+            contact: [n] True if contact is proven.
+            impact: [n] True if an impact is proven.
+            first: [n] best known first-impact harm, m2/s2; NaN if unknown.
+            total: [n] best known total harm, m2/s2; NaN if unknown.
+
+        """
         there = contact & ~impact
         known = there & np.isfinite(first) & np.isfinite(total)
         if not known.any():
@@ -91,7 +107,7 @@ class Between:
         return cls(float(there.mean()), float(first[known].mean()), float(total[known].mean()), harmless)
 
 
-# What was avoidable and the best known in each world, by the names of ``--per-world``.
+# Columns of ``--per-world`` on avoidability and best known harm.
 KNOWN_OF_WORLDS: dict[str, Callable[[Outcome, Regrets], Values | None]] = {
     "avoidable": lambda _, r: None if r.avoidable is None else r.avoidable + 0,
     "unavoidable_reason": lambda _, r: r.limits.proof.reason,
@@ -106,9 +122,10 @@ KNOWN_OF_WORLDS: dict[str, Callable[[Outcome, Regrets], Values | None]] = {
 
 
 def limits_of(evaluation: Evaluation) -> Limits | Unproven:
-    """What is known of each world whoever drives, computed once for an evaluation.
+    """Return proofs and best known harm of each world before any agent drives; ``Unproven`` if nothing is proven.
 
-    Warns (``IncompleteTable``) where a table of best known harm holds some of the worlds, and not the others.
+    They are computed once per evaluation. Warns with ``IncompleteTable`` if a table of best known harm covers only some
+    of the worlds.
     """
     return evaluation.once(_limits)
 
@@ -123,7 +140,7 @@ def _limits(evaluation: Evaluation) -> Limits | Unproven:
 
 
 def regrets_of(evaluation: Evaluation) -> Regrets | None:
-    """Best known harm of every world, the agents of this evaluation included; None where nothing is proven."""
+    """Return the best known harm of every world, including the agents of this evaluation; None if nothing is proven."""
     return evaluation.once(_regrets)
 
 

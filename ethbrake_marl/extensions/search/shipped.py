@@ -1,4 +1,4 @@
-"""The tables of best known harm that ship, and the agent that drives their profiles."""
+"""The shipped tables of best known harm, and the agent that drives their profiles."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent, Source
-from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.engine.profiles import ProfileProblem, Profiles
 from ethbrake_marl.extensions.search.best_harm import task_problem
 from ethbrake_marl.extensions.search.recall import BestHarm
@@ -23,16 +23,16 @@ TABLES = Path(__file__).with_name("_tables")
 
 @cache
 def shipped_tables() -> tuple[BestHarmTable, ...]:
-    """Every shipped table, by name of its file."""
+    """Return every shipped table, sorted by file name."""
     return tuple(BestHarmTable.load(path) for path in sorted(TABLES.glob("*.npz")))
 
 
 def best_known(worlds: Worlds, task: Task) -> dict[HarmCount, Floats]:
-    """The least harm known in each world (at t = 0) under each count, [n] m2/s2; NaN where no shipped table holds it.
+    """Return the best known harm of each world (at t = 0) from the shipped tables, by harm count, [n] m2/s2.
 
-    Worlds are recognised by everything their harm depends on: state, parameters, the others' scripts, time step,
-    horizon and the driven vehicles. Raises ``InvalidInput`` for a script whose command is not fixed at the alert, as no
-    search knows it.
+    NaN if no shipped table has it. Worlds are recognised by everything that affects their harm: state, parameters,
+    scripts of the others, time step, horizon and the controlled vehicles (in ``task``). Raises ``InvalidInput`` for a
+    script whose command is not fixed at the alert, because no search covers it.
     """
     identity = task_problem(worlds, task).identity
     known = {harm_count: np.full(worlds.n, np.nan) for harm_count in HARM_COUNTS}
@@ -42,7 +42,10 @@ def best_known(worlds: Worlds, task: Task) -> dict[HarmCount, Floats]:
 
 
 def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Profiles, Bools]:
-    """Kept profiles of a problem with one controlled vehicle, [n], and where there is one, [n]."""
+    """Return the stored profiles of a problem with one controlled vehicle, [n], and a mask [n] of worlds that have one.
+
+    ``harm_count`` is the harm that the profiles minimise, ``first`` or ``total``.
+    """
     last_step = problem.last_step
     profiles, known = Profiles(last_step[:, np.newaxis].copy(), np.zeros((problem.n, 1, 1))), np.zeros(problem.n, bool)
     for table in shipped_tables():
@@ -55,15 +58,18 @@ def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Pr
 
 
 def make_best_harm(argument: str | None, settings: AgentSettings) -> Agent:
-    """``best_harm[:candidates]``: the shipped profile, or a search with so many candidates where there is none."""
+    """Make the agent ``best_harm`` or ``best_harm:CANDIDATES``, which plays the shipped profile of each world.
+
+    A world without a shipped profile is searched. ``argument`` is the number of candidates of that search, or None.
+    """
     return BestHarm.make(argument, settings, shipped_profiles)
 
 
-BEST_HARM = Part(  # what the entry point names (pyproject.toml)
+BEST_HARM = Part(  # target of the entry point in pyproject.toml
     make_best_harm,
     form="best_harm[:CANDIDATES]",
     about="the best profile known; a search at the alert where none is known",
     knows=Source.MODEL,
 )
 
-RUNGS = ("planner", "best_harm")  # behind ``--agents ladder``, above the core's: up to the best that is known
+RUNGS = ("planner", "best_harm")  # agents that ``--agents ladder`` adds above the core's

@@ -1,4 +1,4 @@
-"""Tables of best known harm: small files that are looked up by what a world is, never by its place in a list."""
+"""Tables of best known harm: small files in which worlds are looked up by their content, not by their list number."""
 
 from __future__ import annotations
 
@@ -25,44 +25,45 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, UInt64s
 
 TABLE_FORMAT = 1
 
-SIZE_LIMIT_BYTES = 64 << 20  # of a file
+SIZE_LIMIT_BYTES = 64 << 20  # largest file
 
-UNPACKED_LIMIT_BYTES = 256 << 20  # of its arrays
+UNPACKED_LIMIT_BYTES = 256 << 20  # largest size of all arrays
 
-DECODED_LIMIT = 1 << 26  # numbers of the profiles of one count, every world with as many phases as the longest
+DECODED_LIMIT = 1 << 26  # most numbers in the decoded profiles of one count
 
 TOLERANCE = 1e-6  # an agent must be this much (m2/s2) below the table to replace its value
 
-_ABOUT = ("scenario", "list_seed", "episodes", "vehicles")  # of the header, in an error
+_ABOUT = ("scenario", "list_seed", "episodes", "vehicles")  # entries of the header that error messages show
 
-LEFT_OUT = "left_out"  # key of a table's header: number in the list -> why the world is in no row
+LEFT_OUT = "left_out"  # key of a table's header: number in the list -> why the world is not in the table
 
-LOWERED = "lowered_by"  # key of a table's header: agent -> count -> in how many worlds it did less harm
+LOWERED = "lowered_by"  # key of a table's header: agent -> count -> number of worlds in which it did less harm
 
 COUNTS: tuple[HarmCount, ...] = ("first", "total")
 
 
 class BestKnown(NamedTuple):
-    """The least harm known under one count."""
+    """Best known harm of n worlds under one harm count."""
 
-    harm: Floats  # [n] m2/s2
-    profiles: Profiles  # [n] that do it; all ends 0 where only the harm is known
+    harm: Floats  # [n] best known harm, m2/s2
+    profiles: Profiles  # [n] command profiles with that harm; all ends are 0 where only the harm is known
 
 
 @dataclass(frozen=True, slots=True)
 class BestHarmTable:
-    """The least harm known in n worlds, for one or both counts, and how it was found (``header``)."""
+    """Best known harm of n worlds, for one or both harm counts."""
 
-    identity: UInt64s  # [n]
-    best: Mapping[HarmCount, BestKnown]
-    header: Mapping[str, Any]
+    identity: UInt64s  # [n] hash of each world, by which it is found
+    best: Mapping[HarmCount, BestKnown]  # harm and profiles, by harm count
+    header: Mapping[str, Any]  # entries that describe how the table was computed: scenario, vehicles, budget, ...
 
     @classmethod
     def load(cls, path: Path) -> BestHarmTable:
-        """Read a table. Raises ``InvalidInput`` if there is no file and ``CorruptBundle`` if it is not a table.
+        """Return the table that is stored in the file ``path``.
 
-        Names, types, shapes and sizes are checked from the headers before anything is unpacked. What a table says of a
-        world is believed; that its profiles fit a problem is for ``check_fits`` to say.
+        Raises ``InvalidInput`` if there is no file, and ``CorruptBundle`` if it is not a table. Names, types, shapes
+        and sizes are checked from the headers before anything is unpacked. The harm of a world is not verified;
+        ``check_fits`` checks that the profiles fit a problem.
         """
         if not os.path.exists(path):
             raise InvalidInput(f"{path}: there is no such table of best known harm")
@@ -82,23 +83,25 @@ class BestHarmTable:
         return cls(arrays["identity"].astype(np.uint64), best, header)
 
     def save(self, path: Path) -> None:
-        """Write the table in one step."""
+        """Write the table to the file ``path``, whole or not at all."""
         write_file(path, table_bytes(self))
 
     @property
     def left_out(self) -> Mapping[str, str]:
-        """Number in the list -> why the world is in no row."""
+        """Worlds that are not in the table because of a failure: number in the list -> reason."""
         return dict(self.header.get(LEFT_OUT, {}))
 
     def rows(self, identity: UInt64s) -> NDArray[np.int64]:
-        """Row of each world, -1 where it is not in the table."""
+        """Return the row of each world, given by its hash ``identity`` [m]; -1 if it is not in the table."""
         order = np.argsort(self.identity, kind="stable")
         place = np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)
         rows = order[place]
         return np.where(self.identity[rows] == identity, rows, -1)
 
     def check_holds_any(self, identity: UInt64s) -> None:
-        """Raise ``InvalidInput`` if none of these worlds is in the table: it is of another list."""
+        """Raise ``InvalidInput`` if the table holds none of the worlds with hashes ``identity``: it then belongs to
+        another list.
+        """
         if not (self.rows(identity) >= 0).any():
             made = ", ".join(f"{key} {self.header[key]}" for key in _ABOUT if key in self.header)
             raise InvalidInput(
@@ -107,7 +110,7 @@ class BestHarmTable:
             )
 
     def check_fits(self, problem: ProfileProblem) -> None:
-        """Raise ``InvalidInput`` if a profile kept for one of these worlds cannot be driven there."""
+        """Raise ``InvalidInput`` if a stored profile of a world of ``problem`` cannot be played there."""
         for harm_count in self.best:
             try:
                 problem.check(self.profiles(problem.identity, harm_count, problem.last_step)[0])
@@ -115,14 +118,25 @@ class BestHarmTable:
                 raise InvalidInput(f"table of best known harm, {harm_count}: {error}") from None
 
     def harm(self, identity: UInt64s, harm_count: HarmCount) -> Floats:
-        """Best known harm of each world (m2/s2), NaN where it is not in the table."""
+        """Return the best known harm of each world, given by its hash ``identity`` [m]: [m] m2/s2, NaN if it is not in
+        the table.
+        """
         rows = self.rows(identity)
         if harm_count not in self.best:
             return np.full(rows.shape, np.nan)
         return np.where(rows >= 0, self.best[harm_count].harm[rows], np.nan)
 
     def profiles(self, identity: UInt64s, harm_count: HarmCount, last_step: Ints) -> tuple[Profiles, Bools]:
-        """Kept profiles [n], and where there is one [n]; coasting elsewhere. ``last_step`` [n] ends each of them."""
+        """Return the stored profile of each world, [m], and a mask [m] of the worlds that have one.
+
+        A world without a profile gets coasting.
+
+        Args:
+            identity: [m] hash of each world.
+            harm_count: harm that the profiles minimise, ``first`` or ``total``.
+            last_step: [m] number of steps of each episode, at which a profile ends.
+
+        """
         rows = self.rows(identity)
         if harm_count not in self.best:
             controlled = next(iter(self.best.values())).profiles.commands_mps2.shape[2]
@@ -136,10 +150,17 @@ class BestHarmTable:
     def improved(
         self, identity: UInt64s, harm_count: HarmCount, harm: Floats, profiles: Profiles | None = None
     ) -> tuple[BestHarmTable, Bools]:
-        """The table with every value replaced that ``harm`` [m] undercuts by more than ``TOLERANCE``; and where it did.
+        """Return the table with smaller values replaced, and a mask [m] of the worlds that were replaced.
 
-        ``profiles`` [m] are what did it; without them only the harm is known there. Worlds that are not in the table
-        change nothing. Raises ``InvalidInput`` for a count that the table does not hold, or shapes that do not fit.
+        A value is replaced if ``harm`` is smaller by more than ``TOLERANCE``. Worlds that are not in the table are
+        ignored. Raises ``InvalidInput`` for a count that the table does not hold, or for shapes that do not match.
+
+        Args:
+            identity: [m] hash of each world.
+            harm_count: ``first`` or ``total``.
+            harm: [m] harm of each world, m2/s2.
+            profiles: [m] command profiles that cause this harm; None: store the harm only.
+
         """
         if harm_count not in self.best:
             raise InvalidInput(f"table of {', '.join(self.best)}: holds no {harm_count!r} harm")
@@ -162,7 +183,10 @@ class BestHarmTable:
 
 
 def table_bytes(table: BestHarmTable) -> bytes:
-    """The table as a compressed .npz without pickles: only the phases in use, bytes of like weight together."""
+    """Return the bytes of a table file: a compressed .npz without pickles.
+
+    Only phases in use are stored, and the bytes of commands are grouped by significance to compress well.
+    """
     arrays: dict[str, NDArray[Any]] = {
         "header": np.frombuffer(json.dumps({"format": TABLE_FORMAT, **table.header}).encode(), np.uint8),
         "identity": table.identity.astype("<u8"),
@@ -182,7 +206,10 @@ def table_bytes(table: BestHarmTable) -> bytes:
 
 
 def _rows(harm_count: HarmCount) -> list[ArrayRow]:
-    """What a table holds of one count: n worlds, m phases in all, C controlled vehicles."""
+    """Return name, type and shape of each array that a table file holds for one harm count.
+
+    n worlds, m phases in all, C controlled vehicles.
+    """
     return [
         ArrayRow("header", "|u1", ("bytes",)),
         ArrayRow("identity", "<u8", ("n",)),
@@ -194,23 +221,26 @@ def _rows(harm_count: HarmCount) -> list[ArrayRow]:
 
 
 class _Header(BaseModel):
-    """What other code relies on in a header; it may say more."""
+    """Entries of a table's header that other code relies on. A header may have more entries."""
 
     model_config = ConfigDict(strict=True, extra="allow")
 
-    format: Annotated[int, Field(ge=TABLE_FORMAT, le=TABLE_FORMAT)]  # neither true nor 1.0
-    scenario: str = ""
-    vehicles: list[str] = []
-    budget: int = 0
-    search_seed: int = 0
-    episodes: int = 0
-    list_seed: int = 0
-    after: dict[str, Any] = {}
-    lowered_by: dict[str, dict[str, int]] = {}
+    format: Annotated[int, Field(ge=TABLE_FORMAT, le=TABLE_FORMAT)]  # version of the file format; refuses true and 1.0
+    scenario: str = ""  # name of the scenario
+    vehicles: list[str] = []  # names of the controlled vehicles
+    budget: int = 0  # candidates per world and count of the search
+    search_seed: int = 0  # seed of the search
+    episodes: int = 0  # number of worlds of the list
+    list_seed: int = 0  # seed of the list
+    after: dict[str, Any] = {}  # header of the table with which the search started
+    lowered_by: dict[str, dict[str, int]] = {}  # agent -> count -> number of worlds in which the agent did less harm
 
 
 def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> BestKnown:
-    """One count of a table whose arrays have the right shapes; raises ``ValueError`` for numbers that cannot be."""
+    """Return harm and profiles of one count from the arrays of a table file, which have the right shapes.
+
+    Raises ``ValueError`` for impossible numbers.
+    """
     harm = arrays[f"{harm_count}_harm"].astype(np.float64)
     used = arrays[f"{harm_count}_phases"].astype(np.int64)
     planes = arrays[f"{harm_count}_commands"]
@@ -240,5 +270,7 @@ def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> Bes
 
 
 def _used(ends: NDArray[np.int64]) -> NDArray[np.int64]:
-    """How many phases each profile uses, [n]; 0 where there is none."""
+    """Return the number of phases that each profile uses, [n]; 0 if there is no profile. ``ends`` [n, K] are their
+    ends.
+    """
     return np.where(ends[:, -1] > 0, np.argmax(ends == ends[:, -1:], axis=1) + 1, 0)

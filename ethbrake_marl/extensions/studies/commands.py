@@ -1,4 +1,4 @@
-"""The commands ``study``: many trainings to sweep or tune, many worlds to falsify."""
+"""The commands ``study``: sweep or tune many trainings, or search many worlds for weaknesses."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def tune_command(
 
 
 def _end_study(out: Out, told: str, *, interrupted: bool, failed: bool) -> None:
-    """Say what a sweep or a tuning came to, and end with its status."""
+    """Print ``told``, the result of a sweep or tuning, and end the command: status 130 if interrupted, 1 if failed."""
     if interrupted:
         out.interrupted(f"interrupted; {told}; {KEPT}")
     out.note(told)
@@ -295,7 +295,10 @@ def falsify_command(
 
 
 def _spelled(**options: Any) -> str:
-    """The command line of a search: without options that are None; one that is a tuple stands several times."""
+    """Return the command line ``ethbrake study falsify`` with these options, by name.
+
+    Options that are None are left out; a tuple repeats its option.
+    """
     words = ["ethbrake", "study", "falsify"]
     for option, value in options.items():
         if value is not None:
@@ -305,10 +308,14 @@ def _spelled(**options: Any) -> str:
 
 
 def _drive_again(out: Out, file: Path, agent: str | None) -> None:
-    """Measure the worlds of a file once more, and compare; exit status 1 where one is worse, or could not be driven."""
+    """Measure the worlds of a file of ``study falsify`` once more, and print a comparison.
+
+    ``agent`` drives; None: the agent that the file names. Ends the command with status 1 if a world is worse than
+    before or could not be driven.
+    """
     import numpy as np
 
-    from ethbrake_marl.agents.registry import parse_spec
+    from ethbrake_marl.agents.spec import parse_spec
     from ethbrake_marl.extensions.studies.named_worlds import NamedWorlds
     from ethbrake_marl.extensions.studies.weakness import Measure
     from ethbrake_marl.scenario.sample import Sample

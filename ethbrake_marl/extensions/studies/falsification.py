@@ -1,4 +1,4 @@
-"""An adaptive search of the unit cube for the points of highest score, of which several far apart are wanted."""
+"""Adaptive search of the unit cube for several points of high score that are far apart."""
 
 from __future__ import annotations
 
@@ -16,36 +16,46 @@ from ethbrake_marl.scenario.sample import Sample
 
 Score = Callable[[Floats], Floats]  # points [n, d] of [0, 1) -> scores [n]; minus infinity: the point does not count
 
-Watcher = Callable[[int, int], None]  # points scored so far, and in all
+Watcher = Callable[[int, int], None]  # called with the number of points scored so far, and their total
 
 ROUND = 256  # points that are scored together
 
-APART = 0.1  # of two finds, in some coordinate
+APART = 0.1  # least distance of two results, in at least one coordinate
 
-_PARENTS = 24  # of the next round, far apart
+_PARENTS = 24  # number of parents of the next round, which are far apart
 
 _EXPLORING = 0.5  # share of each round that is spread evenly over the cube
 
-_NEAREST, _FARTHEST = 1e-3, 0.3  # typical steps from a parent
+_NEAREST, _FARTHEST = 1e-3, 0.3  # range of typical steps from a parent
 
 _LAST = np.nextafter(1.0, 0.0)
 
 
 class Scored(NamedTuple):
-    """All points that were tried, in their order."""
+    """All n points of the unit cube that were tried, in order, with their scores."""
 
-    points: Floats  # [n, d]
-    scores: Floats  # [n]
+    points: Floats  # [n, d] coordinates in [0, 1)
+    scores: Floats  # [n] score of each point, the larger the better; minus infinity: the point does not count
 
 
 def search(
     score: Score, dimensions: int, budget: int, seed: int, *, adaptive: bool = True, on_round: Watcher | None = None
 ) -> Scored:
-    """Score ``budget`` points. ``adaptive``: look around the best so far; otherwise independent uniform points.
+    """Search the unit cube for points with a high score, and return all points that were tried.
 
-    A round's points are partly spread evenly (scrambled Sobol), partly one step from the best points so far that are
-    far apart: a normal step in some coordinates, or the difference of two other ones (differential evolution). While
-    no point is better than the median, all are spread evenly. The same seed gives the same points.
+    One part of a round's points is spread evenly (scrambled Sobol). The other part is one step from the best points so
+    far that are far apart: a normal step in some coordinates, or the difference of two other points (differential
+    evolution). While no point is better than the median, all points are spread evenly. The same seed gives the same
+    points.
+
+    Args:
+        score: function from points [n, d] to scores [n].
+        dimensions: number of coordinates, d.
+        budget: number of points to try.
+        seed: seed of the points.
+        adaptive: whether to look around the best points; False: all points are uniform.
+        on_round: called after each round with the number of points so far and ``budget``.
+
     """
     check_whole_number("search: budget", budget, 1)
     check_whole_number("search: seed", seed, 0)
@@ -67,8 +77,11 @@ def search(
 
 
 def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
-    """Scrambled Sobol points, drawn a whole round at a time: their balance needs powers of two."""
-    from scipy.stats import qmc  # takes a second to load, and most commands search nothing
+    """Yield points that are evenly spread over the unit cube (scrambled Sobol points), one by one, each [d].
+
+    ``dimensions`` is d. The sequence has no end, and the same seed gives the same points.
+    """
+    from scipy.stats import qmc  # imported here, because it takes a second to load
 
     sobol = qmc.Sobol(dimensions, rng=np.random.default_rng([seed, dimensions, 1]))
     while True:
@@ -76,7 +89,10 @@ def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
 
 
 def far_apart(found: Scored, count: int) -> Ints:
-    """Rows of the best points, at most ``count``, best first, of which any two are ``APART`` in some coordinate."""
+    """Return the row numbers of the best points of ``found`` that are far apart, best first, at most ``count``.
+
+    Any two of them differ by at least 0.1 in some coordinate. Points that do not count (score not finite) are omitted.
+    """
     order = np.argsort(-found.scores, kind="stable")
     order = order[np.isfinite(found.scores[order])]
     kept: list[int] = []
@@ -88,7 +104,7 @@ def far_apart(found: Scored, count: int) -> Ints:
 
 
 def _above_median(found: Scored) -> Scored:
-    """The same points, but those that are no better than the median do not count."""
+    """Return the points of ``found`` with the score -inf for those that are no better than the median."""
     good = np.isfinite(found.scores)
     if not good.any():
         return found
@@ -96,7 +112,7 @@ def _above_median(found: Scored) -> Scored:
 
 
 def _children(parents: Floats, count: int, rng: np.random.Generator) -> Floats:
-    """Points near parents, [count, d]; every parent has as many as any other."""
+    """Return ``count`` new points near the points ``parents`` [m, d], with equal shares for all parents."""
     if count == 0:
         return parents[:0]
     parent = parents[np.arange(count) % len(parents)]
@@ -107,21 +123,22 @@ def _children(parents: Floats, count: int, rng: np.random.Generator) -> Floats:
     one, other = (parents[rng.integers(len(parents), size=count)] for _ in range(2))
     crossing = rng.random((count, 1)) < 1.0 / 3.0
     moved_to = parent + np.where(crossing, 0.5 * (one - other) + 0.1 * step, step)
-    inside: Floats = 1.0 - np.abs(np.mod(moved_to, 2.0) - 1.0)  # what left the cube is thrown back at its faces
+    inside: Floats = 1.0 - np.abs(np.mod(moved_to, 2.0) - 1.0)  # reflects points that left the cube at its faces
     return np.clip(inside, 0.0, _LAST)
 
 
 @dataclass(frozen=True, slots=True)
 class Falsified:
-    """The worst worlds that a search found, worst first, and what all that it tried were like."""
+    """Result of a search for worlds in which an agent does badly: the worst worlds, worst first, and all scores."""
 
-    sample: Sample  # the worst worlds
-    worlds: list[NamedWorld]  # the same by name, and what was measured in them
-    scores: Floats  # of every world tried, in their order; minus infinity: the scenario does not have it
-    first_above: int | None  # how many worlds were tried until one had a score above zero
+    sample: Sample  # the worst worlds at the alert
+    worlds: list[NamedWorld]  # the same worlds with names, initial states and measurements
+    # Score of every world tried, in order (m2/s2). Minus infinity: not a world of the scenario, or the physics failed.
+    scores: Floats
+    first_above: int | None  # number of worlds tried up to the first score above zero; None: no score is above zero
 
     @property
     def share_above(self) -> float:
-        """Share of the tried worlds, of those that count, with a score above zero."""
+        """Share, 0 to 1, of worlds with a score above zero among those with a finite score."""
         good = self.scores[np.isfinite(self.scores)]
         return float((good > 0.0).mean()) if len(good) else 0.0

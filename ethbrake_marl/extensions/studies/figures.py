@@ -1,4 +1,4 @@
-"""One training of a sweep or a tuning: bring it to its end in its folder, and the figures of it for a table."""
+"""One training of a sweep or a tuning: bring it to its end in its folder, and return its figures for a table."""
 
 from __future__ import annotations
 
@@ -20,22 +20,25 @@ _MEASURED = ("first_impact_harm", "total_harm", "collision_rate")
 
 FIGURES = (
     "steps",  # decisions of learners in whole updates
-    "policy_steps",  # decisions after which the kept policy was taken: the best one on the recipe's list
-    *_MEASURED,  # of the kept policy on that list
-    RunDirectory.OBJECTIVE,  # likewise, where a learner has another objective than total
-    *(f"last_{name}" for name in _MEASURED),  # of the last one
-    "policy_sha256",  # of the kept policy's manifest, of several vehicle_i=... each
+    "policy_steps",  # decisions after which the kept policy, the best one on the recipe's list, was saved
+    *_MEASURED,  # measures of the kept policy on that list
+    RunDirectory.OBJECTIVE,  # likewise, if a learner has another objective than total harm
+    *(f"last_{name}" for name in _MEASURED),  # measures of the last policy
+    "policy_sha256",  # hash of the kept policy's manifest; vehicle_i=... for each of several policies
 )
 
-HARM = "harm"  # beside them: what the kept policy has least of
+HARM = "harm"  # key beside FIGURES: the quantity by which the kept policy is the best
 
-REASON = "reason"  # in their place: why a training cannot be done, however often it is tried
+REASON = "reason"  # key instead of FIGURES: why a training cannot succeed
 
-Evaluation = Mapping[str, float]  # steps, and what was measured then
+Evaluation = Mapping[str, float]  # one evaluation during a training: steps, and the measures at that time, by name
 
 
 def is_done(job: TrainingJob) -> bool:
-    """Whether the folder holds the training to its end, and its policies; raises ``InvalidInput`` for another one."""
+    """Return whether the folder of ``job`` holds the finished training with its policies.
+
+    Raises ``InvalidInput`` for another training.
+    """
     run = RunDirectory(job.folder)
     if not run.is_finished:
         return False
@@ -44,17 +47,17 @@ def is_done(job: TrainingJob) -> bool:
 
 
 def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
-    """Bring a training to its end, from where it stopped; False where ``stop_at`` stopped it.
+    """Bring the training of ``job`` to its end, from where it stopped. Return False if it was stopped early.
 
-    Raises what a training raises, ``InvalidInput`` where the folder holds another one, and ``BlockingIOError`` where
-    another worker has just begun it.
+    ``stop_at`` takes each evaluation and returns a reason to stop, or None. Raises the exceptions of a training,
+    ``InvalidInput`` if the folder holds another training, and ``BlockingIOError`` if another worker has just begun it.
     """
     run = RunDirectory(job.folder)
     if run.status.is_file():
-        run.wait_for_others(60.0)  # a worker that has lost its driver may hold the folder for a moment
+        run.wait_for_others(60.0)  # a worker without driver may still hold the folder
         check_same_training(run, job.training)
         if run.is_finished and not is_done(job):
-            remove_folder(job.folder)  # a finished run has no checkpoint: it is trained anew
+            remove_folder(job.folder)  # without policies it is trained again; there is no checkpoint
     try:
         return bool(job.finish(stop_at=stop_at))
     except AlreadyExists as error:
@@ -62,7 +65,10 @@ def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
 
 
 def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
-    """What its folder says was measured so far; raises ``InvalidInput`` where its table is damaged."""
+    """Return the evaluations so far in the folder of ``job``, each with steps and measures by name.
+
+    Raises ``InvalidInput`` if its table ``progress.csv`` is damaged.
+    """
     run, names = RunDirectory(job.folder), (*_MEASURED, RunDirectory.OBJECTIVE)
     try:
         rows = [row for row in (run.rows() if run.progress.is_file() else []) if row.get(f"eval/{_MEASURED[0]}")]
@@ -78,7 +84,11 @@ def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
 
 
 def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, Any]:
-    """``HARM`` and the ``FIGURES`` after these evaluations, without a hash."""
+    """Return the figures of the training ``job`` for a table, given its evaluations so far, by name.
+
+    The names are ``harm`` (the quantity by which the best policy is chosen) and those in ``FIGURES``, without
+    ``policy_sha256``; for example ``{"harm": 7.1, "steps": 400000, "total_harm": 9.8, ...}``.
+    """
     harm = RunDirectory.chosen_by(evaluations, job.training.recipe.reward.harm_count)
     kept, last = min(evaluations, key=lambda each: each[harm]), evaluations[-1]
     return {
@@ -91,7 +101,10 @@ def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, An
 
 
 def final_figures(job: TrainingJob) -> dict[str, Any]:
-    """``HARM`` and all ``FIGURES`` of a training that is done; raises ``InvalidInput`` for a damaged file."""
+    """Return the figures of the finished training ``job`` for a table, by name: ``harm`` and all in ``FIGURES``.
+
+    Raises ``InvalidInput`` for a damaged file.
+    """
     run, evaluations = RunDirectory(job.folder), evaluations_of(job)
     if not evaluations:
         raise InvalidInput(f"{run.progress}: holds no evaluation; delete its folder to train anew")

@@ -1,4 +1,4 @@
-"""The folder of a study: it answers one question, and one process at a time works in it."""
+"""The folder of a study: it holds the results of one set of settings, and one process at a time works in it."""
 
 from __future__ import annotations
 
@@ -16,16 +16,18 @@ _LOCK = ".lock"
 
 
 class StudyFolder:
-    """Where a study leaves its results, so that the same command goes on after a kill.
+    """Folder of a study's results, so that the same command continues after an interruption.
 
     Args:
-        path: made when work begins.
-        kind: what it holds, for messages.
-        question: what every result in it depends on, as plain data; None: each result knows its own.
-        record: name of the file with the question, and with what ``more`` adds to it when it is written.
-        advice: what to do about a folder that answers another question.
-        beside: names of what may be in a folder without a record; None: anything.
-        writes: names of files that its work replaces, at its end perhaps.
+        path: the folder; it is created when work begins.
+        kind: what the folder holds, for messages: ``a sweep``.
+        question: all settings and versions that the results depend on, as plain data, so that a folder with other ones
+            is refused; None if each result stores its own.
+        record: name of the file inside the folder that stores ``question``.
+        more: further entries of that file, which are not compared.
+        advice: what the user can do about a folder with another ``question``, for messages.
+        beside: names of files that may exist in a folder without that file; None: any.
+        writes: names of files that the work replaces, and that must therefore be writable.
 
     """
 
@@ -46,10 +48,11 @@ class StudyFolder:
         self._record, self._more = path / record, dict(more or {})
 
     def check(self) -> bool:
-        """Whether the record of the question is still to be written; makes nothing.
+        """Check that work may begin in this folder, and return whether the file ``record`` must still be written.
 
-        Raises ``InvalidInput`` for what is no folder, cannot be written to (nor one of ``writes``), or answers another
-        question, with what differs; ``AlreadyExists`` for a folder of something else.
+        Writes nothing. Raises ``InvalidInput`` if the path is not a folder, if it or one of ``writes`` cannot be
+        written, or if it belongs to other settings (the message lists the differences); ``AlreadyExists`` for a folder
+        with other content.
         """
         check_folder(self.path, self._writes, force=True)
         if self._question is None:
@@ -77,9 +80,11 @@ class StudyFolder:
 
     @contextmanager
     def work(self) -> Iterator[None]:
-        """Keep others out of the folder while the block runs; what killed writers left goes.
+        """Context manager that creates the folder, and locks it against other processes while the block runs.
 
-        Raises what ``check`` raises, and ``InvalidInput`` where another process works in it.
+        At the start it also removes unfinished files of processes that were killed.
+
+        Raises the exceptions of ``check``, and ``InvalidInput`` if another process works in the folder.
         """
         self.check()
         self.path.mkdir(parents=True, exist_ok=True)
@@ -94,7 +99,10 @@ class StudyFolder:
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
-    """What differs between two questions, in words; of lists and of what stands in one alone the name."""
+    """Return the differences of the settings ``now`` from ``before``, in words: ``["seeds 2, here 5", "recipes"]``.
+
+    For a list or an object, only the name is given. ``inside`` is the text before each name.
+    """
     found: list[str] = []
     for name in dict.fromkeys([*now, *before]):
         old, new = before.get(name), now.get(name)

@@ -1,4 +1,4 @@
-"""The machine on which this runs, for figures of speed and time."""
+"""Description of this machine, for figures of speed and time."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ import ethbrake_marl as eb
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """The machine on which this runs: processor, load, versions; a figure of speed means nothing without it."""
+    """Processor, load and versions of this machine, which belong to every figure of speed."""
 
-    processor: str
-    cores_usable: int
-    cores: int
-    load: float  # processes that were running, mean over the last minute
-    python: str
-    numpy: str
-    numba: str
-    ethbrake_marl: str
+    processor: str  # model of the processor
+    cores_usable: int  # number of cores that this process may use
+    cores: int  # number of cores of the machine
+    load: float  # mean number of running processes over the last minute
+    python: str  # version of Python
+    numpy: str  # version of numpy
+    numba: str  # version of numba
+    ethbrake_marl: str  # version of this package
 
     def __str__(self) -> str:
-        """The machine in words."""
+        """Return the description of the machine in one line, for captions."""
         return (
             f"{self.processor}, {self.cores_usable} of {self.cores} cores usable, load {self.load:.1f};"
             f" Python {self.python}, numpy {self.numpy}, numba {self.numba}, ethbrake_marl {self.ethbrake_marl}"
@@ -33,7 +33,7 @@ class Machine:
 
 
 def this_machine() -> Machine:
-    """The machine on which this runs."""
+    """Return processor, cores, present load and versions of this machine."""
     information = Path("/proc/cpuinfo")
     lines = information.read_text("utf-8").splitlines() if information.is_file() else []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

@@ -1,7 +1,7 @@
-"""Proposals of Optuna for a tuning, through Ray Tune, kept in a file: those that stand there are proposed again first.
+"""Optuna's proposals (values to try) for a tuning, through Ray Tune, stored in a file and reused after a restart.
 
-A sampler is made anew for each trial, of a seed and the trial's number: what is proposed depends on what had
-ended by then, and not on how often the command was stopped in between.
+Each trial has a new sampler, seeded by a seed and the trial's number. So a proposal depends on the trials that have
+ended, and not on interruptions of the command.
 """
 
 from __future__ import annotations
@@ -23,18 +23,21 @@ if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
     from optuna.trial import FrozenTrial
 
-Proposal = Mapping[str, Any]  # key -> value as Optuna has it
+Proposal = Mapping[str, Any]  # key -> value in Optuna's form
 
 
 class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
-    """Optuna's search of a space; a trial's configuration is its ``trial``, a number, and its ``values``.
+    """Optuna's search as Ray Tune uses it, which stores each proposal in a file.
+
+    A *proposal* is the values to try in one trial, by key, in Optuna's form. The configuration of a trial is its
+    number, ``trial``, and its proposal, ``values``.
 
     Args:
-        file: of the proposals; made with the first one.
-        known: what stands in it.
-        space: the distribution of each key.
-        sampler: makes the sampler for the trial of a number.
-        first: the first proposal, where none is known.
+        file: JSON file of the proposals; created with the first one.
+        known: proposals that the file holds already; they are proposed again, before new ones.
+        space: key -> Optuna's distribution of its values.
+        sampler: function from the number of a trial to its Optuna sampler.
+        first: proposal of the very first trial, used if ``known`` is empty; None: it is sampled like the others.
 
     """
 
@@ -58,7 +61,10 @@ class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
         )
 
     def suggest(self, trial_id: str) -> dict[str, Any] | None:
-        """The next trial."""
+        """Return the configuration of the next trial: ``{"trial": number, "values": proposal}``.
+
+        A proposal that is not in the file yet is stored there. ``trial_id`` is Ray's name of the trial.
+        """
         values, number = super().suggest(trial_id), self._asked
         if number == len(self.known):
             self.known.append(values)
@@ -68,7 +74,7 @@ class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
 
 
 class _SamplerOfTrial(BaseSampler):
-    """A sampler of its own for each trial."""
+    """Optuna sampler that makes a new sampler for each trial; ``of`` returns it for the number of the trial."""
 
     def __init__(self, of: Callable[[int], BaseSampler]) -> None:
         self._of = of

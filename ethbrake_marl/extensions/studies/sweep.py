@@ -1,7 +1,7 @@
-"""A sweep: the trainings that a YAML file lists, checked before one begins, done on Ray Tune, and one table of them.
+"""A sweep: the trainings listed in a YAML file, checked first, run on Ray Tune, with one table of results.
 
-The table is made of the runs' folders alone. It is the same, byte for byte, in whatever order and wherever the jobs
-ran, and however often they were stopped.
+The table is made only from the folders of the runs. It is the same, byte for byte, in whatever order, place and number
+of attempts the jobs ran.
 """
 
 from __future__ import annotations
@@ -38,7 +38,10 @@ _GRID: YamlPath = ("grid",)
 
 
 class _OneOrMore:
-    """Of a list: in a file a single entry may stand in its place (a check of the model makes it a list)."""
+    """Annotation of a list for which the file may contain a single entry instead.
+
+    It only changes the JSON schema; a validator turns a single entry into a list.
+    """
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
@@ -64,16 +67,16 @@ _Settings = Annotated[dict[str, Any], AfterValidator(_check_keys)]
 
 
 class Request(NamedTuple):
-    """One job as the file asks for it."""
+    """One training of a sweep, as the sweep's file requests it."""
 
-    path: YamlPath  # in the file: of the grid, or of a listed job
-    scenario: str  # a name or a path
-    recipe: str  # a name or a path
-    settings: tuple[str, ...]  # KEY=VALUE each, as for ``train --set``
-    seed: int
+    path: YamlPath  # keys that lead to its place in the file: ``("grid",)``, or ``("jobs", k)`` for a listed job
+    scenario: str  # name or path of the scenario
+    recipe: str  # name or path of the recipe
+    settings: tuple[str, ...]  # ``KEY=VALUE`` texts, as for ``train --set``
+    seed: int  # seed of the training
 
     def __str__(self) -> str:
-        """The job in words."""
+        """Return place, scenario, recipe, seed and settings of the job in words, for messages."""
         settings = f", {', '.join(self.settings)}" if self.settings else ""
         return f"{_place(self.path)} ({self.scenario}, {self.recipe}, seed {self.seed}{settings})"
 
@@ -83,7 +86,7 @@ def _place(path: YamlPath) -> str:
 
 
 class SeedRange(FileModel):
-    """``count`` seeds from ``first`` on."""
+    """Seeds of the trainings as a range: ``count`` seeds, from ``first`` on."""
 
     first: Seed = Field(default=0, description="the smallest seed")
     count: int = Field(ge=1, le=MOST_JOBS, description="how many seeds")
@@ -97,7 +100,7 @@ _Seeds = Annotated[
 
 
 class Grid(FileModel):
-    """All combinations of what is listed."""
+    """One training for every combination of the listed scenarios, recipes, settings and seeds."""
 
     settings: Annotated[dict[str, _Values], AfterValidator(_check_keys)] = Field(
         default={}, alias="set", description="a list of values for each dotted key"
@@ -113,14 +116,14 @@ class Grid(FileModel):
 
     @property
     def seeds(self) -> Sequence[int]:
-        """The seeds, one by one."""
+        """The seeds of the trainings, listed one by one."""
         if isinstance(self.seed, SeedRange):
             return range(self.seed.first, self.seed.first + self.seed.count)
         return self.seed
 
 
 class ListedJob(FileModel):
-    """One job."""
+    """One training: a scenario, a recipe, settings and a seed."""
 
     settings: _Settings = Field(default={}, alias="set", description="settings by dotted key, as train --set")
     scenario: str = Field(description="a name or a path, as train --scenario")
@@ -129,20 +132,23 @@ class ListedJob(FileModel):
 
 
 class SweepFile(StudyFile):
-    """The whole file; ``settings`` hold for every job."""
+    """Content of the YAML file of a sweep: trainings as a grid of combinations, as a list of single jobs, or both."""
 
     settings: _Settings = Field(default={}, alias="set", description="settings of every job, as train --set")
     grid: Grid | None = Field(default=None, description="every combination of what it lists")
     jobs: tuple[ListedJob, ...] = Field(default=(), strict=False, description="single jobs, after those of the grid")
 
     def size(self) -> int:
-        """Number of jobs."""
+        """Return the number of jobs that the file requests."""
         grid = self.grid
         lists = [] if grid is None else [grid.scenario, grid.recipe, grid.seeds, *grid.settings.values()]
         return (math.prod(map(len, lists)) if lists else 0) + len(self.jobs)
 
     def requests(self) -> Iterator[Request]:
-        """The jobs: of the grid, seed by seed, so that first results of all are there early; then those listed."""
+        """Yield the jobs: first those of the grid, then the listed ones.
+
+        The grid is ordered by seed, so that first results of all combinations exist early.
+        """
         if (grid := self.grid) is not None:
             changes = [
                 self._texts(dict(zip(grid.settings, values, strict=True)), _GRID)
@@ -155,7 +161,11 @@ class SweepFile(StudyFile):
             yield Request(("jobs", k), job.scenario, job.recipe, self._texts(job.settings, ("jobs", k)), job.seed)
 
     def where(self, asked: Request, part: str = "") -> str:
-        """File and line of a job; of a ``part`` of it: ``recipe``, ``scenario``, or the key of a setting."""
+        """Return file and line of a requested job, for messages: ``sweep.yaml, line 7``.
+
+        ``part`` names a part of the job, whose line is returned instead: ``recipe``, ``scenario``, or the key of a
+        setting. Empty: the line of the job itself.
+        """
         path = (*asked.path, "set", part) if part else asked.path
         if part in self.settings:
             path = ("set", part)
@@ -173,26 +183,26 @@ class SweepFile(StudyFile):
         return texts_of({**self.settings, **own})
 
 
-TABLE, FAILURES, RUNS = "results.csv", "failures.csv", "runs"  # inside the folder
+TABLE, FAILURES, RUNS = "results.csv", "failures.csv", "runs"  # names inside the folder
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One job: what was asked for, and what is known of it without resolving it again."""
+    """One job of a sweep, checked and loaded: one row of the sweep's table."""
 
-    asked: Request
-    identity: str  # of its training
-    name: str  # of its folder
-    first: Training  # of the job with these settings and the first seed
+    asked: Request  # the job as the file requests it
+    identity: str  # SHA-256 of everything that affects its training (``Training.identity``)
+    name: str  # name of the job and of its folder
+    first: Training  # training with the settings of the job, but perhaps another seed; jobs of equal settings share it
 
     @property
     def settings(self) -> dict[str, str]:
-        """Key -> value of each setting, as text."""
+        """Settings of the job: key -> value, as texts."""
         return dict(text.split("=", 1) for text in self.asked.settings)
 
     @property
     def about(self) -> dict[str, Any]:
-        """What the tables say of it first."""
+        """Columns of the tables that describe the job: hash, scenario, recipe, algorithm, scheme, seed, steps."""
         return {
             "hash": self.identity,
             "scenario": self.asked.scenario,
@@ -206,13 +216,13 @@ class Row:
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """All jobs, in the order of the table. What they have in common is loaded once."""
+    """All jobs of a sweep, checked and loaded, in the order of its table."""
 
-    rows: Sequence[Row]
+    rows: Sequence[Row]  # the jobs
 
     @staticmethod
     def json_schema() -> dict[str, Any]:
-        """JSON Schema of the file of a sweep, for editors that complete and check YAML."""
+        """Return the JSON Schema of a sweep's file, for editors that complete and check YAML."""
         schema = SweepFile.model_json_schema(schema_generator=FileSchema)
         return FileSchema.publish(
             {**schema, "title": "Sweep", "anyOf": [{"required": ["grid"]}, {"required": ["jobs"]}]}
@@ -220,10 +230,10 @@ class SweepPlan:
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """Read the file of a sweep, and resolve every job.
+        """Read the file of a sweep, and load scenario and recipe of every job.
 
-        Raises ``InvalidInput`` with file and line for what the file may not say, and naming the job: an unknown
-        scenario or recipe, a setting that neither has, what does not fit each other, two jobs with one hash.
+        Raises ``InvalidInput`` with file, line and job for invalid content: an unknown scenario or recipe, an unknown
+        setting, parts that do not fit together, or two jobs with the same hash.
         """
         file = SweepFile.read_as(path, "scaling", "with a grid or a list of jobs")
         if not 1 <= file.size() <= MOST_JOBS:
@@ -254,26 +264,36 @@ class SweepPlan:
 
     @staticmethod
     def folder(path: Path) -> StudyFolder:
-        """The folder of a sweep; its jobs know by themselves what they are."""
+        """Return the object that checks and locks the folder ``path`` of a sweep.
+
+        The folder itself stores no settings, because each job's folder stores the settings of its training.
+        """
         return StudyFolder(path, "a sweep", writes=(TABLE, FAILURES))
 
     @staticmethod
     def job(row: Row, path: Path) -> TrainingJob:
-        """The training of a row in the folder of a sweep."""
+        """Return the training of the job ``row``, with its folder inside the sweep's folder ``path``."""
         training = Training.of(row.first.recipe, row.first.scenario, seed=row.asked.seed)
         return TrainingJob(training, path / RUNS / row.name, row.asked.settings)
 
     def train(self, row: Row, path: Path) -> None:
-        """Bring the training of a row to its end."""
+        """Bring the training of the job ``row`` in the sweep's folder ``path`` to its end, from where it stopped."""
         finish(self.job(row, path))
 
     def results(self, path: Path) -> dict[str, dict[str, Any]]:
-        """``HARM`` and ``FIGURES`` of each job that is done, by its name."""
+        """Return the results of each finished job in the sweep's folder ``path``, by the job's name.
+
+        A result holds the figures of the training by name (``figures.FIGURES``, and ``harm`` of the kept policy), as
+        in ``{"ppo-seed0": {"harm": 7.1, "steps": 400000, ...}}``.
+        """
         jobs = ((row.name, self.job(row, path)) for row in self.rows)
         return {name: final_figures(job) for name, job in jobs if is_done(job)}
 
     def states(self, path: Path) -> list[dict[str, Any]]:
-        """Every job and its state: new, begun or finished."""
+        """Return one object for each job: ``hash``, ``job`` (name), ``set`` (settings) and ``state``.
+
+        The state is ``new``, ``begun`` or ``finished``. ``path`` is the sweep's folder.
+        """
         done = self.results(path)
         return [
             {
@@ -288,16 +308,16 @@ class SweepPlan:
     def run(
         self, path: Path, *, jobs: int | None = None, ray: str = LOCAL, retries: int = 2, tell: OnProgress | None = None
     ) -> SweepResult:
-        """Do what is left of a sweep and write its tables, after Ctrl-C too.
+        """Run the remaining jobs of a sweep and write its tables, also after Ctrl-C.
 
         Args:
-            path: the folder of everything; made if it is not there.
-            jobs: at once; None: one for each core.
-            ray: address of a Ray cluster; ``local``: this machine alone.
+            path: folder of all results; created if needed.
+            jobs: number of jobs at once; None: one for each core.
+            ray: address of a Ray cluster; ``local``: only this machine.
             retries: further attempts at a job whose process was lost.
-            tell: hears how many jobs have ended, and why some failed.
+            tell: called with the number of ended jobs, and reasons of failures.
 
-        Raises ``InvalidInput`` where another process works in the folder, or where there is no cluster.
+        Raises ``InvalidInput`` if another process works in the folder, or if there is no cluster.
 
         """
         with self.folder(path).work():
@@ -336,7 +356,10 @@ class SweepPlan:
     def _train(
         self, left: list[int], path: Path, jobs: int | None, ray: str, retries: int, tell: OnProgress | None
     ) -> dict[str, str]:
-        """Train the jobs of these numbers; why some failed, by name."""
+        """Train jobs on Ray, and return the reason of each failed job, by its name.
+
+        ``left`` holds the numbers of the jobs in ``rows``; the other arguments are those of ``run``.
+        """
         with connected(ray, jobs):
             from ray import tune
 
@@ -352,25 +375,32 @@ class SweepPlan:
                 retries=retries,
                 told=Told("sweep", len(self.rows) - len(left), len(self.rows), tell),
             )
-        named = zip(left, ends, strict=False)  # after Ctrl-C some have not begun
+        named = zip(left, ends, strict=False)  # fewer ends than jobs after Ctrl-C
         return {self.rows[number].name: end[REASON] for number, end in named if REASON in end}
 
 
 @dataclass(frozen=True, slots=True)
 class SweepResult:
-    """What a sweep left behind."""
+    """Numbers of jobs after a run of a sweep, and the file of its table."""
 
-    table: Path
-    jobs: int
-    finished: int
-    failed: int
+    table: Path  # CSV file with a row for each finished job
+    jobs: int  # number of all jobs
+    finished: int  # number of jobs that have finished, including earlier runs
+    failed: int  # number of jobs that failed in this run
 
     @property
     def interrupted(self) -> bool:
-        """Whether some jobs did not come to an end."""
+        """Whether some jobs neither finished nor failed, because Ctrl-C stopped the run."""
         return self.finished + self.failed < self.jobs
 
 
 def do_job(config: dict[str, Any], plan: SweepPlan, path: Path) -> None:
-    """Train one job, in a process of its own."""
+    """Train one job, in a worker process of Ray.
+
+    Args:
+        config: ``{"job": number}`` with the job's number in ``plan.rows``.
+        plan: the sweep.
+        path: folder of the sweep.
+
+    """
     plan.train(plan.rows[config["job"]], path)

@@ -1,4 +1,4 @@
-"""Trainings of a study: a finished one is kept, one that was begun goes on; several at a time; and what they cost."""
+"""Trainings of a study: finished ones are kept, unfinished ones continue, several at a time; and their cost."""
 
 from __future__ import annotations
 
@@ -26,10 +26,18 @@ if TYPE_CHECKING:
 
 
 def train_all(trainings: Sequence[TrainingJob], jobs: int = 1, tell: OnProgress | None = None) -> bool:
-    """Bring every training to its end, ``jobs`` at a time; False when Ctrl-C stopped one.
+    """Bring every training to its end, from where it stopped. Return False if Ctrl-C stopped one.
 
-    The policies do not depend on ``jobs`` or on interruptions. Raises, before any is begun, what ``steps_left`` raises,
-    and what the first training raises that fails.
+    The policies do not depend on ``jobs`` or on interruptions.
+
+    Args:
+        trainings: trainings with their folders.
+        jobs: number of trainings at once, one process each.
+        tell: called with the progress; None: silent.
+
+    Raises the exceptions of ``steps_left`` before any training begins, and the exception of the first training that
+    fails.
+
     """
     left = [training for training in trainings if training.steps_left()]
     if jobs == 1 or len(left) < 2:
@@ -45,19 +53,22 @@ def train_all(trainings: Sequence[TrainingJob], jobs: int = 1, tell: OnProgress 
 
 @dataclass(frozen=True, slots=True)
 class TrainingJob:
-    """A training and its folder."""
+    """A training of a study, and the folder in which it runs."""
 
-    training: Training
-    folder: Path
-    noted: tuple[str, ...] = ()  # by which scenario and recipe differ from their files, for ``config.json``
+    training: Training  # recipe and scenario
+    folder: Path  # folder of the run; it need not exist yet
+    noted: tuple[str, ...] = ()  # how scenario and recipe differ from their files, ``KEY=VALUE``, for ``config.json``
 
     @property
     def per_update(self) -> int:
-        """Decisions of all learners between two updates."""
+        """Number of decisions of all learners together between two updates."""
         return self.training.recipe.n_envs * len(self.training.scenario.learners) * self.training.recipe.rounds
 
     def steps_left(self) -> int:
-        """Decisions that are still to do; raises ``InvalidInput`` for a folder that holds another training."""
+        """Return the number of decisions until the end of the training; 0 if it has finished.
+
+        Raises ``InvalidInput`` if the folder holds another training.
+        """
         run, total = RunDirectory(self.folder), self.training.recipe.total_steps
         if not run.status.exists():
             if self.folder.exists():
@@ -74,9 +85,14 @@ class TrainingJob:
         return max(total - (steps if isinstance(steps, int) else 0), 1)
 
     def finish(self, tell: OnProgress | None = None, *, stop_at: StopAt | None = None) -> bool | None:
-        """Bring it to its end; None where it was stopped before, by ``stop_at`` too, as ``train`` has it.
+        """Bring the training to its end, from where it stopped. Return True, or None if it was stopped early.
 
-        Raises what ``train`` and ``resume`` raise.
+        Args:
+            tell: called with the progress; None: silent.
+            stop_at: takes each evaluation, and returns a reason to stop, or None.
+
+        Raises the exceptions of ``train`` and ``resume``.
+
         """
         from ethbrake_marl.training.session import resume, train  # torch takes seconds to load
 
@@ -97,7 +113,10 @@ class TrainingJob:
         return True if ended.status == "finished" else None
 
     def time(self, sample: Sample | None = None) -> Timed:
-        """Time a few updates, and the policy on the first worlds of ``sample``; None: of the recipe's list."""
+        """Measure the speed of this training: of a few updates, and of its policy on 50 worlds.
+
+        ``sample``: worlds for the policy; None: the first ones of the list on which the recipe evaluates.
+        """
         from ethbrake_marl.training.session import train
 
         told: list[Progress] = []
@@ -105,7 +124,7 @@ class TrainingJob:
         short = recipe.replace(evaluation={**recipe.evaluation.model_dump(), "worlds": 10, "every_updates": 1000})
         with tempfile.TemporaryDirectory(prefix="ethbrake-") as folder:
             path = Path(folder) / "timed"
-            train(short, scenario, path, steps=1)  # compiles and warms up
+            train(short, scenario, path, steps=1)  # to compile and warm up
             train(short, scenario, path, steps=4 * self.per_update, force=True, on_progress=told.append)
             updates = [one for one in told if one.updates >= 1]
             last = updates[-1]
@@ -115,23 +134,23 @@ class TrainingJob:
             return Timed(self, decision_s, replace(self, folder=path).world_seconds(worlds))
 
     def world_seconds(self, sample: Sample) -> float:
-        """Seconds per world that its team drives."""
+        """Return the seconds that the trained policies need to drive one of the worlds of ``sample``."""
         team = {"team": load_team(self.folder, self.training.scenario)}
         drive = partial(evaluate, agents=team, scenario=self.training.scenario, aftermath=False)
         return Timed.each_s(sample.worlds, drive)
 
 
 class Timed(NamedTuple):
-    """Seconds of one core, by the clock, that a training takes."""
+    """Measured speed of a training on one core, by the wall clock."""
 
-    job: TrainingJob
-    decision_s: float  # of a learner, its share of the learning included
-    world_s: float  # that the policy drives
+    job: TrainingJob  # the measured training
+    decision_s: float  # seconds per decision of a learner, including its share of the learning
+    world_s: float  # seconds per world when its policies are evaluated
 
     def seconds(self, steps: int) -> float:
-        """Of ``steps`` decisions, of as many trainings as they make, with what is measured on the way.
+        """Return the estimated seconds for ``steps`` decisions of such trainings, including their evaluations.
 
-        A training measures its policies on the fixed list at first, now and then, and at the end.
+        A training evaluates its policies on the recipe's fixed list at the start, every few updates, and at the end.
         """
         recipe = self.job.training.recipe
         times = recipe.total_steps // self.job.per_update // recipe.evaluation.every_updates + 2
@@ -139,7 +158,10 @@ class Timed(NamedTuple):
 
     @staticmethod
     def each_s(worlds: Worlds, work: Callable[[Worlds], object], most: int = 50) -> float:
-        """Seconds per world of some work on at most so many, which one world has done before: it compiles."""
+        """Measure and return the seconds per world of ``work(worlds)``, on at most ``most`` of these worlds.
+
+        One world runs first, so that compilation is not timed.
+        """
         work(worlds.take([0]))
         some, started = worlds.take(range(min(worlds.n, most))), time.monotonic()
         work(some)
@@ -147,7 +169,7 @@ class Timed(NamedTuple):
 
     @staticmethod
     def in_words(seconds: float) -> str:
-        """Seconds, minutes or hours."""
+        """Return a duration as text in seconds, minutes or hours: ``40 s``, ``12 min``."""
         if seconds < 90.0:
             return f"{seconds:.0f} s"
         return f"{seconds / 60.0:.0f} min" if seconds < 36_000.0 else f"{seconds / 3600.0:.0f} h"

@@ -1,7 +1,7 @@
-"""Many trials on Ray Tune: a core and a thread each, here or on a cluster; one whose process was lost is tried again.
+"""Run many trials on Ray Tune, each with one core and thread; a trial whose process was lost is tried again.
 
-Ray keeps notes about its work as pickles, in a temporary folder that ends with the command. ``Tuner.restore`` would
-load them, and run what a stranger put there, so it is not used: a trial knows from its own folder where it goes on.
+Ray stores its state as pickles in a temporary folder that ends with the command. ``Tuner.restore`` is not used, because
+it would load pickles that a stranger may have written. Instead, a trial continues from its own folder.
 """
 
 from __future__ import annotations
@@ -33,19 +33,22 @@ def run_trials(
     retries: int,
     told: Told,
 ) -> list[dict[str, Any]]:
-    """The last report of each trial that began, in order; Ctrl-C ends all of them early. Ray must be connected.
+    """Run trials on Ray Tune, and return the last report of each trial that began, in order.
 
-    One that came to its end has ``done``, one that failed a ``REASON``.
+    A report is the dictionary that ``work`` passed to ``tune.report``, with Ray's own entries. Its entry ``reason``
+    says why a trial failed; ``done`` is true if Ray has ended the trial. Ctrl-C ends all trials early. Ray must be
+    connected (see ``cluster.connected``).
 
     Args:
-        work: is called as ``work(config, **given)`` in a worker process, and reports with ``tune.report``.
-        given: the same for all trials.
-        folder: of everything; every computer of a cluster must see it.
-        config: what Ray Tune searches, and how.
-        space: of the trials.
-        jobs: trials at once; None: as many as there are cores.
-        retries: further attempts at a trial whose process was lost, or that failed by no error of this package.
-        told: hears of the ends.
+        work: called as ``work(config, **given)`` in a worker process; reports with ``tune.report``.
+        given: arguments that are the same for all trials.
+        folder: folder of all results; every computer of a cluster must see it.
+        config: Ray Tune's settings: search algorithm, scheduler and number of trials.
+        space: Ray Tune's space of configurations: key -> values.
+        jobs: trials at once; None: one for each core.
+        retries: further attempts at a trial whose process was lost, or that failed with an error from outside this
+            package.
+        told: callback that reports ended trials.
 
     """
     config.max_concurrent_trials, config.reuse_actors = jobs, True
@@ -73,7 +76,10 @@ def run_trials(
 
 
 def _attempt(config: dict[str, Any], work: Callable[..., None], given: Mapping[str, Any], folder: Path) -> None:
-    """One attempt at a trial. An error of this package would come again, so Ray is not to try again."""
+    """Run one attempt at a trial with the configuration ``config``; arguments as in ``run_trials``.
+
+    Errors of this package are reported, not raised, so that Ray does not try again.
+    """
     try:
         if not folder.is_dir():
             raise InvalidInput(f"{folder}: is not there on {os.uname().nodename}; every computer must see this folder")
@@ -83,29 +89,37 @@ def _attempt(config: dict[str, Any], work: Callable[..., None], given: Mapping[s
 
 
 class Told(tune.Callback):  # type: ignore[misc]  # Ray ships no types
-    """Tells how many trials have ended, and why some failed."""
+    """Callback of Ray Tune that reports how many trials have ended, and why some failed.
+
+    Args:
+        name: name of the study, for the progress.
+        done: number of trials that had ended before.
+        total: number of all trials.
+        tell: called with a ``Progress``; None: silent.
+
+    """
 
     def __init__(self, name: str, done: int, total: int, tell: OnProgress | None) -> None:
         self._name, self._done, self._total, self._tell = name, done, total, tell or (lambda progress: None)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Nothing: Ray's notes are not read."""
+        """Return an empty state for Ray to store, because it is never read."""
         return {}
 
     def say(self, note: str = "") -> None:
-        """Tell how many have ended, with a note."""
+        """Report how many trials have ended, with ``note`` as a message to print once."""
         self._tell(Progress(self._name, self._done, self._total, note=note))
 
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """A trial came to its end, or cannot be done."""
+        """Count a trial that ended, or that cannot succeed, and report why; Ray calls this method."""
         self._done += 1
         self.say(str(trial.last_result.get(REASON, "")))
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """A trial was tried often enough."""
+        """Count a trial that has failed after all its attempts; Ray calls this method."""
         self._done += 1
         self.say("a process was lost or failed, too often: the table says why")
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """A trial is tried again."""
+        """Report that a trial is tried again; Ray calls this method."""
         self.say("a process was lost or failed: tried again")

@@ -1,7 +1,7 @@
-"""A tuning: the settings of a recipe that do least harm, searched by Optuna on Ray Tune, and one table of the trials.
+"""A tuning: search the settings of a recipe for the least harm with Optuna on Ray Tune, with one table of the trials.
 
-No time and no place stands in the table: with one job at once it is the same, byte for byte, however often the search
-was stopped.
+The table holds no time or place: with one job at once it is the same, byte for byte, however often the search was
+interrupted.
 """
 
 from __future__ import annotations
@@ -58,7 +58,10 @@ _Count = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
 def _check_number(value: Any) -> int | float:
-    """A whole number stays one: it says that whole numbers alone are tried."""
+    """Return ``value`` unchanged if it is a finite number, else raise ``ValueError``.
+
+    A whole number stays an ``int``, which limits the search to whole numbers.
+    """
     if not isinstance(value, int | float) or isinstance(value, bool):
         raise ValueError("must be a number")
     if not math.isfinite(value):
@@ -70,20 +73,23 @@ _Number = Annotated[int | float, PlainValidator(_check_number), WithJsonSchema({
 
 
 class Range(FileModel):
-    """From ``low`` to ``high``, both included; whole numbers where both are written without a point."""
+    """Numbers that a search may try for one setting: a range from ``low`` to ``high``, both included.
+
+    If both ends are written without a point, only whole numbers are tried.
+    """
 
     low: _Number = Field(description="the least value, included")
     high: _Number = Field(description="the largest value, included; with low: whole numbers where neither has a point")
     log: bool = Field(default=False, description="the logarithm is searched, not the number")
 
     def __str__(self) -> str:
-        """The range in words."""
+        """Return the range in words: ``from 0.001 to 0.1, by its logarithm``."""
         kind = ", whole" * self.whole + ", by its logarithm" * self.log
         return f"from {flow_text(self.low)} to {flow_text(self.high)}{kind}"
 
     @property
     def whole(self) -> bool:
-        """Whether whole numbers alone are tried."""
+        """Whether only whole numbers are tried: both ends are written without a point."""
         return isinstance(self.low, int) and isinstance(self.high, int)
 
     @model_validator(mode="after")
@@ -96,11 +102,11 @@ class Range(FileModel):
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """The values that are tried before anything starts."""
+        """Both ends of the range; the recipe must allow them, which is checked before the search starts."""
         return self.low, self.high
 
     def own(self, value: Any) -> int | float | None:
-        """A recipe's value as it would be tried; None where it is not in the range."""
+        """Return ``value``, a recipe's own value of this setting, as a number of the range; None if it is not in it."""
         if not isinstance(value, int | float) or isinstance(value, bool) or not self.low <= value <= self.high:
             return None
         if not self.whole:
@@ -108,7 +114,7 @@ class Range(FileModel):
         return int(value) if value == int(value) else None
 
     def distribution(self) -> BaseDistribution:
-        """The same for Optuna."""
+        """Return Optuna's distribution from which values of this range are proposed."""
         from optuna.distributions import FloatDistribution, IntDistribution
 
         if self.whole:
@@ -116,19 +122,19 @@ class Range(FileModel):
         return FloatDistribution(float(self.low), float(self.high), log=self.log)
 
     def stored(self, value: Any) -> Any:
-        """A value as Optuna has it: as it is."""
+        """Return a value as Optuna stores it; for a range, this is the value itself."""
         return value
 
     value = stored
 
 
 class Choices(FileModel):
-    """One of a list of values, of any kind."""
+    """Values that a search may try for one setting: a list of values of any kind."""
 
     choices: tuple[Any, ...] = Field(strict=False, min_length=2, description="values of any kind that the recipe takes")
 
     def __str__(self) -> str:
-        """The values in words."""
+        """Return the values in words: ``one of relu, tanh``."""
         return f"one of {', '.join(map(flow_text, self.choices))}"
 
     @model_validator(mode="after")
@@ -141,25 +147,25 @@ class Choices(FileModel):
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """The values that are tried before anything starts."""
+        """All choices; the recipe must allow them, which is checked before the search starts."""
         return self.choices
 
     def own(self, value: Any) -> Any:
-        """A recipe's value as it would be tried; None where it is no choice."""
+        """Return the choice that equals a recipe's own value of this setting; None if it is not one of the choices."""
         return next((each for each in self.choices if flow_text(each) == flow_text(value)), None)
 
     def distribution(self) -> BaseDistribution:
-        """The same for Optuna."""
+        """Return Optuna's distribution from which choices, as texts, are proposed."""
         from optuna.distributions import CategoricalDistribution
 
         return CategoricalDistribution([*map(flow_text, self.choices)])
 
     def stored(self, value: Any) -> str:
-        """A value as Optuna has it: its text, for Optuna chooses among no lists."""
+        """Return a value as Optuna stores it: as text, because Optuna's choices cannot be lists."""
         return flow_text(value)
 
     def value(self, stored: Any) -> Any:
-        """What Optuna has as a value."""
+        """Return the choice that Optuna stores as the text ``stored``."""
         return {flow_text(value): value for value in self.choices}[stored]
 
 
@@ -178,42 +184,53 @@ def _check_recipe_keys(value: dict[str, Any]) -> dict[str, Any]:
 
 
 class Measuring(FileModel):
-    """The list by which trials are judged and pruned, and how often in a training."""
+    """How trials are judged: the list of worlds on which their policies are evaluated, and how often in a training."""
 
+    # Number of worlds of the list.
     worlds: int = Field(default=1000, ge=1, le=1_000_000, description="of the list")
+    # Seed from which these worlds are drawn.
     seed: Seed = Field(default=4007, description="of the list")
+    # Number of evaluations in the course of a training.
     times: int = Field(default=10, ge=1, le=1000, description="how often a training is measured")
 
 
 class Pruning(FileModel):
-    """A trial stops whose least harm so far is above the median of the others' means until then (Ray's median rule)."""
+    """Rule that stops weak trials early (Ray's median stopping rule).
 
+    A trial (one training) stops if its least harm so far is above the median of the other trials' mean harm up to the
+    same evaluation.
+    """
+
+    # Least number of other trials that must have reached the same evaluation before a trial may be stopped.
     after_trials: _Count = Field(default=5, description="so many others must have come as far before one is stopped")
+    # Number of evaluations, apart from that before the training, that every trial is allowed to make.
     after_times: _Count = Field(default=3, description="nobody is stopped before it was measured so often")
 
     def rule(self) -> TrialScheduler:
-        """The same for Ray Tune."""
+        """Return Ray Tune's scheduler that applies this rule."""
         from ray.tune.schedulers import MedianStoppingRule
 
         return MedianStoppingRule(
             "training_iteration",
             HARM,
             "min",
-            grace_period=self.after_times + 1,  # the first is that of an untrained policy
+            grace_period=self.after_times + 1,  # the first evaluation is of an untrained policy
             min_samples_required=self.after_trials,
             min_time_slice=math.inf,  # no trial waits for others
         )
 
 
 class Sampling(FileModel):
-    """Who proposes: Optuna's TPE, or chance."""
+    """How the values of the next trial are chosen: by Optuna's TPE from the results of earlier trials, or at random."""
 
     name: Literal["tpe", "random"] = Field(default="tpe", description="Optuna's TPE, or chance")
+    # Seed of the proposed values.
     seed: Seed = Field(default=0, description="of what is proposed")
+    # Number of first trials with random values, before TPE chooses.
     random_trials: _Count = Field(default=10, description="trials by chance before TPE begins")
 
     def of_trial(self, number: int) -> BaseSampler:
-        """The same for Optuna, for one trial."""
+        """Return the Optuna sampler that proposes the values of trial ``number``; its seed depends on the number."""
         from optuna.samplers import RandomSampler, TPESampler
 
         seed = int(np.random.SeedSequence([self.seed, number]).generate_state(1)[0])
@@ -223,7 +240,7 @@ class Sampling(FileModel):
 
 
 class TuningFile(StudyFile):
-    """The whole file."""
+    """Content of the YAML file of a tuning: a training, and the settings of its recipe to search for the least harm."""
 
     scenario: str = Field(description="a name or a path, as train --scenario")
     recipe: str = Field(description="a name or a path, as train --recipe")
@@ -239,15 +256,18 @@ class TuningFile(StudyFile):
     sampler: Sampling = Field(default=Sampling(), description="who proposes")
 
     def values(self, proposal: Mapping[str, Any]) -> dict[str, Any]:
-        """What Optuna proposes, as YAML has it."""
+        """Return the values of a proposal as in a YAML file: key -> value.
+
+        ``proposal`` maps each searched key to its value as Optuna stores it.
+        """
         return {key: self.search[key].value(value) for key, value in proposal.items()}
 
     def space(self) -> dict[str, BaseDistribution]:
-        """The space for Optuna."""
+        """Return key -> Optuna's distribution of its values, for each searched key."""
         return {key: dimension.distribution() for key, dimension in self.search.items()}
 
     def points(self, number: int) -> Iterator[dict[str, Any]]:
-        """Points of the space by chance, the same ones each time."""
+        """Return ``number`` random points of the space, each as key -> value; the same ones each time."""
         with naming_extras():
             import optuna
         optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -256,9 +276,9 @@ class TuningFile(StudyFile):
         return (self.values(study.ask(space).params) for _ in range(number))
 
 
-Values = Mapping[str, Any]  # of a trial: key -> value, as YAML has it
+Values = Mapping[str, Any]  # values of a trial: key -> value in YAML's form
 
-_NOT_SEARCHED = {  # key -> why; what is inside it, too
+_NOT_SEARCHED = {  # key -> reason; also holds for keys inside it
     "seed": "a seed is luck; give one for all trials, as seed",
     "evaluation": "trials are judged on one list; give it as measure",
     "algorithm": "each algorithm has a recipe of its own; tune one at a time",
@@ -269,31 +289,31 @@ _NOT_SEARCHED = {  # key -> why; what is inside it, too
 
 PRUNED = "pruned: too much harm for so many decisions"
 
-_TRIED = 200  # points of the space that are checked before anything starts
+_TRIED = 200  # random points of the space that are checked before the search starts
 
-TABLE, TRIALS, PROPOSALS = "trials.csv", "trials", "proposals.json"  # inside the folder
+TABLE, TRIALS, PROPOSALS = "trials.csv", "trials", "proposals.json"  # names inside the folder
 
 
 @dataclass(frozen=True)
 class TuningPlan:
-    """What every trial has in common."""
+    """A tuning, checked and loaded: everything that its trials have in common."""
 
-    file: TuningFile
-    recipe: TrainingRecipe  # with the file's settings, its seed and its list
-    scenario: Scenario
-    question: Mapping[str, Any]  # all that makes a trial's harm what it is, versions included
+    file: TuningFile  # content of the tuning's file
+    recipe: TrainingRecipe  # recipe with the file's settings and seed, before any searched value
+    scenario: Scenario  # scenario with the file's settings
+    question: Mapping[str, Any]  # all settings and versions that a trial's harm depends on, as plain data
 
     @staticmethod
     def json_schema() -> dict[str, Any]:
-        """JSON Schema of the file of a tuning, for editors that complete and check YAML."""
+        """Return the JSON Schema of a tuning's file, for editors that complete and check YAML."""
         return FileSchema.publish({**TuningFile.model_json_schema(), "title": "Tuning"})
 
     @classmethod
     def read(cls, path: str | Path) -> TuningPlan:
-        """Read the file of a tuning, resolve it and try its space.
+        """Read the file of a tuning, load its parts and check its space.
 
-        Raises ``InvalidInput`` with file and line: an unknown scenario or recipe, a key that the recipe does not have
-        or that is not to be searched, a value that it does not allow, values that do not go together.
+        Raises ``InvalidInput`` with file and line for: an unknown scenario or recipe, a key that the recipe does not
+        have or that may not be searched, a value that the recipe does not allow, and values that do not go together.
         """
         file = TuningFile.read_as(path, "tuning", "with scenario, recipe and search")
         at = file._document.refusing_at
@@ -336,9 +356,10 @@ class TuningPlan:
         return plan
 
     def training(self, values: Values) -> Training:
-        """The training of a trial, measured so often that all trials can be compared on the way.
+        """Return the training of a trial with these values of the searched keys.
 
-        Raises ``InvalidInput`` where the values do not go together.
+        It is evaluated as often as the file's ``measure.times`` says, so that all trials can be compared on the way.
+        Raises ``InvalidInput`` if the values do not go together.
         """
         recipe = read_settings(texts_of(values), [self.recipe]).change(self.recipe)
         asked = self.file.measure
@@ -347,19 +368,19 @@ class TuningPlan:
         return Training.of(recipe.replace(evaluation=listed), self.scenario)
 
     def updates(self, recipe: TrainingRecipe) -> int:
-        """Updates of a whole training."""
+        """Return the number of updates of a whole training by this recipe."""
         return -(-recipe.total_steps // (recipe.n_envs * len(self.scenario.learners) * recipe.rounds))
 
     def own_values(self) -> dict[str, Any] | None:
-        """The values that the recipe has, None where one of them is not in the space."""
+        """Return the recipe's own value of each searched key; None if one of them is not in the space."""
         content = self.recipe.model_dump(mode="json")
         own = {key: dimension.own(_value_at(content, key)) for key, dimension in self.file.search.items()}
         return None if None in own.values() else own
 
     def example(self) -> str:
-        """The command line that trains what a trial trains: the first one, where the space holds the recipe's values.
+        """Return a command line ``ethbrake train ...`` that trains the same as one of the trials.
 
-        Else one with values of the space by chance.
+        It is the first trial if the space contains the recipe's own values, else one with random values.
         """
         values = self.own_values() or next(self.file.points(1))
         measured = {"evaluation": self.training(values).recipe.evaluation.model_dump(mode="json")}
@@ -375,7 +396,7 @@ class TuningPlan:
             try:
                 self.training({key: math.nextafter(dimension.low, math.inf)})
             except InvalidInput:
-                written = f"{{low: {dimension.low!r}, high: {dimension.high!r}}}"  # with the points that make it wrong
+                written = f"{{low: {dimension.low!r}, high: {dimension.high!r}}}"  # as written, with decimal points
                 right = "must be whole numbers, written without a decimal point"
                 raise InvalidInput(f"search.{key} = {written}: {right}") from None
         for value in dimension.ends:
@@ -388,11 +409,14 @@ class TuningPlan:
             raise InvalidInput(f"search, at {', '.join(texts_of(values))}: {error}") from None
 
     def folder(self, path: Path) -> StudyFolder:
-        """The folder, which no other tuning may have."""
+        """Return the object that checks and locks the folder ``path``, which may belong to this tuning only."""
         return StudyFolder(path, "a tuning", self.question, record="tuning.json", writes=(TABLE,))
 
     def proposals(self, path: Path) -> list[Values]:
-        """What was proposed in a folder, as Optuna has it; raises ``InvalidInput`` unless it is all in the space."""
+        """Return the proposals (values of each trial so far) in the tuning's folder ``path``, as Optuna stores them.
+
+        Raises ``InvalidInput`` if one has other keys or values than the file's ``search`` allows.
+        """
         file, space = path / PROPOSALS, self.file.search
         if not file.exists():
             return []
@@ -407,7 +431,10 @@ class TuningPlan:
         return [*known]
 
     def job(self, values: Values, path: Path) -> TrainingJob:
-        """The training of a trial in the folder of a tuning; equal trials are one training."""
+        """Return the training of a trial with these values, with its folder inside the tuning's folder ``path``.
+
+        Trials with equal values share one training.
+        """
         training = self.training(values)
         return TrainingJob(training, path / TRIALS / training.identity[:16], texts_of({**self.file.settings, **values}))
 
@@ -421,20 +448,20 @@ class TuningPlan:
         retries: int = 2,
         tell: OnProgress | None = None,
     ) -> TuningResult:
-        """Bring the trials of a folder to so many, and write their table, after Ctrl-C too.
+        """Run trials until the folder has ``trials`` of them, and write their table, also after Ctrl-C.
 
-        The search begins anew each time, with what was proposed before; a training that is done is answered from its
-        folder, and one that was stopped goes on.
+        The search starts over each time with the stored proposals: a finished training is read from its folder, and an
+        unfinished one continues.
 
         Args:
-            path: the folder of everything; made if it is not there.
-            trials: that this folder shall have altogether.
-            jobs: trials at once; more than one change what is proposed.
-            ray: address of a Ray cluster; ``local``: this machine alone.
+            path: folder of all results; created if needed.
+            trials: number of trials that the folder has at the end.
+            jobs: trials at once; more than one changes the proposals.
+            ray: address of a Ray cluster; ``local``: only this machine.
             retries: further attempts at a trial whose process was lost.
-            tell: hears how many trials have ended, and why some failed.
+            tell: called with the number of ended trials, and reasons of failures.
 
-        Raises ``InvalidInput`` where another process works in the folder, for a damaged file, or without the cluster.
+        Raises ``InvalidInput`` if another process works in the folder, for a damaged file, or if there is no cluster.
 
         """
         with self.folder(path).work():
@@ -466,7 +493,10 @@ class TuningPlan:
     def _search(
         self, path: Path, known: list[Values], trials: int, jobs: int, retries: int, tell: OnProgress | None
     ) -> tuple[list[Values], list[dict[str, Any]]]:
-        """What was proposed, and how each trial of these ended."""
+        """Run the trials on Ray, and return all proposals and the last report of each of their trials.
+
+        ``known`` are the proposals of earlier runs; the other arguments are those of ``run``.
+        """
         from ray import tune
 
         from ethbrake_marl.extensions.studies.proposals import Proposals
@@ -494,9 +524,15 @@ class TuningPlan:
         return search.known, ends
 
     def best_recipe(self, values: Values, file: Path, source: str) -> str:
-        """The text of a recipe that trains what the trial with these values trained, named as its file.
+        """Return the YAML text of a recipe that repeats the training with these values.
 
-        Raises ``InvalidInput`` for a file whose name cannot be a recipe's.
+        Args:
+            values: value of each searched key.
+            file: path that the text will be written to; its name becomes the recipe's.
+            source: text for the recipe's key ``source``.
+
+        Raises ``InvalidInput`` if the file's name is not a valid name of a recipe.
+
         """
         check_file_name("recipe", file.stem)
         described = f"Settings of {self.file.recipe} that `ethbrake study tune` found."
@@ -504,7 +540,7 @@ class TuningPlan:
             name=file.stem, title=self.file.title, description=described, source=source
         )
         parts = {*type(self.recipe).model_fields, "recipe"}
-        of_scenario = {  # no recipe has these
+        of_scenario = {  # settings of the scenario, which a recipe does not have
             key: value
             for key, value in self.file.settings.items()
             if key.startswith("scenario.") or key.partition(".")[0] not in parts
@@ -514,7 +550,7 @@ class TuningPlan:
         return recipe.text(f"# The best trial of a tuning, trained again: {command}\n")
 
     def has_exported(self, path: Path, file: Path) -> bool:
-        """Whether a file is what the tuning in this folder exported: the recipe of one of its trials."""
+        """Return whether ``file`` is the exported recipe of one of the trials in the tuning's folder ``path``."""
         try:
             source, text = load_recipe(file).source, file.read_text("utf-8")
         except InvalidInput:
@@ -528,18 +564,18 @@ State = Literal["running", "finished", "pruned", "failed"]
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """How a trial ended."""
+    """One trial of a tuning (a training with some values of the searched keys), and how it ended."""
 
-    number: int  # from 0
-    state: State
-    values: Values
-    harm: float | None  # m2/s2 on the tuning's list, of a finished one
-    figures: Mapping[str, Any]  # those of a pruned one say how it stood when it stopped
-    reason: str  # why it failed
+    number: int  # number of the trial, from 0
+    state: State  # how it ended; ``pruned``: stopped early because of too much harm
+    values: Values  # value of each searched key
+    harm: float | None  # harm of its best policy on the tuning's list (m2/s2); None unless finished
+    figures: Mapping[str, Any]  # entries for the table (``FIGURES``) at its end, or when it was pruned
+    reason: str  # reason of a failure; else empty
 
     @classmethod
     def of(cls, number: int, values: Values, end: Mapping[str, Any]) -> Trial:
-        """From the last report of the trial."""
+        """Return the trial ``number`` with these values, from its last report ``end`` (see ``run_trials``)."""
         reason = str(end.get(REASON, ""))
         state: State = "running"
         if reason:
@@ -552,31 +588,40 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class TuningResult:
-    """What a tuning left behind."""
+    """Trials after a run of a tuning, and the file of their table."""
 
-    table: Path
-    asked: int
-    trials: tuple[Trial, ...]
+    table: Path  # CSV file with a row for each trial that ended
+    asked: int  # number of trials that the folder should have at the end
+    trials: tuple[Trial, ...]  # trials that were begun, in order
 
     @property
     def counts(self) -> Counter[State]:
-        """How many trials ended in which way."""
+        """State (``finished``, ``pruned``, ...) -> number of trials in it."""
         return Counter(each.state for each in self.trials)
 
     @property
     def interrupted(self) -> bool:
-        """Whether some trials did not come to an end."""
+        """Whether some of the requested trials did not end, because Ctrl-C stopped the run."""
         return len(self.trials) < self.asked or "running" in self.counts
 
     @property
     def best(self) -> Trial | None:
-        """The finished trial of least harm, of equals the first; None where none has finished."""
+        """The finished trial with the least harm; of equal ones the first. None if no trial has finished."""
         finished = [each for each in self.trials if each.harm is not None]
         return min(finished, key=lambda each: (each.harm, each.number), default=None)
 
 
 def do_trial(config: dict[str, Any], plan: TuningPlan, path: Path) -> None:
-    """Train to the end and report every evaluation; Ray ends it there where the trial is pruned."""
+    """Train one trial to its end, in a worker process of Ray, and report every evaluation.
+
+    Ray stops a pruned trial at such a report.
+
+    Args:
+        config: ``{"trial": number, "values": proposal}``, values as Optuna stores them.
+        plan: the tuning.
+        path: folder of the tuning.
+
+    """
     from ray.tune import report
 
     job = plan.job(plan.file.values(config["values"]), path)
@@ -585,7 +630,7 @@ def do_trial(config: dict[str, Any], plan: TuningPlan, path: Path) -> None:
 
     def judge(evaluation: Evaluation) -> None:
         if evaluations and evaluation["steps"] <= evaluations[-1]["steps"]:
-            return  # measured again, after a stop
+            return  # the same evaluation again, after an interruption
         evaluations.append(evaluation)
         if evaluation["steps"] < last:
             report(figures(job, evaluations))
@@ -593,7 +638,7 @@ def do_trial(config: dict[str, Any], plan: TuningPlan, path: Path) -> None:
     def stop_at(evaluation: Evaluation) -> str | None:
         try:
             judge(evaluation)
-        except SystemExit:  # how Ray ends a trial: the training is to close its folder first
+        except SystemExit:  # Ray's way to end a trial; first let the training close its folder
             return PRUNED
         return None
 
@@ -619,7 +664,7 @@ def _check_searched(key: str, recipe: TrainingRecipe, file: TuningFile) -> None:
 
 
 def _value_at(content: Any, key: str) -> Any:
-    """What stands at a dotted key; None where nothing does."""
+    """Return the value at a dotted key (``network.policy.0``) of the nested data ``content``; None if there is none."""
     for part in key.removeprefix("recipe.").split("."):
         if isinstance(content, list) and part.isdecimal() and int(part) < len(content):
             content = content[int(part)]

@@ -7,7 +7,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.extensions.certified.enclosure import Boxes
 from ethbrake_marl.extensions.certified.estimated_shield import BelievedShield
 from ethbrake_marl.physics.state import Floats

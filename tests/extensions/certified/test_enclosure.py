@@ -240,7 +240,10 @@ def test_engine__with_an_uncertain_own_latency_no_world_of_the_box_is_distrusted
     )
     episodes = drive(uncertainty.draw(told, np.random.default_rng(1)), driver, scenario, 1)
     shield = episodes.guarded.shield
-    assert not shield.distrusted.any() and (episodes.ledger.world_harm("first") <= shield.predicted_harm + 1e-9).all()
+    assert (
+        not shield.memory.distrusted.any()
+        and (episodes.ledger.world_harm("first") <= shield.predicted_harm + 1e-9).all()
+    )
 
 
 def test_bound__more_parts_never_make_it_worse():
@@ -254,18 +257,18 @@ def test_shield__coasting_stays_within_the_bound_in_every_world_of_the_box():
     shield = RobustShield(PAPER, 1, uncertainty=uncertainty, robust="interior")
     shield.begin(worlds, np.arange(2))
     told, kept = [shield.bound.copy()], 0
-    while not shield.running.finished.all():
-        held, going = shield.backup, ~shield.running.finished
+    while not shield.memory.running.finished.all():
+        held, going = shield.memory.backup, ~shield.memory.running.finished
         shield.decide(np.zeros(2))
         told.append(shield.bound.copy())
-        same = going & (shield.backup.plan == held.plan).all(axis=1)
-        assert (shield.backup.harm[same] == held.harm[same]).all()  # not the lower harm of its corners
+        same = going & (shield.memory.backup.plan == held.plan).all(axis=1)
+        assert (shield.memory.backup.harm[same] == held.harm[same]).all()  # not the lower harm of its corners
         kept += same.sum()
     assert (np.diff(told, axis=0) <= 0.0).all() and kept > 10
-    assert (shield.interventions > 0).all() and (shield.interventions < shield.running.steps).any()
+    assert (shield.interventions > 0).all() and (shield.interventions < shield.memory.running.steps).any()
     for k in range(2):
-        harm = harm_inside(PAPER, worlds.take([k]), uncertainty, shield.backup.plan[k], 300)
-        assert harm.max() <= shield.bound[k] <= shield.first_bound[k] < 200.0
+        harm = harm_inside(PAPER, worlds.take([k]), uncertainty, shield.memory.backup.plan[k], 300)
+        assert harm.max() <= shield.bound[k] <= shield.memory.first_bound[k] < 200.0
 
 
 # Where a world drawn from a box leaves the enclosure: its states, not only its harm.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.task import Task
@@ -48,7 +48,7 @@ def test_review__tells_the_harm_of_the_engine_also_where_the_bound_is_not_it(mod
     assert abs(shield.bound - harm).max() > 1.0
     found = review(shield, wavering, worlds)
     assert found.realised.tolist() == harm[found.world].tolist()
-    assert found.trusted.tolist() == (~shield.distrusted[found.world]).tolist()
+    assert found.trusted.tolist() == (~shield.memory.distrusted[found.world]).tolist()
     assert found.trusted.all() == (mode == "robust")
 
 

@@ -8,10 +8,14 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import episode_engine
+from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.evaluation.shield_modes import compare_modes
 from ethbrake_marl.extensions.certified.guards import RobustMode
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
+from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield.drivers import ShieldedDriver
+from tests.evaluation.test_shield_modes import WORLDS
 from tests.shield import test_wrappers as wrappers
 from tests.shield.attacks import line
 from tests.shield.test_guard import PAPER, Counting, asks_once, drives_off, remembering
@@ -79,8 +83,16 @@ def test_world__that_goes_on_after_the_shields_own_end_is_braked_fully():
     engine = episode_engine(worlds, ShieldedDriver(drives_off, PAPER, told=slower, uncertainty="gaps_m=0.02"), PAPER, 1)
     braking, after = -worlds.vehicles.braking_capacity_mps2[:, 1], np.zeros(40, bool)
     while not engine.ended.all():
-        over = engine.guarded.shield.running.finished & ~engine.ended
+        over = engine.guarded.shield.memory.running.finished & ~engine.ended
         engine.step({})
         assert (engine.wanted_mps2[over, 1] == braking[over]).all()
         after |= over
     assert 0 < after.sum() < 40
+
+
+@pytest.mark.parametrize(
+    "spec", ["full_brake+robust", pytest.param("full_brake+robust:interior", marks=pytest.mark.slow)]
+)
+def test_behind_shields__those_that_do_not_know_the_world_are_left_out(spec: str) -> None:
+    agent = make_agent(spec, scenario=PAPER, uncertainty="gaps_m=0.5")
+    assert compare_modes({spec: agent}, WORLDS, Task(PAPER, (1,)), behind=True) == []

@@ -2,14 +2,20 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.registry import make_agent
+import ethbrake_marl as eb
+from ethbrake_marl.agents import registry
+from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.agents.protocol import Team
+from ethbrake_marl.agents.registry import Entry
 from ethbrake_marl.envs.gymnasium import EthBrakeEnv
 from ethbrake_marl.envs.pettingzoo import parallel_env
 from ethbrake_marl.errors import UnknownName
+from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.certified.options import checked_uncertainty
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import Interval, Uncertainty, parse_uncertainty
@@ -17,6 +23,7 @@ from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.options import ShieldOptions
 from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv
+from tests.fixtures.commands import Refuse
 from tests.fixtures.lines import line as one_line
 from tests.refused import refused
 from tests.shield.attacks import begun, line
@@ -196,3 +203,55 @@ def test_interior__takes_no_command_beyond_the_least_capacity() -> None:
     shield = RobustShield(weak, 1, uncertainty=parse_uncertainty("braking_capacity_mps2=10%"), robust="interior")
     with refused("uncertainty: braking_capacity_mps2=10%: agent 'constant:5': above the braking capacity 4.68 m/s2"):
         shield.begin(weak.sample(1, 0).worlds, np.arange(1))
+
+
+def test_uncertainty__is_for_an_agent_that_certifies_against_it() -> None:
+    with refused("uncertainty gaps_m=1: nobody uses it; an agent with +robust does: ppo@PATH+robust"):
+        make_lineup(["coast"], PAPER, uncertainty="gaps_m=1")
+
+
+SLOW = PAPER.replace(brake_rate_mps3=9)
+PIECES = PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"})
+AGENTS: dict[str, Callable[[], object]] = {
+    "agent 'ppo@shipped+robust': mode robust needs an uncertainty": lambda: make_agent(
+        "ppo@shipped+robust", scenario=PAPER
+    ),
+    "agent 'e_v2x_bm:believed': needs a scenario: make_agent('e_v2x_bm:believed'": lambda: make_agent(
+        "e_v2x_bm:believed"
+    ),
+    "scenario 'mixture-delays': is a mixture, and a vehicle that is not known could be of any": lambda: make_agent(
+        "e_v2x_bm:believed", scenario=eb.load_scenario("mixture-delays")
+    ),
+    ":believed: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and nothing exact": lambda: evaluated(
+        make_agent("full_brake+step:believed", scenario=SLOW), SLOW
+    ),
+    ":believed: a vehicle of world 0 brakes in pieces (profile), and nothing exact is known for these": lambda: (
+        evaluated(make_agent("full_brake+step:believed", scenario=PIECES), PIECES)
+    ),
+    "shield: robust interior: vehicle_1 is driven by 'profile:0=3,1=5', which it cannot enclose": lambda: evaluated(
+        make_agent("full_brake+robust:interior", scenario=PIECES, uncertainty="latency_s=0.1"), PIECES
+    ),
+}
+
+
+def evaluated(agent: Any, scenario: Scenario) -> object:
+    return eb.evaluate(scenario.sample(12, 7), {"own": agent}, scenario=scenario)
+
+
+@pytest.mark.parametrize("message", AGENTS)
+def test_agent__is_refused(message: str) -> None:
+    with refused(message):
+        AGENTS[message]()
+
+
+def test_team__goes_behind_no_robust_shield(monkeypatch) -> None:
+    team = Team.of(make_agent("coast"), [1, 2])
+    entry = Entry("team", "team@RUN", "", (), lambda argument, settings: team)
+    monkeypatch.setitem(registry.AGENTS.loaded, "team", entry)
+    with refused("'team@run+robust': is a team, and +robust is for one driven vehicle"):
+        make_lineup(["team@run+robust"], PAIR)
+
+
+def test_evaluation__of_a_robust_shield_needs_an_uncertainty(refuse: Refuse) -> None:
+    told = "agent 'ppo@shipped+robust': mode robust needs an uncertainty"
+    refuse("evaluate --agents ppo@shipped+robust", told)

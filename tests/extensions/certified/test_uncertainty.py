@@ -1,20 +1,29 @@
 """Intervals, the members that stand for them, and robust mode, whose bound holds in every member."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.extensions.certified.options import checked_uncertainty
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
+from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield.certify import plan_harm
 from ethbrake_marl.shield.drivers import ShieldedDriver
 from ethbrake_marl.shield.reasons import ShieldReason
 from tests.fixtures.lines import line as one_line
+from tests.golden.test_golden import decisions_hash
+from tests.physics.random_worlds import Draws
+from tests.refused import refused
 from tests.shield.attacks import Hostile, begun, line
 
 EVERY = {
@@ -74,7 +83,7 @@ def test_every_member__realises_at_most_the_bound_to_the_bit(N, harm_count, who)
         episodes = drive(members.take(np.arange(worlds.n) * M + m), driver, scenario, vehicle)
         harm, shield = episodes.ledger.world_harm(harm_count), episodes.guarded.shield
         assert (harm <= shield.bound).all() and (shield.bound <= shield.predicted_harm).all()
-        assert not shield.distrusted.any()
+        assert not shield.memory.distrusted.any()
         tight += int((harm > 0.9 * shield.bound).sum())
     assert tight > 0  # the bound is not out of reach
 
@@ -103,7 +112,7 @@ def test_seen__inside_the_range_of_the_members_is_no_surprise_outside_is_one(gap
     driver = ShieldedDriver(make_agent("full_brake"), STANDING, uncertainty=OPEN, told=told)
     episodes = drive(truth, driver, STANDING, 1)
     shield = episodes.guarded.shield
-    assert shield.distrusted.tolist() == [surprising]
+    assert shield.memory.distrusted.tolist() == [surprising]
     assert surprising or 0.0 < episodes.ledger.world_harm("first")[0] <= shield.predicted_harm[0]
 
 
@@ -143,12 +152,12 @@ def test_bound_at_the_alert__is_that_of_the_best_constant_in_the_worst_corner() 
     )  # fmt: skip
     worlds, uncertainty = scenario.sample(1, 0).worlds, parse_uncertainty("gaps_m=3")
     shield = begun(scenario, worlds, RobustShield, uncertainty=uncertainty)
-    alone = [begun(scenario, uncertainty.members(worlds).take([m])).first_bound[0] for m in range(5)]
-    tried = [plan_harm(shield.running, np.full((1, 81), -a))[0] for a in np.linspace(0.0, 1.0, 41)]
-    assert shield.running.members == 5
+    alone = [begun(scenario, uncertainty.members(worlds).take([m])).memory.first_bound[0] for m in range(5)]
+    tried = [plan_harm(shield.memory.running, np.full((1, 81), -a))[0] for a in np.linspace(0.0, 1.0, 41)]
+    assert shield.memory.running.members == 5
     assert len(set(alone)) > 2
     # No single deceleration is best in all of them.
-    assert max(*alone, alone[0] + 1.0) - 1e-9 <= shield.first_bound[0] <= min(tried)
+    assert max(*alone, alone[0] + 1.0) - 1e-9 <= shield.memory.first_bound[0] <= min(tried)
 
 
 def test_seen__counts_from_then_on() -> None:
@@ -156,3 +165,68 @@ def test_seen__counts_from_then_on() -> None:
     decision = shield.decide(np.zeros(1), seen=np.array([[0.0, 14.0, 5.0, 0.0]]))
     assert (ShieldReason(decision.reason[0]).text, decision.applied[0]) == ("assumption broken", -1.0)
     assert decision.bound[0] == pytest.approx(14.0**2 - 2 * 5 * 5)
+
+
+PAPER = eb.load_scenario("paper-random")
+
+
+FIXED = PAPER.replace(gaps_m=40, speeds_mps=20, latency_s=0, early_impacts="keep", horizon_s=30)
+
+
+def test_uncertainty_of_friction__moves_all_capacities_together() -> None:
+    # Its uncertainty moves all capacities together: of 0.6 +- 0.2, shares 0, 1/8, ..., 1 of the way up.
+    worlds = FIXED.replace(friction=0.6, braking_capacity_mps2=[4, 7, 9]).sample(1, 7).worlds
+    members = parse_uncertainty("friction=0.2,braking_capacity_mps2.vehicle_3=3").members(worlds)
+    shares, dry = [0, 0.125, 0.25, 0.375, 0.625, 0.75, 0.875, 1], ([4, 7, 6], [4, 7, 12])
+    expected = [[4, 5.886, 5.886]] + [np.minimum(d, 9.81 * (0.4 + 0.4 * share)) for d in dry for share in shares]
+    assert members.vehicles.braking_capacity_mps2.shape == (17, 3)
+    assert len(expected) == 17
+    assert np.abs(members.vehicles.braking_capacity_mps2 - np.array(expected)).max() <= 1e-12
+
+
+def test_friction__no_truth_of_its_box_is_distrusted_and_no_corner_is_above_the_bound() -> None:
+    wet = load_scenario("engineering-wet-road").replace(time_gaps_s={"uniform": [0.2, 0.9]})
+    told, rng = wet.sample(60, 7).worlds, np.random.default_rng(0)
+    uncertainty = parse_uncertainty("friction=0.1")
+    for corners, spec in ((True, "coast"), (True, "full_brake"), (False, "full_brake")):
+        shield = ShieldedDriver(make_agent(spec), wet, told=told, uncertainty=uncertainty)
+        found = drive(uncertainty.draw(told, rng, corners=corners), shield, wet, 1)
+        assert not found.guarded.shield.memory.distrusted.any()
+        harm = found.ledger.world_harm("first")
+        assert not corners or (harm <= found.guarded.shield.predicted_harm + 1e-9).all()
+
+
+def test_robust_shield__trusts_a_longer_line_inside_its_box() -> None:
+    five = load_scenario("cooperation-2-five").replace(brake_rate_mps3=15, release_rate_mps3=25)
+    told = five.sample(20, seed=7).worlds
+    shift = Draws(2).uniform(-0.4, 0.4, (20, 4)) * [1.0, 0.0, 0.0, 0.0]
+    task = Task(five, five.learners, "first")
+    uncertain = parse_uncertainty("gaps_m.pair_1=0.5")
+    shielded = ShieldedDriver.around(make_agent("full_brake"), task, mode="robust", uncertainty=uncertain, told=told)
+    driven = drive(replace(told, gaps_m=told.gaps_m + shift), shielded, five)
+    assert driven.guarded.shield.memory.distrusted.sum() == 0
+    assert driven.ledger.world_harm("first").sum() > 0.0
+
+
+def test_robust_shield__decisions_have_the_committed_bits() -> None:
+    shield = RobustShield(PAPER, 1, uncertainty=parse_uncertainty("gaps_m=0.5"))
+    assert decisions_hash(shield, 10) == "8845d4c2238eac5c"
+
+
+FRICTION: dict[str, Callable[[], object]] = {
+    "uncertainty: friction is one number for the whole line; give it without a vehicle": lambda: parse_uncertainty(
+        "friction.vehicle_2=0.1"
+    ),
+    "uncertainty: friction=0.1: friction is not known in every world; declare it in the scenario": lambda: (
+        parse_uncertainty("friction=0.1").members(FIXED.sample(1, 7).worlds)
+    ),
+    "uncertainty: friction=1: 0.6 in world 0 may be as low as -0.4; it must stay above 0": lambda: parse_uncertainty(
+        "friction=1"
+    ).members(FIXED.replace(friction=0.6).sample(1, 7).worlds),
+}
+
+
+@pytest.mark.parametrize("message", FRICTION)
+def test_uncertainty_of_friction__is_refused(message: str) -> None:
+    with refused(message):
+        FRICTION[message]()

@@ -189,7 +189,7 @@ def test_host__that_never_ends_sees_the_shield_hold_the_brakes_after_its_own_end
     decide, held = StepShield.decide, []
 
     def told(self, proposed, *, only, **more):
-        over = self.running.finished & only
+        over = self.memory.running.finished & only
         decision = decide(self, proposed, only=only, **more)
         held.extend((decision.applied[over] == -1.0).tolist())
         return decision

@@ -324,3 +324,9 @@ def test_regimes__by_hand(gap, speeds, latency, decelerations, expected) -> None
     # t^2 = 1 at 0.21 s, before 1 s.
     worlds = line([[gap]], [speeds], latency_s=latency, mass_t=5.0, restitution=0.1)
     assert module.regimes_of(worlds, 0, np.array([decelerations])).tolist() == [expected]
+
+
+def test_trajectories__draw_the_obstacle_ahead() -> None:
+    scenario = load_scenario("cooperation-4-all").with_learners(["vehicle_1"])
+    record = eb.record_episode(scenario.sample(1, 7).worlds, eb.make_agent("coast"), scenario=scenario)
+    assert "obstacle" in trajectories({"coast": record}).axes[0].get_legend_handles_labels()[1]

@@ -14,15 +14,17 @@ from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import AlreadyExists, plain_text
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.report import page as page_module
-from ethbrake_marl.extensions.report.page import Part, Section, read_file
+from ethbrake_marl.extensions.report.page import Page as Sections, Part, Section, read_file
 from ethbrake_marl.extensions.report.paper_rows import summarise_beside_paper
-from ethbrake_marl.extensions.report.report import Report
+from ethbrake_marl.extensions.report.report import Report, shield_section
 from ethbrake_marl.extensions.report.shown_worlds import choose_shown, worst_rows
 from ethbrake_marl.extensions.report.style import add_caption, new_figure
 from ethbrake_marl.extensions.report.svg import inline_svg
 from ethbrake_marl.extensions.search.regret import regrets_of
 from ethbrake_marl.files.sheet import Column, Sheet, Shown
 from ethbrake_marl.game.harm import HarmCount
+from tests.evaluation.test_rollout import left_out_by
+from tests.evaluation.test_shield_modes import pair_modes
 from tests.fixtures.page import HOSTILE, UNSEEN, Page
 from tests.fixtures.pictures import draw_nothing
 
@@ -425,3 +427,15 @@ def test_report__counts_a_cascade_whole_but_draws_its_last_impact(pair: eb.Scena
     assert np.diff([impact[4] for impact in episode["impacts"]]).min() > 0
     _, _, closing_mps, _, number, first, total = episode["impacts"][0]
     assert number == 1 and first == total == closing_mps**2
+
+
+def test_shield_section__shows_bound_and_shares_of_a_team() -> None:
+    text = Page(Sections("Shield", [shield_section(pair_modes(), "30 worlds")]).html).text
+    assert "minus no shield" in text and "coast, step-cap, vehicle_3" in text.replace("\u200b", "")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_report__says_how_many_worlds_were_left_out_and_which() -> None:
+    found = left_out_by("coast")
+    text = Report("title", eb.summarise(found), found).html
+    assert "LEFT OUT for every agent: 3 of 12 worlds" in text and "world 10 of seed 7 (failing: planted)" in text

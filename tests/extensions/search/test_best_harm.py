@@ -13,7 +13,7 @@ import pytest
 
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.cli.evaluate import GROUP_EPISODES
 from ethbrake_marl.engine.profiles import Profiles, profile_problem

@@ -6,7 +6,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive, script_agents
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.extensions.search import refine as refine_module
@@ -14,7 +14,9 @@ from ethbrake_marl.extensions.search.around import Searched
 from ethbrake_marl.extensions.search.planner import Planner
 from ethbrake_marl.extensions.search.refine import refine
 from ethbrake_marl.game.harm import HARM_COUNTS
+from ethbrake_marl.shield.drivers import ShieldedDriver
 from tests.fixtures.asked import Asked
+from tests.shield.test_step_shield import Remembering
 
 SCENARIO = eb.load_scenario("paper-random")
 WORLDS = SCENARIO.sample(80, 3).worlds
@@ -118,3 +120,9 @@ def test_refine__is_a_function_of_the_world_and_the_seed(monkeypatch):
     monkeypatch.setattr(refine_module, "_refine_worlds", fail)
     with pytest.raises(PhysicsError, match="world 4: its commands could not be played"):
         refine(problem, given, budget=5)
+
+
+def test_rollout__also_of_a_searched_policy_that_cannot_be_divided():
+    driver = ShieldedDriver(Searched(Remembering(), SCENARIO, candidates=20), SCENARIO)
+    episodes = drive(WORLDS.take(np.arange(20)), driver, SCENARIO, 1)
+    assert episodes.ledger.world_harm("first").tolist() == episodes.guarded.shield.bound.tolist()

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Literal
 
 import numpy as np
 
-from ethbrake_marl.evaluation.impacts import EpisodeImpacts
-from ethbrake_marl.evaluation.outcome import Values
-from ethbrake_marl.evaluation.own_measures import EpisodeFunction
 from ethbrake_marl.game.harm import INJURY_CURVES, injury_probability
+from ethbrake_marl.game.impacts import EpisodeImpacts
+from ethbrake_marl.game.measures import MeasureFunction
+from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.registry import Part
 
 
-def _injury(curve: str, rule: Literal["", "_vehicle", "_every"]) -> EpisodeFunction:
-    def told(episodes: EpisodeImpacts) -> Values:
+def _injury(curve: str, rule: Literal["", "_vehicle", "_every"]) -> MeasureFunction:
+    def told(episodes: EpisodeImpacts) -> Floats:
         rows, found = episodes.rows, np.zeros(episodes.worlds.speeds_mps.shape)
         struck = rows.pair >= 0  # an obstacle ahead is no vehicle
         world = np.concatenate([rows.world, rows.world[struck]])
@@ -42,13 +43,15 @@ def _injury(curve: str, rule: Literal["", "_vehicle", "_every"]) -> EpisodeFunct
 
 _RULES: tuple[Literal["", "_vehicle", "_every"], ...] = ("", "_vehicle", "_every")
 
-# The injuries in 1,000 lines, by each of ``harm.INJURY_CURVES``, under one name of the entry points (pyproject.toml).
+# The injuries in 1,000 lines, by each of ``harm.INJURY_CURVES``; names of the entry points stand in pyproject.toml.
 #
 # ``injury_CURVE`` is the sum over the vehicles of a line, each by its largest change of speed, as the literature takes
-# it; ``injury_CURVE_vehicle`` tells it of each; ``injury_CURVE_every`` sums over every impact, as if each met other
-# people. A vehicle that was not hit has none, nor has one pushed by a vehicle that touches it already.
+# it; ``injury_CURVE_vehicle`` is the injuries of each; ``injury_CURVE_every`` sums over every impact, as if each met
+# other people. A vehicle that was not hit has none, nor has one pushed by a vehicle that touches it already.
 INJURY = {
     f"injury_{curve}{rule}": Part(_injury(curve, rule), unit="per 1,000 lines")
     for curve in INJURY_CURVES
     for rule in _RULES
 }
+
+ONE = SimpleNamespace(**INJURY)  # ``ONE.injury_lr4s``: an entry point cannot name what stands in a mapping

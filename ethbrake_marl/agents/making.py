@@ -1,0 +1,176 @@
+"""Make agents from their names: ``make_agent`` for a driver, ``make_role`` for a vehicle of a scenario."""
+
+from __future__ import annotations
+
+import inspect
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.agents.protocol import Agent, Driver, Source, Team, check_agent
+from ethbrake_marl.agents.registry import AGENTS, PROFILE, Entry, agent_names, around_entry, group_names
+from ethbrake_marl.agents.settings import HORIZON_S, AgentSettings
+from ethbrake_marl.agents.spec import AgentSpec, parse_spec
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
+from ethbrake_marl.files.python_file import load_from_file
+from ethbrake_marl.game.harm import HarmCount, check_harm_count
+from ethbrake_marl.scenario.catalogue import load_scenario
+from ethbrake_marl.scenario.schema import Scenario
+
+
+def make_agent(
+    spec: str,
+    *,
+    scenario: Scenario | str | Path | None = None,
+    harm_count: HarmCount = "first",
+    horizon_s: float | None = None,
+    most_candidates: int | None = None,
+    uncertainty: object = None,
+    time_step_s: float | None = None,
+) -> Driver:
+    """Make a new agent for one vehicle in one batch, or a team of agents from one training run.
+
+    Args:
+        spec: ``name[:argument][@policy]`` and wrappers, for example ``constant:3.5``, ``planner:64``,
+            ``ppo@shipped+search+step``; ``ethbrake agent list`` lists all. ``my_file.py:make_agent`` runs that file,
+            which can do whatever you can: its function gets the arguments of a factory (see ``register_agent``), or
+            none.
+        scenario: scenario, its name or the path of its file; needed by teams, by wrappers, and to find the shipped
+            policy for this scenario.
+        harm_count: impacts whose harm an optimising agent minimises: ``first`` (each pair's first) or ``total`` (all).
+        horizon_s: time after the alert until which an agent looks ahead, s; None: the scenario's horizon, or 8 s.
+        most_candidates: upper limit for the candidates of a search, to try an agent out quickly.
+        uncertainty: what a shield for uncertain worlds does not know, for example ``"gaps_m=0.5"``.
+        time_step_s: time between two decisions for agents that search or follow a control law; None: the scenario's, or
+            0.1 s.
+
+    Raises ``UnknownName`` with a suggestion for an unknown name; ``InvalidInput`` for an invalid argument, harm count
+    or horizon, and for a missing scenario.
+
+    >>> import ethbrake_marl as eb
+    >>> eb.make_agent("ppo@shipped+step", scenario="paper-random").name
+    'ppo@shipped+step'
+
+    """
+    check_harm_count(harm_count)
+    scenario = None if scenario is None else load_scenario(scenario)
+    if horizon_s is None:
+        horizon_s = HORIZON_S if scenario is None else scenario.horizon_s
+    if not isinstance(horizon_s, int | float | np.number) or not 0.0 < horizon_s < float("inf"):
+        raise InvalidInput(f"horizon_s {horizon_s!r}: must be a positive number of seconds")
+    written = parse_spec(spec)
+    if written.name == PROFILE:
+        raise InvalidInput(f"agent {spec!r}: a profile is a role of a scenario, fixed at the alert; it is no agent")
+    settings = AgentSettings(
+        written.core, written.policy, scenario, harm_count, float(horizon_s), most_candidates, uncertainty,
+        time_step_s or (0.1 if scenario is None else scenario.time_step_s),
+    )  # fmt: skip
+    return _make_driver(written, settings)
+
+
+def _make_driver(written: AgentSpec, settings: AgentSettings) -> Driver:
+    driver = _make(find_entry(written), written.argument, settings)
+    for each in written.around:
+        settings, entry = replace(settings, spec=f"{settings.spec}+{each}"), around_entry(each)
+        if isinstance(driver, Team) and not entry.teams:
+            raise InvalidInput(
+                f"agent {settings.spec!r}: is a team, and +{each} is for one driven vehicle, the others following"
+                " scripts (--set roles.vehicle_3=full_brake); +step goes around a team; else name one policy of the"
+                " team (ppo@RUN/policy/vehicle_2)"
+            )
+        driver = _make(entry, each.partition(":")[2] or None, settings, driver)
+    return driver
+
+
+def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None = None) -> Agent:
+    """Make the agent that the scenario assigns to ``vehicle`` (index, 0 = front) as its script.
+
+    An optimising agent minimises first-impact harm. ``most_candidates`` is the upper limit for the candidates of a
+    search; None: no limit. Raises what ``make_agent`` raises, and ``InvalidInput`` for a script with a shield or search
+    around it, and for a team without this vehicle.
+    """
+    spec = scenario.scripts[vehicle]
+    name, _, argument = spec.partition(":")
+    written = AgentSpec(PROFILE, argument, None, ()) if name == PROFILE else parse_spec(spec)
+    settings = AgentSettings(
+        written.core, written.policy, scenario, horizon_s=scenario.horizon_s, most_candidates=most_candidates,
+        time_step_s=scenario.time_step_s, role=vehicle,
+    )  # fmt: skip
+    team = None if written.around else Team.of(_make_driver(written, settings), (vehicle,))
+    if team is None or team.shield is not None:
+        raise InvalidInput(
+            f"agent {spec!r}: a search or a shield goes around a driver, never around a role; let"
+            f" {scenario.vehicle_names[vehicle]} follow {written.core}, or drive it"
+        )
+    return team.drivers[vehicle]
+
+
+def find_entry(spec: AgentSpec | str) -> Entry:
+    """Return the registry's entry of an agent.
+
+    ``spec`` is a specification such as ``planner:64`` or ``ppo@shipped``, as a text or parsed. Raises ``UnknownName``
+    with a suggestion for an unknown agent; ``InvalidInput`` for an argument or a policy that the agent does not take.
+    """
+    written = parse_spec(spec) if isinstance(spec, str) else spec
+    if written.file is not None:
+        form = f"{written.name}[:ARGUMENT][@POLICY]"
+        return Entry(written.name, form, "your own", Source.UNSTATED, make_from_file)
+    if written.name not in AGENTS:
+        if written.name in group_names():
+            raise InvalidInput(f"agent {written.core!r}: stands for several agents in --agents; here one is needed")
+        raise AGENTS.unknown(written.name, {*agent_names(), *group_names()})
+    entry = AGENTS[written.name]
+    if written.argument is not None and ":" not in entry.whole_form:
+        raise InvalidInput(f"agent {written.core!r}: {written.name} takes no argument")
+    if written.policy is not None and "@" not in entry.form:
+        own = "" if entry.is_ours else "; register_agent(..., takes_policy=True) says that it does"
+        raise InvalidInput(f"agent {written.core!r}: {written.name} takes no policy{own}")
+    return entry
+
+
+def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: Driver) -> Driver:
+    """Make an agent or a team from its registry entry, and check it.
+
+    Errors of agents from outside this package become ``InvalidInput``.
+
+    Args:
+        entry: the entry.
+        argument: text after the colon in the specification; None without one.
+        settings: passed on.
+        inside: for a shield or a search, the agent or team that it goes around.
+
+    """
+    try:
+        driver = entry.call(argument, settings, *inside)
+    except Exception as error:
+        if entry.is_ours or isinstance(error, EthBrakeError):
+            raise
+        raise InvalidInput(f"agent {settings.spec!r}: {describe_error(error)}") from error
+    if not isinstance(driver, Team):
+        check_agent(driver, f"agent {settings.spec!r}", alone=not inside)
+    return driver
+
+
+def make_from_file(argument: str | None, settings: AgentSettings) -> Driver:
+    """Call the function in a Python file that ``settings.spec`` names (``FILE.py:FUNCTION``), and return its result.
+
+    The function is called with ``argument`` (the text after the second colon, or None) and ``settings``; a function
+    without parameters is called without arguments. Raises ``InvalidInput`` if such a function is given an argument or a
+    policy, and if the file cannot be loaded.
+    """
+    named = parse_spec(settings.spec).file
+    assert named is not None
+    function = load_from_file(*named, reads=settings.policy)
+    if not callable(function):
+        raise InvalidInput(f"file {named[0]!r}: {named[1]!r} is no function; name the one that makes the agent")
+    given: tuple[Any, ...] = (argument, settings)
+    with suppress(TypeError, ValueError):  # a built-in function may have no signature
+        if not inspect.signature(function).parameters:
+            given = ()
+    if not given and (argument, settings.policy) != (None, None):
+        raise InvalidInput(f"agent {settings.spec!r}: {named[1]} has no parameters, so it takes no argument")
+    made: Driver = function(*given)
+    return made

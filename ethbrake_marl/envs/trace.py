@@ -1,0 +1,214 @@
+"""``Trace``: recorded motion of an engine's worlds, so that every moment can be shown exactly.
+
+Between two decisions, the motion follows from the state and the command alone, so each moment is advanced from the
+beginning of its step. A ``Trace`` watches the engine; without a ``Trace`` nothing is recorded and nothing costs time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.envs.rendering import (
+    AHEAD_M,
+    BEHIND_M,
+    BODY_M,
+    FLASH_S,
+    LATE_S,
+    LEAST_WIDTH_M,
+    Scene,
+    Struck,
+    View,
+    follow,
+)
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.left_out import ImpactRows
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Recorded motion of n worlds during one step, or from the alert to the first decision.
+
+    A motion is *open* while it is the latest one: its end is the engine's current state. ``closed`` returns it with a
+    fixed end, and with its ``parts``, which ``scenes`` needs.
+    """
+
+    start: Worlds  # the n worlds at the start
+    command_mps2: Floats  # [n, N] commands (m/s2); where ``fresh``, 0 until ``closed`` sets the commands at the end
+    until_s: Floats  # [n] time at the end since the alert (s); NaN while the motion is open
+    fresh: Bools  # [n] whether the motion begins at the alert, not at a decision
+    front_m: Floats  # [n] position of Vehicle 1 at the start, relative to the alert (m)
+    harm: Floats  # [n, 2] first-impact harm and total harm at the start (m2/s2)
+    left_m: Floats  # [n] left end of the road that pictures of the episode show (m from Vehicle 1 at the alert)
+    right_m: Floats  # [n] right end of that road (m)
+    struck: Floats  # [k, 4] impacts shortly before the start: row of the world, pair, time (s), closing speed (m/s)
+    stepped_in: Bools | None  # [n] whether a shield replaced an action; None: no shield
+    # Parts of the motion with constant commands, set by ``closed``: worlds at the start, commands, time at the end.
+    parts: tuple[tuple[Worlds, Floats, Floats], ...] = ()
+
+    def closed(self, engine: Engine) -> Motion:
+        """Return this motion with its end fixed at the current state of ``engine``."""
+        worlds = engine.worlds
+        command = np.where(self.fresh[:, np.newaxis], worlds.command_mps2, self.command_mps2)
+        parts = tuple(engine.segments(self.start, command))
+        return replace(self, command_mps2=command, until_s=worlds.time_s, parts=parts)
+
+    def scenes(self, engine: Engine, row: int, times_s: Floats | None = None) -> list[Scene]:
+        """Return the scenes (all that a picture shows) of one world, one for each time.
+
+        Args:
+            engine: the engine that was recorded.
+            row: row of the world.
+            times_s: [k] times within this motion, which must be closed; None: its end only.
+
+        """
+        times = self.until_s[[row]] if times_s is None else times_s
+        alert_view = View(float(self.left_m[row]), float(self.right_m[row]))
+        obstacle = self.start.obstacle_gap_m[row] + self.front_m[row]
+        front_m, harm = self.front_m[row], self.harm[row]
+        struck = [Struck(int(m[1]), float(m[3]), float(m[2])) for m in self.struck if m[0] == row]
+        shown: list[Scene] = []
+        for part in self.parts:
+            world, command, until = part[0].take([row]), part[1][[row]], part[2][[row]]
+            now = times if part is self.parts[-1] else times[times <= until]
+            times = times[len(now) :]
+            post = world.with_post_ahead(until - world.time_s).take(np.zeros(len(now) + 1, np.int64))
+            moved, _ = advance(post, command, until_s=np.append(now, until))
+            impacts = _rows(world, command, until)
+            first = (front_m + (post.obstacle_gap_m - moved.obstacle_gap_m))[:, np.newaxis]
+            fronts = np.concatenate([first, first - np.cumsum(moved.gaps_m + BODY_M, axis=1)], axis=1)
+            told = zip(impacts.pair.tolist(), impacts.closing_speed_mps.tolist(), impacts.time_s.tolist(), strict=True)
+            struck += [Struck(*each) for each in told]
+            by_then = impacts.time_s <= np.append(now, until)[:, np.newaxis]
+            each_harm = impacts.closing_speed_mps * impacts.closing_speed_mps
+            counted = [(by_then * (each_harm * impacts.first)).sum(axis=1), (by_then * each_harm).sum(axis=1)]
+            latency, done = world.vehicles.latency_s[0], harm + np.stack(counted, axis=1)
+            shown += [
+                Scene(
+                    title=engine.scenario.name,
+                    time_s=float(time),
+                    view=follow(alert_view, fronts[k]),
+                    front_m=fronts[k],
+                    gaps_m=moved.gaps_m[k],
+                    speeds_mps=moved.speeds_mps[k],
+                    command_mps2=moved.command_mps2[k],
+                    braking_mps2=world.vehicles.braking_capacity_mps2[0],
+                    driving_mps2=world.vehicles.driving_capacity_mps2[0],
+                    latency_s=latency,
+                    hit=moved.pair_hit[k],
+                    struck=tuple(s for s in struck if time - FLASH_S < s.time_s <= time),
+                    first_harm=float(done[k, 0]),
+                    total_harm=float(done[k, 1]),
+                    obstacle_m=float(obstacle),
+                    learners=engine.learners or tuple(engine.deciders),
+                    shield=None if self.stepped_in is None or self.fresh[row] else bool(self.stepped_in[row]),
+                    ended=bool(engine.ended[row])
+                    and time == float(engine.packed.state[row, engine.packed.column.time]),
+                )
+                for k, time in enumerate(now)
+            ]
+            front_m, harm = fronts[-1][0], done[-1]
+        return shown
+
+
+Memory = tuple[Motion, ...]  # recorded motions, the running one last
+
+
+class Trace:
+    """Recorder of the motion of an engine's worlds; a ``Watcher`` of ``engine.engine``.
+
+    Args:
+        engine: engine to watch, from its next reset on.
+        whole: keep every step since the episode began (for engines with one world); if False, the last step only.
+        alert: the worlds at the alert of an engine that is still at its first decision; recording starts there at once.
+            None: at the next reset.
+
+    """
+
+    def __init__(self, engine: Engine, *, whole: bool = False, alert: Worlds | None = None) -> None:
+        self._whole = whole
+        engine.watch(self, () if alert is None else self.begun((), alert, np.arange(alert.n)))
+
+    def begun(self, memory: Memory, alert: Worlds, rows: Ints) -> Memory:
+        """Return the recorded motions (``Motion``) after episodes have started in the rows with the indices ``rows``.
+
+        Args:
+            memory: the motions recorded before.
+            alert: the worlds of these rows only, at t = 0.
+            rows: indices of the worlds whose episodes have started.
+
+        """
+        v, n = alert.vehicles, alert.n
+        # The view contains each line from the alert to rest if all brake fully as soon as they can. A rear vehicle that
+        # would stop further on is assumed to push the vehicles ahead that far.
+        behind = np.concatenate([np.zeros((n, 1)), np.cumsum(alert.gaps_m, axis=1)], axis=1)
+        reaction = alert.speeds_mps * np.minimum(v.latency_s, LATE_S)
+        rising = (
+            alert.speeds_mps * v.braking_capacity_mps2 / (2.0 * v.brake_rate_mps3)
+        )  # upper bound while brakes build up
+        way = reaction + rising + alert.speeds_mps**2 / (2.0 * v.braking_capacity_mps2)
+        left = -behind[:, -1] - alert.N * BODY_M - BEHIND_M
+        right = np.minimum((way - behind).max(axis=1), alert.obstacle_gap_m) + AHEAD_M
+        new = Motion(
+            alert, np.zeros(alert.speeds_mps.shape), np.full(n, np.nan), np.ones(n, np.bool_), np.zeros(n),
+            np.zeros((n, 2)), left, np.maximum(right, left + LEAST_WIDTH_M), np.zeros((0, 4)), None,
+        )  # fmt: skip
+        if not memory or n == memory[-1].start.n:
+            return (new,)
+        last = memory[-1]
+        columns: dict[str, Any] = {}
+        for name in ("command_mps2", "until_s", "fresh", "front_m", "harm", "left_m", "right_m"):
+            columns[name] = getattr(last, name).copy()
+            columns[name][rows] = getattr(new, name)
+        struck = last.struck[~np.isin(last.struck[:, 0], rows)]
+        return (replace(last, start=last.start.assign(rows, alert), struck=struck, **columns),)
+
+    def stepped(self, memory: Memory, before: Engine, after: Engine) -> Memory:
+        """Return the recorded motions after a step: those of ``memory``, and the motion of the step.
+
+        The last motion of ``memory`` is closed first. Unless the trace was made with ``whole``, only the motion of the
+        step is kept. ``before`` and ``after`` are the engine before and after the step.
+        """
+        last = memory[-1].closed(before)
+        front_m, met = last.front_m, [last.struck]
+        for start, command, until_s in last.parts:
+            post = start.with_post_ahead(until_s - start.time_s)
+            moved, _ = advance(post, command, until_s=until_s)
+            front_m = front_m + (post.obstacle_gap_m - moved.obstacle_gap_m)
+            rows = _rows(start, command, until_s)
+            columns = (rows.world, rows.pair, rows.time_s, rows.closing_speed_mps)
+            met.append(np.stack(columns, axis=1).astype(np.float64))
+        struck, ledger, n = np.concatenate(met), before.ledger, before.n
+        new = replace(
+            last,
+            start=before.worlds,
+            command_mps2=after.wanted_mps2.copy(),
+            until_s=np.full(n, np.nan),
+            fresh=np.zeros(n, np.bool_),
+            front_m=front_m,
+            harm=np.stack([ledger.world_harm("first"), ledger.world_harm("total")], axis=1),
+            struck=struck[struck[:, 2] > last.until_s[struck[:, 0].astype(np.int64)] - FLASH_S],
+            stepped_in=None if after.ruling is None else after.ruling.stepped_in,
+        )
+        return (*memory[:-1], last, new) if self._whole else (new,)
+
+    def motions(self, engine: Engine) -> Memory:
+        """Return all recorded motions in order, the last one up to the engine's current state.
+
+        Raises ``InvalidInput`` before the first reset.
+        """
+        memory: Memory = engine.memory(self)
+        if not memory:
+            raise InvalidInput("render: no episode was started; call reset first")
+        return (*memory[:-1], memory[-1].closed(engine))
+
+
+def _rows(worlds: Worlds, command: Floats, until_s: Floats) -> ImpactRows:
+    rows = advance(worlds, command, until_s=until_s, record=True)[1].rows
+    assert rows is not None  # because of ``record=True``
+    return rows

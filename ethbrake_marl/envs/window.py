@@ -1,0 +1,57 @@
+"""``Window``: the window of ``render_mode="human"``, drawn with pygame."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from ethbrake_marl.envs.rendering import HEIGHT, WIDTH, Frame
+from ethbrake_marl.errors import InvalidInput, need
+
+
+class Window:
+    """Window of ``render_mode="human"``. It opens with its first frame, and stays closed after the user closes it.
+
+    A copy is a separate window. Raises ``MissingExtra`` if pygame is missing.
+    """
+
+    def __init__(self) -> None:
+        need("pygame")
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # no greeting on import
+        import pygame
+
+        self._pygame: Any = pygame
+        self._screen: Any = None
+        self._clock: Any = None
+        self.closed_by_user = False  # reset when an episode begins
+
+    def __reduce__(self) -> tuple[type[Window], tuple[()]]:
+        return Window, ()
+
+    def show(self, frame: Frame, fps: float) -> None:
+        """Show a frame [H, W, 3] uint8 for 1/fps seconds. Raise ``InvalidInput`` if there is no display."""
+        if self.closed_by_user:
+            return
+        pygame = self._pygame
+        if self._screen is None:
+            try:
+                pygame.display.init()
+                self._screen = pygame.display.set_mode((WIDTH, HEIGHT))
+            except pygame.error as error:
+                raise InvalidInput(
+                    f"render_mode = 'human': no window can be opened here ({error}); 'rgb_array' needs no display"
+                ) from None
+            pygame.display.set_caption("EthBrake")
+            self._clock = pygame.time.Clock()
+        self._screen.blit(pygame.image.frombuffer(frame.tobytes(), (WIDTH, HEIGHT), "RGB"), (0, 0))
+        pygame.display.flip()
+        self._clock.tick(fps)
+        if any(event.type == pygame.QUIT for event in pygame.event.get()):
+            self.close()
+            self.closed_by_user = True
+
+    def close(self) -> None:
+        """Close the window, if it is open."""
+        if self._screen is not None:
+            self._pygame.display.quit()
+            self._screen = self._clock = None

@@ -1,0 +1,50 @@
+"""`ethbrake study ablate`: what it refuses."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.fixtures.commands import Refuse
+
+REFUSED = [
+    (
+        "study ablate --output new --levels cooperation-3-par,cooperation-2-paper",
+        "unknown scenario 'cooperation-3-par'; did you mean 'cooperation-3-pair'?",
+    ),
+    (
+        "study ablate --output new --levels cooperation-3-pair,cooperation-3-pair",
+        "levels: 'cooperation-3-pair' is given twice",
+    ),
+    ("study ablate --output new --levels cooperation-3-pair", "levels: 1 given; at least two are needed to compare"),
+    (
+        "study ablate --output new --levels cooperation-0-sensors,paper-distance",
+        "level 'paper-distance': its speeds_mps differs from that of 'cooperation-0-sensors' (20, 18, 20",
+    ),
+    (
+        "study ablate --output new --levels cooperation-3-pair,cooperation-3-five",
+        "level 'cooperation-3-five': its vehicles differs from that of 'cooperation-3-pair' (5; there 3)",
+    ),
+    (
+        "study ablate --output new --episodes 10 --search-episodes 11",
+        "search-episodes 11: must be at most the 10 worlds of --episodes",
+    ),
+    (
+        "study ablate --output new --set scheme=shard",
+        "recipe 'cooperation': scheme = shard: must be single, shared, independent or centralised",
+    ),
+    (
+        "study ablate --output new --shield robust",
+        "shield 'robust': must be step; episode and robust shield one vehicle",
+    ),
+    ("study ablate --output new --recipes ppo,ppo", "recipes ppo, ppo: give at least one, each with a name of its own"),
+]
+
+
+@pytest.mark.parametrize(("line", "message"), REFUSED, ids=lambda value: value[:60])
+def test_ablation__is_refused(line: str, message: str, refuse: Refuse) -> None:
+    refuse(line, message)
+
+
+def test_output__is_a_folder_of_its_own(refuse: Refuse) -> None:
+    Path("file").write_text("precious")
+    refuse("study ablate --output file/new", "is no folder; give a folder of its own (--output)")

@@ -1,0 +1,77 @@
+"""What datasets and clones of them refuse."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.errors import AlreadyExists, UnknownName
+from ethbrake_marl.extensions.datasets import minari
+from ethbrake_marl.extensions.datasets.minari import write_dataset
+from tests.docs.site import DOCS, load
+from tests.refused import refused
+
+PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
+
+
+BRAKE = {"full_brake": eb.make_agent("full_brake")}
+
+
+def dataset(path: str = "a.parquet", agents: Any = None, **given: Any) -> None:
+    """Writes a dataset of two episodes, as if the extra were installed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(minari, "need", lambda package: None)
+        write_dataset(path, BRAKE if agents is None else agents, **{"scenario": PAPER, "episodes": 2, **given})
+
+
+NOBODY = PAPER.with_learners([])
+
+
+DATASETS: dict[str, Callable[[], object]] = {
+    "write_dataset: episodes = 0: must be a whole number, at least 1": lambda: dataset(episodes=0),
+    "write_dataset: no agents given; at least one": lambda: dataset(agents={}),
+    "a.parquet: the format minari is written to a folder called NAME-vNUMBER": lambda: dataset(format="minari"),
+    "a-v0: the format parquet is written to a file ending in .parquet": lambda: dataset("a-v0", format="parquet"),
+    "brakes: a dataset of Minari is a folder called NAME-vNUMBER": lambda: dataset("brakes"),
+    "nowhere/a.parquet: there is no folder nowhere; make it first": lambda: dataset("nowhere/a.parquet"),
+    "nowhere/a-v0: there is no folder nowhere; make it first": lambda: dataset("nowhere/a-v0"),
+    "has no learner to record: scenario.with_learners(['vehicle_2'])": lambda: dataset(scenario=NOBODY),
+    "scenario 'cooperation-3-pair' has 2 learners (vehicle_2, vehicle_3)": lambda: dataset("a-v0", scenario=PAIR),
+}
+
+
+@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.parametrize("message", DATASETS)
+def test_dataset__is_refused(message: str) -> None:
+    with refused(message):
+        DATASETS[message]()
+
+
+@pytest.mark.parametrize(("name", "make"), [("a.parquet", Path.touch), ("a-v0", Path.mkdir)])
+def test_dataset__replaces_nothing_unasked(name: str, make: Callable[[Path], None], empty_folder: Path) -> None:
+    make(Path(name))
+    with refused(f"{name}: is there already; give another name or use force (--force)", AlreadyExists):
+        dataset(name)
+
+
+def test_dataset__replaces_no_folder_that_is_none(empty_folder: Path) -> None:
+    Path("a-v0").mkdir()
+    with refused("a-v0: is no dataset of Minari, and is not replaced; give another name"):
+        dataset("a-v0", force=True)
+    with refused("unknown format 'csv'; known: minari, parquet", UnknownName):
+        dataset(format="csv")
+
+
+def test_clone__is_of_one_learner_of_a_dataset_and_says_which_drives(empty_folder: Path) -> None:
+    Path("no.parquet").write_text("no")
+    clone = load("../../train/clone")
+    with refused("no.parquet: is no dataset of `write_dataset`"):
+        clone.train(Path("no.parquet"), 0, Path("clone"))
+    write_dataset("two.parquet", BRAKE, scenario=PAIR, episodes=1)
+    with refused("two.parquet: holds 2 learners, one is needed"):
+        clone.train(Path("two.parquet"), 0, Path("clone"))
+    Path("clone.py").write_text((DOCS.parent / "train" / "clone.py").read_text())
+    with refused("agent 'clone.py:make_agent': say which clone drives: train/clone.py:make_agent:runs/clone"):
+        eb.make_agent("clone.py:make_agent", scenario=PAPER)

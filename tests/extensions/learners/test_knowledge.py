@@ -1,0 +1,21 @@
+"""Whether policies that these algorithms train use no more than the messages that they say they know."""
+
+import pytest
+
+from ethbrake_marl.agents.protocol import Source
+from tests.agents.test_knowledge import BLOCKED, agent_of, changed_decisions, check_stated, in_two, with_channels
+
+STATED = {"options@shipped/options-paper-random-obstacle-total": (Source.MESSAGES,)}
+APART = {"counterfactual@PATH"}  # it needs a run, and has tests of its own
+HONEST, _ = in_two(STATED)
+
+
+@pytest.mark.parametrize(("spec", "knows"), STATED.items())
+def test_knowledge__every_agent_states_it(spec, knows):
+    check_stated(spec, agent_of(spec), knows)
+
+
+@pytest.mark.parametrize(("spec", "channel"), with_channels(HONEST), ids=str)
+def test_own_sensors_and_messages__what_was_not_received_changes_no_action(spec, channel):
+    scenario = BLOCKED.replace(v2x=channel)
+    assert changed_decisions(agent_of(spec, scenario), scenario, n=10) == 0

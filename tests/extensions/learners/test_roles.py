@@ -1,0 +1,13 @@
+"""A role of a scenario is the same agent as a driver of that vehicle, for agents of this extension, too."""
+
+import pytest
+
+from tests.agents.test_roles import SCENARIOS, check_role
+
+SPECS = {"counterfactual": ["counterfactual@shipped"], "options": ["options@shipped"]}
+
+
+@pytest.mark.parametrize("kind", SPECS)
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_role__is_the_same_agent_as_a_driver(name, kind):
+    check_role(name, SPECS[kind])

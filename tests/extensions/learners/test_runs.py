@@ -1,0 +1,97 @@
+"""Trainings by these algorithms: recipes, and going on to the same bits."""
+
+from pathlib import Path
+
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.evaluation.summary import summarise
+from ethbrake_marl.training import session as train_module
+from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
+from tests.cli.test_scenarios import check_new_recipe
+from tests.extensions.learners.tiny import MODES, TINY_COUNTERFACTUAL, TINY_MODES, TINY_OPTIONS
+from tests.learning.test_runs import MIXTURE, Whole, check_one_update, check_resumed, trained_once
+from tests.learning.test_teams import check_meanings, check_shipped
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of those who read event files
+SCENARIO = eb.load_scenario("paper-random")
+
+
+GOAL = 1.10  # harm of the policy, in the least harm known
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(3))
+def test_quick__ends_near_the_best_known_for_every_seed(seed: int, tmp_path: Path) -> None:
+    result = train_module.train("quick", "paper-random", tmp_path / "run", seed=seed, on_progress=None)
+    agents = {"last": eb.LearnedAgent(result.last_policy), "kept": eb.LearnedAgent(result.policy)}
+    for row in summarise(evaluate(SCENARIO.sample(10_000, seed=7), agents, scenario=SCENARIO, aftermath=False)):
+        assert row.first_impact_harm.value <= GOAL * row["best_known_first_impact_harm"].value
+
+
+def test_recipe__tells_only_the_keys_that_it_has() -> None:
+    told = TINY_COUNTERFACTUAL.model_dump(mode="json")
+    assert {"focus", "modes"} & told.keys() == set()
+    assert "initial_action" not in told["network"]
+    assert TINY_COUNTERFACTUAL.replace(focus=0.75).model_dump(mode="json")["focus"] == 0.75
+
+
+OF_THEIR_KIND = ("cooperation", "modes")  # others differ in numbers
+RECIPES = [name for name, file in TrainingRecipe.shipped().items() if file.parent.name == "learners"]
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in OF_THEIR_KIND else pytest.mark.slow) for name in RECIPES]
+)
+def test_shipped_recipe__trains_for_one_update(name: str, tmp_path: Path) -> None:
+    """By the fewest worlds whose decisions can be split into batches and tried."""
+    recipe = load_recipe(name)
+    most = max(recipe.batch_size, recipe.tried if recipe.algorithm == "options" else recipe.counterfactuals)
+    check_one_update(recipe.replace(n_envs=-(-most // recipe.rounds)), tmp_path / "run")
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_recipe__that_ships_comes_back_from_its_json_and_its_template_and_passes_the_schema(name: str) -> None:
+    check_shipped(name)
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_new_recipe__has_every_key_with_a_comment_and_the_same_values(name: str, tmp_path: Path) -> None:
+    check_new_recipe(name, tmp_path / "mine.yaml")
+
+
+@pytest.mark.parametrize("algorithm", ["counterfactual", "options"])
+def test_schema__says_what_every_key_of_an_algorithm_means(algorithm: str) -> None:
+    check_meanings(algorithm)
+
+
+AMONG = {"among": ["policy@shipped/ppo", "policy@shipped/sac"], "drawn": 2, "near": [], "focus": 0.5,
+         "relative": True, "tie_break": 0.5, "observation": ["own", "front_1", "rear_1", "contact"]}  # fmt: skip
+TRAININGS = {
+    "counterfactual": (TINY_COUNTERFACTUAL.replace(gradient_limit="auto"), SCENARIO),
+    "modes": (TINY_MODES, SCENARIO),
+    "options": (TINY_OPTIONS, SCENARIO),
+    "among": (TINY_OPTIONS.replace(**AMONG), MIXTURE),
+    "scout": (TINY_MODES.replace(focus=0.75, modes=MODES | {"tie_break": 0.0}), SCENARIO),
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
+    return trained_once(TRAININGS, tmp_path_factory)
+
+
+@pytest.mark.parametrize(
+    ("name", "at"),
+    [
+        *((name, ("update", 5)) for name in ("counterfactual", "modes", "among")),
+        *(pytest.param(name, ("update", number), marks=pytest.mark.slow)
+          for name, numbers in (("modes", (3, 7)), ("scout", (5,))) for number in numbers),  # in its other stages
+    ],
+    ids=str,
+)  # fmt: skip
+def test_resume__after_ctrl_c_everything_is_as_if_nobody_had_stopped_it(
+    name: str, at: tuple[str, int], whole: Whole, tmp_path: Path
+) -> None:
+    check_resumed(TRAININGS[name], tmp_path / "run", at, *whole(name))

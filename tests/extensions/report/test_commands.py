@@ -1,0 +1,97 @@
+"""Pictures, pages and films of commands."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ethbrake_marl.errors import _EXTRA_OF
+from ethbrake_marl.evaluation.identity import LIST_SEED
+from tests.cli.test_watch import check_extra
+from tests.files.test_files import check_target
+from tests.fixtures.commands import Command, Refuse, check_refused, told_json
+from tests.test_imports import ended
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+
+@pytest.mark.parametrize("name", ["realistic-mixed", "paper-scenario-1"])
+def test_sample__draws_a_picture(ethbrake: Command, tmp_path: Path, name: str) -> None:
+    for picture in (tmp_path / "a.png", tmp_path / "b.png"):
+        told = ethbrake("scenario", "sample", name, "--episodes", "40", "--output", picture)
+        assert (told.status, told.out, told.err) == (0, "", f"picture: {picture}\n")
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_evaluate__by_force_leaves_no_file_of_earlier_results(ethbrake: Command, tmp_path: Path) -> None:
+    folder, line = tmp_path / "new", ("evaluate", "--agents", "coast", "--episodes", "3", "--output")
+    assert ethbrake(*line, folder, "--per-world", "csv", "--report").status == 0
+    (folder / "mine.txt").write_text("mine")
+    assert sorted(each.name for each in folder.iterdir()) == ["mine.txt", "report.html", "results.json", "worlds.csv"]
+    check_refused(ethbrake(*line, folder), "results.json: is there already")
+    assert ethbrake(*line, folder, "--force", "--per-world", "parquet").status == 0
+    assert sorted(each.name for each in folder.iterdir()) == ["mine.txt", "results.json", "worlds.parquet"]
+
+
+def test_compare__a_run_its_report_and_shields_are_results_too(ethbrake, finished_run: Path, tmp_path: Path) -> None:
+    results = finished_run / "results.json"
+    told = told_json(ethbrake("compare", results, results, "--json"))
+    policies = {each["agent"]: each["policy"] for each in told["agents"]}
+    assert told["intervals"] == "paired" and policies["trained policy"] == "same"
+    assert all(each["total_harm_difference_interval"] == [0.0, 0.0] for each in told["agents"])
+    tests = ethbrake("compare", results, finished_run / "other_tests.json")
+    check_refused(tests, "each test needs a file of its own")
+    page = (finished_run / "report.html").read_text()
+    assert all(json.loads(results.read_text())[0][name] in page for name in ("worlds_sha256", "scenario_sha256"))
+    for count in ("first", "total"):
+        line = ("shield", "--agents", "full_brake", "--episodes", "5", "--set", f"harm_count={count}", "--json")
+        (tmp_path / f"{count}.json").write_text(ethbrake(*line).out)
+    told = told_json(ethbrake("compare", tmp_path / "first.json", tmp_path / "first.json", "--json"))
+    found = {each["agent"]: each["harm_difference"] for each in told["agents"]}
+    assert found == {f"full_brake ({mode})": 0.0 for mode in ("none", "episode", "step", "step-alert")}
+    check_refused(ethbrake("compare", tmp_path / "first.json", tmp_path / "total.json"), "is about another harm than")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_report__says_which_harm_the_shield_bounds(ethbrake: Command) -> None:
+    answer = ethbrake(
+        "evaluate", "--agents", "full_brake,constant:3+step", "--episodes", "12", "--report", "--output", "r"
+    )
+    assert answer.status == 0, answer.err
+    text = Path("r/report.html").read_text()
+    assert "minus episode mode" in text and "First-impact harm, which the shield bounds" in text
+
+
+def test_target__that_cannot_be_replaced_is_refused_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    check_target("watch --agents coast --output", tmp_path / "mine.svg", monkeypatch, capsys)
+
+
+def test_report__is_imported_where_no_package_of_an_extra_can_be() -> None:
+    absent = "".join(f"sys.modules[{name!r}] = None\n" for name in sorted(_EXTRA_OF))
+    assert ended(f"import sys\n{absent}from ethbrake_marl.extensions import report") == (0, "", "")
+
+
+def test_help__of_watch_says_the_list_that_the_package_has(ethbrake: Command) -> None:
+    assert f"[default: {LIST_SEED}]" in ethbrake("watch", "--help").out
+
+
+def test_film__of_an_extra_that_is_missing_says_the_line_that_installs_it(ethbrake: Command, monkeypatch) -> None:
+    check_extra(ethbrake, "imageio_ffmpeg", "render", "watch --agents coast --output film.mp4", monkeypatch)
+
+
+REFUSED = [
+    ("watch --agents nobody --output x.txt", "a film that ends in '.txt': films are written as .gif, .mp4, .svg")
+]
+
+
+@pytest.mark.parametrize(("line", "message"), REFUSED, ids=lambda value: value[:60])
+def test_film__is_refused(line: str, message: str, refuse: Refuse) -> None:
+    refuse(line, message)
+
+
+def test_film__that_is_there_is_not_replaced_unasked(refuse: Refuse) -> None:
+    Path("film.gif").write_text("precious")
+    told = "film.gif: is there already; give another name or use force (--force)"
+    refuse("watch --agents full_brake --output film.gif", told)

@@ -1,0 +1,63 @@
+"""Parts of the user's own in reports, and the page that shows how to add them."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.cli.app import app, run_command
+from ethbrake_marl.extensions.report.report import Report
+from tests.extending.test_extending import changed, measured_by_vehicle
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_measure__of_each_vehicle_stands_in_the_report() -> None:
+    found = measured_by_vehicle()
+    report = Report("mine", eb.summarise(found), found).html
+    assert "squared (m2/s2)" in report and "injured, vehicle 2 (1)" in report
+    assert "Squared closing speed of every impact." in report
+
+
+def test_measure__stands_in_the_page_of_an_evaluation(empty_folder: Path) -> None:
+    rear = changed(lambda episodes: episodes.largest_speed_change_mps[:, 2])
+    eb.register_measure("change_of_rear", rear, unit="m/s")
+    words = [
+        "evaluate",
+        "--agents",
+        "full_brake,coast",
+        "--seed",
+        "7",
+        "--episodes",
+        "40",
+        "--output",
+        "out",
+        "--report",
+    ]
+    assert run_command(words) == 0
+    found = eb.evaluate(agents="full_brake", scenario="paper-random", episodes=40).outcome("full_brake")
+    page = Path("out/report.html").read_text()
+    assert "change_of_rear (m/s)" in page and f"{found.metrics['change_of_rear'].mean():.2f}" in page
+
+
+DOCS = Path(__file__).resolve().parents[3] / "docs"
+PAGE = "".join((DOCS / f"{name}.md").read_text("utf-8") for name in ("extending", "own-policy"))
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_page__its_code_runs_from_the_top_down(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(app, "registered_commands", [*app.registered_commands])
+    code = "\n".join(re.findall("```python\n(.*?)```", PAGE, re.DOTALL))
+    names: dict[str, object] = {"__name__": "my_file"}
+    exec(compile(code, "extending.md", "exec"), names)
+    assert names["status"] == 0
+    assert run_command(["scenario", "parts"]) == 0
+    told = capsys.readouterr().out
+    assert all(name in told for name in ("comfort", "time_gap", "rural", "front-first", "patient", "absorbed"))
+    policy = eb.load_policy(tmp_path / "runs" / "again")
+    assert policy.manifest.algorithm == "patient" and "comfort" in policy.manifest.reward["terms"]
+    assert policy.manifest.observation.features[-1] == "rear_1.mass_ratio"
+    assert (tmp_path / "runs" / "again" / "harm.png").stat().st_size > 1000

@@ -1,0 +1,81 @@
+"""What films and figures refuse."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.extensions.report.deceleration import deceleration_curve
+from ethbrake_marl.extensions.report.episode_figure import trajectories
+from ethbrake_marl.extensions.report.film import film_bytes, film_scenes
+from ethbrake_marl.extensions.report.harm_figures import harm_by_agent
+from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap, learning_curve
+from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
+from ethbrake_marl.extensions.report.style import picture_ending
+from ethbrake_marl.scenario.task import Task
+from tests.contract.interfaces import CRASH
+from tests.refused import refused
+
+PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
+
+
+BRAKE = {"full_brake": eb.make_agent("full_brake")}
+
+
+@pytest.fixture(scope="module")
+def scene() -> Any:
+    return film_scenes(CRASH.sample(1, seed=0).worlds, eb.make_agent("full_brake"), scenario=CRASH)[:1]
+
+
+@pytest.mark.parametrize(
+    ("films", "message"),
+    [
+        (lambda scene: film_bytes({"a": scene}, ".gif", fps=30), "film_bytes: fps = 30: must divide 100"),
+        (lambda scene: film_bytes({}, ".gif"), "film_bytes: no films given"),
+        (
+            lambda scene: film_bytes({str(k): scene for k in range(13)}, ".gif"),
+            "film: 13 agents, one below the other; at most 12 are shown",
+        ),
+        (
+            lambda scene: film_bytes({str(k): scene * 5000 for k in range(2)}, ".gif"),
+            "film of 2 agents for 200 s: needs 10,000 pictures, and at most 2,500 are kept",
+        ),
+    ],
+    ids=["rate", "none", "too many", "too long"],
+)
+def test_film__is_refused(films: Callable[[Any], bytes], message: str, scene: Any) -> None:
+    with refused(message):
+        films(scene)
+
+
+FIGURES: dict[str, Callable[[], object]] = {
+    "deceleration curve: 2 worlds given; exactly one is drawn": lambda: deceleration_curve(
+        PAPER.sample(2, 7).worlds, Task(PAPER, (1,))
+    ),
+    "deceleration curve: points = 1; at least 2 are needed": lambda: deceleration_curve(
+        PAPER.sample(1, 7).worlds, Task(PAPER, (1,)), points=1
+    ),
+    "curves of several seeds: the trainings were never evaluated at the same step": lambda: SeedCurve.of(
+        [{0: 1.0}, {1: 1.0}]
+    ),
+    "seed_curves: nothing to draw; at least one training with one evaluation is needed": lambda: seed_curves(
+        {"harm": {}}
+    ),
+    "harm_by_agent: no rows; evaluate at least one agent": lambda: harm_by_agent([]),
+    "learning_curve: no points; evaluate the policy at least once during training": lambda: learning_curve([]),
+    "harm_against_total_gap: bins = 0; at least 1 is needed": lambda: harm_against_total_gap(
+        eb.evaluate(PAPER.sample(2, 7), BRAKE, scenario=PAPER), bins=0
+    ),
+    "agent 'ppo' was not evaluated; evaluated: full_brake": lambda: harm_against_total_gap(
+        eb.evaluate(PAPER.sample(2, 7), BRAKE, scenario=PAPER), agents=["ppo"]
+    ),
+    "map.png.eps: pictures are written as PNG, SVG or PDF": lambda: picture_ending("map.png.eps"),
+    "trajectories: no records given": lambda: trajectories({}),
+}
+
+
+@pytest.mark.parametrize("message", FIGURES)
+def test_figure__needs_something_to_draw(message: str) -> None:
+    with refused(message):
+        FIGURES[message]()

@@ -1,0 +1,71 @@
+"""What searches and searching agents refuse."""
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.making import make_agent
+from ethbrake_marl.engine.profiles import ProfileProblem, profile_problem
+from ethbrake_marl.extensions.search.around import Searched
+from ethbrake_marl.extensions.search.refine import refine
+from ethbrake_marl.extensions.search.templates import best_templates
+from tests.agents.test_refusals import check_failure
+from tests.refused import refused
+
+PAPER = eb.load_scenario("paper-random")
+WORLDS = PAPER.sample(12, 7).worlds
+BRAKE = make_agent("full_brake")
+
+
+@cache
+def problem(*vehicles: int) -> ProfileProblem:
+    return profile_problem(WORLDS, vehicles)
+
+
+REFUSED: dict[str, Callable[[], object]] = {
+    "agent 'planner+step+episode': +search comes first and once, then one shield of +episode": lambda: make_agent(
+        "planner+step+episode", scenario=PAPER
+    ),
+    "agent 'planner:0': the argument must be a number of candidates per decision": lambda: make_agent("planner:0"),
+    "agent 'planner:1.5': the argument must be a number of candidates per decision": lambda: make_agent("planner:1.5"),
+    "best_harm: budget = 0; at least 1 candidate is needed": lambda: make_agent("best_harm", most_candidates=0),
+    "search: candidates = 0: must be a whole number in 1..1000000": lambda: Searched(BRAKE, PAPER, candidates=0),
+    "refine: commands of shape (3, 75); (12, 75) of one vehicle are needed": lambda: refine(
+        problem(1), np.zeros((3, 75)), budget=5
+    ),
+    "refine: a command is beyond the vehicle's capacity": lambda: refine(
+        problem(1), np.full((12, problem(1).last_step.max()), -50.0), budget=5
+    ),
+    "budget = 0: must be a whole number, at least 1": lambda: refine(
+        problem(1), np.zeros((12, problem(1).last_step.max())), budget=0
+    ),
+    "templates = 0: must be a whole number, at least 1": lambda: best_templates(
+        problem(1), np.full(12, np.inf), number=0
+    ),
+    "templates: 2 vehicles; they are of one": lambda: best_templates(problem(1, 2), np.full(12, np.inf), number=40),
+}
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_search__is_refused(message: str) -> None:
+    with refused(message):
+        REFUSED[message]()
+
+
+@pytest.mark.parametrize("around", ["+search", "+search+step"])
+def test_failure__is_told_with_its_world_where_a_search_stands_around_the_agent(around: str) -> None:
+    check_failure(around)
+
+
+PLANS = PAPER.replace(
+    early_impacts="keep", roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "planner:8"}
+)
+
+
+def test_looking_ahead__needs_commands_that_are_fixed_at_the_alert() -> None:
+    with refused("vehicle_3 is driven by 'planner:8', whose command is not fixed at the alert"):
+        drive(WORLDS, Searched(BRAKE, PLANS), PLANS, 1)

@@ -1,0 +1,19 @@
+"""As tests/test_same_bits.py, of extensions."""
+
+from tests.test_same_bits import PACKAGE, SQUARES, TRAINED, calls_in
+
+SEARCHED = "a search, whose finds are written down as numbers"
+REMAINS = {
+    ("learners/rollout_classification_model.py", "**"): TRAINED,
+    ("learners/scout.py", "np.exp"): TRAINED,
+    ("learners/vine_model.py", "**"): TRAINED,
+    ("report/player.py", "**"): SQUARES,
+    ("reproduction/trajectories.py", "**"): SQUARES,
+    ("studies/falsification.py", "**"): SEARCHED,
+    ("studies/falsification.py", "rng.standard_normal"): SEARCHED,
+    ("studies/falsification.py", "scipy.stats"): SEARCHED,
+}
+
+
+def test_extensions__call_nothing_that_differs_by_processor_but_what_is_listed() -> None:
+    assert calls_in(PACKAGE / "extensions") == set(REMAINS)
