@@ -108,9 +108,9 @@ def only_learner(engine: Engine) -> int:
 def learner_actions(engine: Engine, actions: Mapping[str, Any], count: int | None) -> Floats | dict[int, Floats]:
     """Return the learners' actions of an engine with one world, as ``Engine.step`` takes them: [1, L].
 
-    ``actions`` maps vehicle names to actions [1], or to an index of ``count`` discrete actions. Raises ``InvalidInput`` naming the vehicle whose action is missing or
-    has the wrong shape; the engine checks the range. Behind a shield, actions may be missing; then the result is a
-    mapping from vehicle index to action [1].
+    ``actions`` maps vehicle names to actions [1], or to indices of ``count`` discrete actions. Raises ``InvalidInput``
+    naming the vehicle whose action is missing or has the wrong shape; the engine checks the range. Behind a shield,
+    actions may be missing; then the result is a mapping from vehicle index to action [1].
     """
     names, columns = engine.scenario.vehicle_names, np.empty((1, len(engine.learners)))
     for c, vehicle in enumerate(engine.learners):

@@ -131,8 +131,8 @@ class LineTask(TaskClass):  # type: ignore[misc]
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
         """Return a function without arguments that makes a ``LineEnv`` with ``num_envs`` worlds.
 
-        ``seed`` is the seed of the worlds (None: 0). BenchMARL also passes ``continuous_actions`` (``InvalidInput`` if the
-        task has the other kind) and ``device``, which is unused.
+        ``seed`` is the seed of the worlds (None: 0). BenchMARL also passes ``device``, which is unused, and
+        ``continuous_actions``; raises ``InvalidInput`` if the task has the other kind of actions.
         """
         config, actions = self.config, self.config.get("actions")
         if continuous_actions != (actions is None):
