@@ -16,8 +16,9 @@ from ethbrake_marl.agents.foreign_wrappers import normalisation, training_enviro
 from ethbrake_marl.agents.protocol import Source
 from ethbrake_marl.engine.memory import Memory, checked_memory, map_memory, take_memory
 from ethbrake_marl.engine.scripts import Script
-from ethbrake_marl.errors import AgentFailed, InvalidInput, describe_error, naming_extras
+from ethbrake_marl.errors import AgentFailed, InvalidInput, check_whole_number, describe_error, naming_extras
 from ethbrake_marl.game.actions import LARGEST, action_to_command
+from ethbrake_marl.game.discrete_actions import index_to_action
 from ethbrake_marl.game.full_state import Appended, full_state, row_features
 from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec, choose_observation, observe
 from ethbrake_marl.game.observed import observation_for
@@ -205,8 +206,9 @@ def policy_agent(
     clip: bool = False,
     appended: Appended | None = None,
     ignore_wrappers: bool = False,
+    actions: int | None = None,
 ) -> PolicyAgent:
-    """Return an agent for a policy of any library: observations [n, F] float32 -> actions [n, 1] in [-1, 1].
+    """Return an agent for a policy of any library: observations [n, F] float32 -> actions [n, 1], or indices [n].
 
     A policy with a memory is a function ``(observation, state) -> (action, state)`` with an ``initial_state``, or a
     model whose ``predict`` returns a state.
@@ -221,12 +223,14 @@ def policy_agent(
             that of the policy itself, of a Stable-Baselines3 model's environment, or the default.
         initial_state: makes the memory of ``n`` episodes at their start: an array whose first axis is the world, or
             tuples and mappings of arrays. None: a function has no memory.
-        clip: clip actions to [-1, 1]; by default an action beyond is an error.
+        clip: clip actions to [-1, 1], and indices to the first and last; by default a value beyond is an error.
         appended: what training appended to each observation: ``number`` (the learner's number) or ``state`` (the true
             state of the line), as for ``make_sb3_vec_env``; needs the scenario with its learners. None: as in the
             model's training environment, or nothing.
         ignore_wrappers: accept a model even if wrappers of its training may have changed observations or actions, if
             its actions have other bounds, or if the statistics of its ``VecNormalize`` are missing.
+        actions: number of discrete actions of which the policy returns the index, as in an environment with these
+            ``actions``. None: as in the model's environment, or actions in [-1, 1].
 
     Raises ``InvalidInput`` for anything else, for a policy with another number of features, and for a model that was
     trained under wrappers that may change observations or actions.
@@ -238,6 +242,8 @@ def policy_agent(
     5
 
     """
+    if actions is not None:
+        check_whole_number("actions", actions, 2)
     scenario = load_scenario(scenario) if isinstance(scenario, str) else scenario
     of_file = isinstance(policy, str | os.PathLike)
     named = name or (Path(policy).stem if of_file else str(getattr(policy, "__name__", type(policy).__name__)))
@@ -260,19 +266,30 @@ def policy_agent(
             f"agent {named!r}: the model is trained on other features than {spec}: {seen}; leave"
             " observation out, and give the scenario it was trained in, or none"
         )
-    actions = getattr(policy, "action_space", None)
-    low, high = (np.asarray(getattr(actions, end, np.nan)) for end in ("low", "high"))
-    if not (actions is None or ignore_wrappers or (low.tolist() == [-1.0] and high.tolist() == [1.0])):
-        raise InvalidInput(
-            f"agent {named!r}: the policy gives actions in {actions}, here they mean [-1, 1]; write a function around"
-            " it that says what they mean"
-        )
+    actions = getattr(trained, "actions", None) if actions is None else actions
+    if not ignore_wrappers:
+        _check_action_space(policy, named, actions)
     infer, begin = adapt_policy(policy, named, size, initial_state)
     more = None if appended is None or scenario is None else _appending(appended, scenario)
-    agent = PolicyAgent(infer, named, spec, begin, clip, lambda: weights_sha256(policy), more)
+    agent = PolicyAgent(infer, named, spec, begin, clip, lambda: weights_sha256(policy), more, actions)
     if appended == "state":
         agent.knows = Source.STATE
     return agent
+
+
+def _check_action_space(policy: Any, name: str, actions: int | None) -> None:
+    """Raise ``InvalidInput`` if the policy has another action space than an environment with these ``actions``."""
+    space = getattr(policy, "action_space", None)
+    low, high = (np.asarray(getattr(space, end, np.nan)).tolist() for end in ("low", "high"))
+    count, least = getattr(space, "n", None), getattr(space, "start", None)
+    fits = (low, high) == ([-1.0], [1.0]) if actions is None else (count, least) == (actions, 0)
+    if space is None or fits:
+        return
+    right = "[-1, 1]" if actions is None else f"an index from 0 to {actions - 1} (actions={actions})"
+    advice = "write a function around it that says what they mean"
+    if least == 0:
+        advice = f"say actions={count} if they are evenly spaced from -1 to 1, or {advice}"
+    raise InvalidInput(f"agent {name!r}: the policy gives actions in {space}, here they mean {right}; {advice}")
 
 
 def _appending(appended: Appended, scenario: Scenario) -> Callable[[Worlds, int], Observations]:
@@ -313,12 +330,14 @@ class PolicyAgent:
         clip: bool,
         weights_sha256: Callable[[], str | None],
         more: Callable[[Worlds, int], Observations] | None = None,
+        actions: int | None = None,
     ) -> None:
         self.name = name
         self.weights_sha256 = weights_sha256  # hash of the policy's present weights; None if they cannot be read
         self.observation = observation
         self._infer, self._initial_state, self._clip = infer, initial_state, clip
         self._more = more  # what follows the own observation
+        self._actions = actions  # number of discrete actions, of which the policy returns an index; None: no index
 
     def policy_sha256(self) -> str | None:
         """Return the hash of the policy's present weights; None if they cannot be read."""
@@ -404,6 +423,8 @@ class PolicyAgent:
         ``seen``, ``worlds`` and ``steps`` [n] (steps taken) are used in the message only.
         """
         n, what = worlds.n, f"gave {action.dtype} of shape {action.shape} for observations of shape {seen.shape}"
+        if self._actions is not None:
+            return self._checked_indices(action, self._actions, what, worlds, steps)
         if action.shape != (n, 1) or action.dtype.kind not in "fiu":
             first = len(action) if action.shape[1:] in ((), (1,)) and action.ndim and len(action) < n else 0
             raise self._refusal(first, worlds, steps, f"{what}; one number per world is needed, shape ({n}, 1)")
@@ -417,6 +438,19 @@ class PolicyAgent:
             right = "must be in [-1, 1]; with clip=True the nearest is meant"
             raise self._refusal(k, worlds, steps, f"{what}, in which stands {values[k]:g}; {right}")
         return values.clip(-1.0, 1.0)
+
+    def _checked_indices(self, indices: NDArray[Any], count: int, what: str, worlds: Worlds, steps: Ints) -> Floats:
+        """Check the indices of discrete actions and return the actions as [n] in [-1, 1]."""
+        n, last = worlds.n, count - 1
+        right = f"with actions={count} a whole number from 0 to {last} per world is needed, shape ({n},) or ({n}, 1)"
+        if indices.shape not in ((n,), (n, 1)) or indices.dtype.kind not in "iu":
+            raise self._refusal(0, worlds, steps, f"{what}; {right}")
+        row = indices.reshape(n).clip(0, last) if self._clip else indices.reshape(n)
+        inside = (row >= 0) & (row <= last)
+        if not inside.all():
+            k = int(np.argmin(inside))
+            raise self._refusal(k, worlds, steps, f"{what}, in which stands {row[k]}; {right}")
+        return index_to_action(row, count)
 
     def _refusal(self, k: int, worlds: Worlds, steps: Ints, reason: str) -> AgentFailed:
         return AgentFailed(self.name, k, f"{_moment_text(k, worlds, steps)}: {reason}")

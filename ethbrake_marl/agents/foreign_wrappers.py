@@ -98,6 +98,11 @@ def training_environment(model: Any, name: str, *, ignore_wrappers: bool = False
         raise InvalidInput(
             f"agent {name!r}: the copies of the model's environment observe different features; all need the same"
         )
+    counts = {getattr(base, "actions", None) for base in bases}
+    if not ignore_wrappers and len(counts) > 1:
+        raise InvalidInput(
+            f"agent {name!r}: the copies of the model's environment have different actions, {counts}; all need the same"
+        )
     return bases[0] if bases else None
 
 

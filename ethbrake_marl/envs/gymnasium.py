@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.infos import OneWorld, Report
-from ethbrake_marl.envs.making import AnyScenario, action_box, feature_box, learner_actions, make_engine, only_learner
+from ethbrake_marl.envs.making import (
+    AnyScenario,
+    feature_box,
+    learner_action_space,
+    learner_actions,
+    make_engine,
+    only_learner,
+)
 from ethbrake_marl.envs.viewer import Viewer
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec
@@ -89,6 +96,8 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
         learners: the one vehicle that learns instead of the scenario's, by name (``vehicle_2``) or index from 0.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         observation: what the learner observes; None: ``observation_for(scenario)``.
+        actions: None: a learner acts by one number in [-1, 1]. A whole number K, at least 2: by an index of K evenly
+            spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random")
@@ -110,7 +119,9 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
         learners: Sequence[str | int] | None = None,
         reward: Reward = "harm",
         observation: Observation | None = None,
+        actions: int | None = None,
     ) -> None:
+        self.action_space, self.actions = learner_action_space(actions), actions
         self.engine = make_engine(scenario, 1, learners=learners, reward=reward, observation=observation)
         self.render_mode, self.viewer = render_mode, Viewer(self.engine, render_mode)
         self.metadata = {**self.metadata, **self.viewer.metadata}
@@ -118,7 +129,6 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
         self._column = np.array([self.learner])
         self._name = self.engine.scenario.vehicle_names[self.learner]
         self.observation_space = feature_box(self.engine.observations[self.learner].features)
-        self.action_space = action_box()
         self._running = False
 
     def reset(
@@ -144,7 +154,7 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
         """
         if not self._running:
             raise InvalidInput("step: no episode is running; call reset first")
-        step = self.engine.step(learner_actions(self.engine, {self._name: action}))
+        step = self.engine.step(learner_actions(self.engine, {self._name: action}, self.actions))
         self._running = not step.ended[0]
         if self.render_mode is not None:
             self.viewer.play()

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Discrete
 
 from ethbrake_marl.agents.driving import script_agents
 from ethbrake_marl.engine.engine import Engine
@@ -34,6 +34,17 @@ def feature_box(features: Sequence[Feature]) -> Box[np.float32]:
 def action_box() -> Box[np.float32]:
     """Return the action space, a float32 box [1]: -1 full braking capacity, 0 coasts, +1 full driving capacity."""
     return Box(-1.0, 1.0, (1,), dtype=np.float32)
+
+
+def learner_action_space(actions: int | None) -> Any:
+    """Return the action space of a learner: ``action_box()``, or that of as many discrete ``actions``.
+
+    Raises ``InvalidInput`` unless ``actions`` is None or a whole number, at least 2.
+    """
+    if actions is None:
+        return action_box()
+    check_whole_number("actions", actions, 2)
+    return Discrete(int(actions))
 
 
 def make_engine(
@@ -94,12 +105,12 @@ def only_learner(engine: Engine) -> int:
     return engine.learners[0]
 
 
-def learner_actions(engine: Engine, actions: Mapping[str, Any]) -> Floats | dict[int, Floats]:
+def learner_actions(engine: Engine, actions: Mapping[str, Any], count: int | None) -> Floats | dict[int, Floats]:
     """Return the learners' actions of an engine with one world, as ``Engine.step`` takes them: [1, L].
 
-    ``actions`` maps vehicle names to actions [1]. Raises ``InvalidInput`` naming the vehicle whose action is missing or
-    has the wrong shape; the engine checks the range. Behind a shield, actions may be missing; then the result is a
-    mapping from vehicle index to action [1].
+    ``actions`` maps vehicle names to actions [1], or to indices of ``count`` discrete actions. Raises ``InvalidInput``
+    naming the vehicle whose action is missing or has the wrong shape; the engine checks the range. Behind a shield,
+    actions may be missing; then the result is a mapping from vehicle index to action [1].
     """
     names, columns = engine.scenario.vehicle_names, np.empty((1, len(engine.learners)))
     for c, vehicle in enumerate(engine.learners):
@@ -107,11 +118,12 @@ def learner_actions(engine: Engine, actions: Mapping[str, Any]) -> Floats | dict
         if actions.get(name) is None:
             if engine.guard is not None:
                 given = {i: actions[names[i]] for i in engine.learners if actions.get(names[i]) is not None}
-                return {i: checked_action(each, (1,), names[i]) for i, each in given.items()}
+                return {i: checked_action(each, (1,), names[i], count) for i, each in given.items()}
             raise InvalidInput(f"step: no action for the learner {name}")
         action = actions[name]
-        if type(action) is not np.ndarray or action.shape != (1,) or action.dtype.kind not in "fiu":
-            action = checked_action(action, (1,), name)
+        is_plain = type(action) is np.ndarray and action.shape == (1,) and action.dtype.kind in "fiu"
+        if count is not None or not is_plain:
+            action = checked_action(action, (1,), name, count)
         columns[0, c] = action.item()
     return columns
 

@@ -14,7 +14,15 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.infos import OneWorld, Report
-from ethbrake_marl.envs.making import AnyScenario, IgnoredAction, action_box, feature_box, learner_actions, make_engine
+from ethbrake_marl.envs.making import (
+    AnyScenario,
+    IgnoredAction,
+    action_box,
+    feature_box,
+    learner_action_space,
+    learner_actions,
+    make_engine,
+)
 from ethbrake_marl.envs.viewer import Viewer
 from ethbrake_marl.errors import InvalidInput, check_whole_number, unknown_name
 from ethbrake_marl.game.actions import checked_action
@@ -73,13 +81,13 @@ class InTurns(SeededInside, parallel_to_aec_wrapper):  # type: ignore[misc]  # P
         After the last agent's action, all vehicles advance by one time step. Raises ``InvalidInput`` for an invalid
         action of a learner, and for any action but None after the agent's episode has ended.
         """
-        agent, engine = self.agent_selection, self.env.unwrapped.engine
+        agent, engine, count = self.agent_selection, self.env.unwrapped.engine, self.env.unwrapped.actions
         assert isinstance(engine, Engine)
         if self.terminations[agent] or self.truncations[agent]:
             if action is not None:
                 raise InvalidInput(f"step: the episode of {agent} is over; only None may follow, or reset")
         elif engine.scenario.vehicle_names.index(agent) in engine.learners and not (action is None and engine.guard):
-            checked_action(action, (1,), agent)  # behind a shield, an action may be omitted
+            checked_action(action, (1,), agent, count)  # behind a shield, an action may be omitted
         super().step(action)
 
 
@@ -105,6 +113,8 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         observation: what every vehicle observes, or a mapping from name to observation; None: the scenario's.
         agents: ``all`` vehicles, or ``learners`` only, for trainers that learn from every agent.
         max_cycles: truncates an episode after this many steps; None: only at the horizon.
+        actions: None: a learner acts by one number in [-1, 1]. A whole number K, at least 2: by an index of K evenly
+            spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
 
     >>> import ethbrake_marl as eb
     >>> env = eb.parallel_env(scenario="paper-random")
@@ -127,6 +137,7 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         observation: Observation | None = None,
         agents: WhoIsAgent = "all",
         max_cycles: int | None = None,
+        actions: int | None = None,
     ) -> None:
         if max_cycles is not None:
             check_whole_number("max_cycles", max_cycles, 1)
@@ -143,7 +154,13 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         seen = self.engine.observations
         self._alike = len({seen[i] for i in self._vehicles.tolist()}) == 1
         self.observation_spaces = {names[i]: feature_box(seen[i].features) for i in self._vehicles.tolist()}
-        self.action_spaces = {agent: action_box() for agent in self.possible_agents}
+        if actions is not None and not learners:
+            raise InvalidInput(f"actions = {actions!r}: nobody learns in {self.engine.scenario.name!r}; leave it out")
+        self.actions = actions
+        self.action_spaces = {
+            agent: learner_action_space(actions) if agent in learners else action_box()
+            for agent in self.possible_agents
+        }
         self.state_space = feature_box(state_features(self.engine.scenario))
 
     def observation_space(self, agent: str) -> Any:
@@ -151,7 +168,10 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Any:
-        """Return the action space of the agent with this name, a float32 box [1]; the same object on each call."""
+        """Return the action space of the agent with this name; the same object on each call.
+
+        It is a float32 box [1], or for a learner with discrete actions ``Discrete(actions)``.
+        """
         return self.action_spaces[agent]
 
     def reset(
@@ -187,7 +207,7 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
                 raise unknown_name("agent", agent, self.possible_agents)
         if self._scripted:
             self._warn_of_ignored(actions)
-        step = self.engine.step(learner_actions(self.engine, actions))
+        step = self.engine.step(learner_actions(self.engine, actions, self.actions))
         agents = self.possible_agents
         (rewards,) = step.reward.take(self._vehicles, axis=1).tolist()
         terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])

@@ -18,15 +18,15 @@ from ethbrake_marl.envs.infos import Begun, Report, plain_rows, shield_columns
 from ethbrake_marl.envs.making import (
     INITIAL_STATE,
     AnyScenario,
-    action_box,
     chosen_seed,
     feature_box,
+    learner_action_space,
     make_engine,
     warn_of_unknown,
 )
 from ethbrake_marl.envs.viewer import Viewer
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.game.actions import own_actions
+from ethbrake_marl.game.actions import checked_action, own_actions
 from ethbrake_marl.game.full_state import Appended, full_state, row_features
 from ethbrake_marl.game.observations import Observation, Observations
 from ethbrake_marl.game.rewards import Reward
@@ -49,6 +49,7 @@ def make_sb3_vec_env(
     appended: Appended | None = None,
     step_infos: bool = False,
     render_mode: str | None = None,
+    actions: int | None = None,
 ) -> EthBrakeVecEnv:
     """Return ``n_envs`` worlds as a ``VecEnv`` for Stable-Baselines3.
 
@@ -67,6 +68,8 @@ def make_sb3_vec_env(
             critic.
         step_infos: fill the infos of every step as the other interfaces do, not only at the end of an episode; slower.
         render_mode: ``rgb_array`` or None; ``render`` and ``VecVideoRecorder`` show all worlds side by side.
+        actions: None: a learner acts by one number in [-1, 1]. A whole number K, at least 2: by an index of K evenly
+            spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
 
     >>> import ethbrake_marl as eb
     >>> eb.make_sb3_vec_env("paper-random", 4, seed=7).reset().shape
@@ -76,7 +79,13 @@ def make_sb3_vec_env(
     begin = chosen_seed(seed)
     engine = make_engine(scenario, n_envs, learners=learners, reward=reward, observation=observation)
     return EthBrakeVecEnv(
-        engine, begin, horizon_is_end=horizon_is_end, appended=appended, step_infos=step_infos, render_mode=render_mode
+        engine,
+        begin,
+        horizon_is_end=horizon_is_end,
+        appended=appended,
+        step_infos=step_infos,
+        render_mode=render_mode,
+        actions=actions,
     )
 
 
@@ -97,6 +106,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
             the full state of the line. None: nothing.
         step_infos: fill the infos of every step, not only at the end of an episode.
         render_mode: ``rgb_array`` or None.
+        actions: number of discrete actions, of which a row's action is the index; None: an action is in [-1, 1].
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -119,6 +129,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         appended: Appended | None = None,
         step_infos: bool = False,
         render_mode: str | None = None,
+        actions: int | None = None,
     ) -> None:
         features = row_features(engine.observation.features, appended, engine.scenario)
         if not engine.learners:
@@ -130,6 +141,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         if render_mode not in (None, "rgb_array"):
             raise InvalidInput(f"render_mode = {render_mode!r}: must be 'rgb_array', or None")
         self.render_mode, self.viewer = render_mode, Viewer(engine, render_mode, batch=True)
+        self.actions, space = actions, learner_action_space(actions)
         self._set_seed(seed)
         self._learners = np.array(engine.learners, np.int64)
         self._actions: NDArray[Any] | None = None
@@ -138,7 +150,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self._steps = np.zeros(rows, np.int64)
         self._begun = np.zeros(0)  # values of the report at each episode's beginning
         self._begun_shield: Columns = {}  # infos of a shield at each episode's beginning
-        super().__init__(rows, feature_box(features), action_box())
+        super().__init__(rows, feature_box(features), space)
         self.metadata = {**self.viewer.metadata, "render_modes": ["rgb_array"]}
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
@@ -167,8 +179,8 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return self._observe()
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Store the actions [rows, 1] in [-1, 1] for ``step_wait``."""
-        self._actions = own_actions(actions, "the learners")
+        """Store the actions for ``step_wait``: [rows, 1] in [-1, 1], or indices [rows]."""
+        self._actions = own_actions(actions, "the learners", self.actions)
 
     def step_wait(self) -> tuple[Observations, Rewards, Bools, list[dict[str, Any]]]:
         """Advance every world by one time step with the stored actions.
@@ -184,6 +196,8 @@ class EthBrakeVecEnv(Begun, VecEnv):
             raise InvalidInput(
                 f"step: actions of shape {actions.shape}; one for each row, ({self.num_envs}, 1), is needed"
             )
+        if self.actions is not None:
+            actions = checked_action(actions, actions.shape, "the learners", self.actions)
         step = engine.step(actions.reshape(engine.n, len(learners)))
         reward = step.reward.take(learners, axis=1).reshape(-1)
         self._return += reward

@@ -19,15 +19,15 @@ from ethbrake_marl.envs.making import (
     LISTED_WORLD,
     RESET_MASK,
     AnyScenario,
-    action_box,
     feature_box,
+    learner_action_space,
     make_engine,
     only_learner,
     warn_of_unknown,
 )
 from ethbrake_marl.envs.viewer import Viewer
 from ethbrake_marl.errors import InvalidInput, check_whole_number
-from ethbrake_marl.game.actions import own_actions
+from ethbrake_marl.game.actions import checked_action, own_actions
 from ethbrake_marl.game.observations import Observation, Observations
 from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.state import Bools, Floats
@@ -93,6 +93,8 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
             infos in ``infos["final_info"]``. ``Disabled`` never resets: the caller must reset ended rows before the
             next step.
         max_episode_steps: truncates an episode after this many steps; None: only at the horizon.
+        actions: None: a learner acts by one number in [-1, 1]. A whole number K, at least 2: by an index of K evenly
+            spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -116,6 +118,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         observation: Observation | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,
+        actions: int | None = None,
     ) -> None:
         if max_episode_steps is not None:
             check_whole_number("max_episode_steps", max_episode_steps, 1)
@@ -127,7 +130,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         self.learner = only_learner(self.engine)
         self.num_envs = num_envs
         self.single_observation_space = feature_box(self.engine.observations[self.learner].features)
-        self.single_action_space = action_box()
+        self.single_action_space, self.actions = learner_action_space(actions), actions
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
@@ -164,7 +167,10 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
             raise InvalidInput(
                 f"step: episodes are over in rows {over}; reset(options={{'reset_mask': ...}}) them first"
             )
-        step = engine.step(self._fill_ignored(actions, before))
+        actions = self._fill_ignored(actions, before)
+        if self.actions is not None:
+            actions = checked_action(actions, (self.num_envs, 1), "the learners", self.actions)
+        step = engine.step(actions)
         if self.max_episode_steps is not None:
             engine.cut(step, self.max_episode_steps)
         # includes worlds that an interrupted step left without renewal
@@ -192,9 +198,9 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         """
         if self.autoreset_mode is not AutoresetMode.NEXT_STEP or not before.any():
             return actions
-        heeded = own_actions(actions, "the learners")
+        heeded = own_actions(actions, "the learners", self.actions)
         if heeded.shape[:1] == (self.num_envs,):
-            heeded[before] = 0.0
+            heeded[before] = 0
         return heeded
 
     def _rows_to_reset(self, options: Any) -> Bools:

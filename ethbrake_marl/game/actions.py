@@ -11,19 +11,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.game.discrete_actions import checked_indices, index_to_action
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats, Vehicles, real_numbers
 
 LARGEST = float(np.nextafter(np.float32(1.0), np.float32(2.0)))  # 1 plus one float32 step, accepted as a rounded 1
 
 
-def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str) -> Floats:
+def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str, count: int | None = None) -> Floats:
     """Return the action as float64 of ``shape``; raise ``InvalidInput`` unless it fits and is in [-1, 1].
 
     Axes of length 1 may be missing or added: a single action may be a number, [1] or [1, 1]. Rounding in a network can
     exceed the bounds by one float32 step; such a value counts as -1 or 1. ``names`` names the vehicles in the message.
+    With a ``count``, ``action`` holds indices of ``count`` discrete actions instead (``index_to_action``).
     """
-    given = _numbers(action, names)
+    given = _numbers(action, names) if count is None else index_to_action(action, count, names)
     if given.shape != shape and _longer_axes(given.shape) != _longer_axes(shape):
         raise InvalidInput(f"action of {names}: shape {given.shape}; {shape} is needed")
     good = (given >= -LARGEST) & (given <= LARGEST)
@@ -34,13 +36,15 @@ def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str) -> Flo
     return given.reshape(shape).clip(-1.0, 1.0)
 
 
-def own_actions(actions: ArrayLike, names: str) -> NDArray[Any]:
+def own_actions(actions: ArrayLike, names: str, count: int | None = None) -> NDArray[Any]:
     """Return a copy of the actions as an array, which later changes by the caller do not affect.
 
     Raises ``InvalidInput`` for a list or tensor with values that are not numbers; a NumPy array is copied unchecked.
-    ``names``: names of the vehicles, for the message.
+    ``names``: names of the vehicles, for the message. With a ``count``, they are indices of ``count`` discrete actions.
     """
-    return actions.copy() if isinstance(actions, np.ndarray) else _numbers(actions, names).copy()
+    if isinstance(actions, np.ndarray):
+        return actions.copy()
+    return _numbers(actions, names).copy() if count is None else checked_indices(actions, count, names)
 
 
 def _numbers(action: ArrayLike, names: str) -> Floats:

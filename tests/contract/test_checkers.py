@@ -37,6 +37,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "nobody learns": {"scenario": ANY_START, "learners": []},
     "two learn": {"scenario": ANY_START, "learners": ["vehicle_2", "vehicle_3"]},
     "learners alone": {"scenario": LEVELS["cooperation-3-pair"], "agents": "learners"},
+    "discrete": {"scenario": LEVELS["cooperation-3-pair"], "actions": 9},
     **{mode: {"scenario": REST, "render_mode": mode} for mode in Viewer.METADATA["render_modes"][1:]},
 }
 STEP, EPISODE = {}, {"mode": "episode", "policy": eb.make_agent("full_brake")}
@@ -44,10 +45,10 @@ MAKERS: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
     **{name: (partial(parallel_env, **given), partial(env, **given)) for name, given in SETTINGS.items()},
     **{
         f"shielded, {mode}": (
-            lambda given=given: eb.HybridShield(parallel_env(), **given),
-            lambda given=given: eb.shielded_aec(parallel_env(), **given),
+            lambda given=given, acts=acts: eb.HybridShield(parallel_env(**acts), **given),
+            lambda given=given, acts=acts: eb.shielded_aec(parallel_env(**acts), **given),
         )
-        for mode, given in (("step", STEP), ("episode", EPISODE))
+        for mode, given, acts in (("step", STEP, {}), ("episode", EPISODE, {}), ("discrete", STEP, {"actions": 9}))
     },
 }
 
@@ -64,16 +65,18 @@ def test_pettingzoo__checkers_pass(name: str) -> None:
         seed_test(in_turn, num_cycles=20)
 
 
+@pytest.mark.parametrize("actions", [None, 9])
 @pytest.mark.parametrize("scenario", [*SCENARIOS.values(), REST], ids=lambda scenario: scenario.name)
-def test_gymnasium_and_stable_baselines3__checkers_pass(scenario: Any) -> None:
-    plain = gymnasium.make("EthBrake-v0", scenario=scenario).unwrapped
+def test_gymnasium_and_stable_baselines3__checkers_pass(scenario: Any, actions: int | None) -> None:
+    plain = gymnasium.make("EthBrake-v0", scenario=scenario, actions=actions).unwrapped
     check_env(plain)
     sb3_check_env(plain)
 
 
 def test_gymnasium_and_stable_baselines3__checkers_pass_behind_the_shield() -> None:
-    check_env(eb.ShieldedEnv(EthBrakeEnv()), skip_render_check=True)
-    sb3_check_env(eb.ShieldedEnv(EthBrakeEnv()))
+    for actions in (None, 9):
+        check_env(eb.ShieldedEnv(EthBrakeEnv(actions=actions)), skip_render_check=True)
+        sb3_check_env(eb.ShieldedEnv(EthBrakeEnv(actions=actions)))
 
 
 def test_pettingzoo__render_test_passes() -> None:

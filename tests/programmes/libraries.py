@@ -265,7 +265,7 @@ def evaluated_by_itself(model: Any, agent: Any) -> float:
     scenario = eb.load_scenario(SCENARIO)
     sample = scenario.sample(OWN_EPISODES, SEED, channel="training")  # the worlds of ``env.reset(seed=SEED)``
     ours = eb.evaluate(sample, {"theirs": agent}, scenario=scenario).outcome("theirs").first_impact_harm
-    worlds = make_vec_env("EthBrake-v0", seed=SEED)
+    worlds = make_vec_env("EthBrake-v0", seed=SEED, env_kwargs={"actions": getattr(model.action_space, "n", None)})
     returns, _ = evaluate_policy(model, worlds, OWN_EPISODES, deterministic=True, return_episode_rewards=True)
     return float(np.abs(ours + returns).max())
 

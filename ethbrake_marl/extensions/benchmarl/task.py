@@ -18,7 +18,9 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from ethbrake_marl.envs.making import feature_box, make_engine
+from ethbrake_marl.envs.making import feature_box, learner_action_space, make_engine
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.game.discrete_actions import index_to_action
 from ethbrake_marl.game.full_state import full_state, state_features
 from ethbrake_marl.game.observed import observation_for
 from ethbrake_marl.game.rewards import Reward
@@ -33,7 +35,7 @@ GROUP = "learners"
 class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is missing
     """TorchRL environment over ``n`` worlds of ``scenario``.
 
-    Shapes: observation [n, L, F], action and reward [n, L, 1], state [n, S], done [n, 1].
+    Shapes: observation [n, L, F], action and reward [n, L, 1] (a discrete action [n, L]), state [n, S], done [n, 1].
 
     Args:
         scenario: the scenario, which has at least one learner.
@@ -42,6 +44,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
         reward: reward of the learners, as in the other environments: a name such as ``harm``, or weights.
         horizon_is_end: count an episode that the horizon cuts off as terminated, as in a training recipe.
         shield: mode of a shield around the learners (``step`` if there are several learners); None: no shield.
+        actions: number of discrete actions, of which an action is the index, as QMIX needs them; None: continuous ones.
 
     """
 
@@ -53,6 +56,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
         reward: Reward,
         horizon_is_end: bool = True,
         shield: str | None = None,
+        actions: int | None = None,
     ) -> None:
         super().__init__(device="cpu", batch_size=torch.Size([n]))
         self.engine = make_engine(scenario, n, reward=reward, observation=observation_for(scenario), seed=seed)
@@ -66,7 +70,8 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
         self.observation_spec = Composite(
             {GROUP: Composite({"observation": seen}, shape=rows), "state": state}, shape=(n,)
         )
-        action = Bounded(-1.0, 1.0, shape=(*rows, 1))
+        self.actions, space = actions, learner_action_space(actions)
+        action = Bounded(-1.0, 1.0, shape=(*rows, 1)) if actions is None else Categorical(space.n, shape=rows)
         self.action_spec = Composite({GROUP: Composite({"action": action}, shape=rows)}, shape=(n,))
         reward_of_each = Composite({"reward": Unbounded(shape=(*rows, 1))}, shape=rows)
         self.reward_spec = Composite({GROUP: reward_of_each}, shape=(n,))
@@ -84,8 +89,10 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
         return TensorDict(self._observe_all(), batch_size=self.batch_size)
 
     def _step(self, tensordict: Any) -> Any:
-        action = tensordict[GROUP, "action"].numpy()[:, :, 0].clip(-1.0, 1.0)
-        step = self.engine.step(action)
+        given = tensordict[GROUP, "action"].numpy()
+        step = self.engine.step(
+            given[:, :, 0].clip(-1.0, 1.0) if self.actions is None else index_to_action(given, self.actions)
+        )
         reward = torch.from_numpy(step.reward[:, self._learners, np.newaxis].astype(np.float32))
         terminated, truncated = step.terminated.copy(), step.truncated.copy()
         if self.horizon_is_end:
@@ -114,7 +121,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
     Args:
         name: name of the task in BenchMARL, such as ``PAPER_RANDOM``.
         config: ``scenario`` (a shipped name, a YAML file, its content, or a ``Scenario``) and the arguments ``reward``,
-            ``horizon_is_end`` and, optionally, ``shield`` of ``LineEnv``.
+            ``horizon_is_end`` and, optionally, ``shield`` and ``actions`` of ``LineEnv``.
 
     """
 
@@ -124,20 +131,25 @@ class LineTask(TaskClass):  # type: ignore[misc]
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
         """Return a function without arguments that makes a ``LineEnv`` with ``num_envs`` worlds.
 
-        ``seed`` is the seed of the worlds (None: 0). BenchMARL also passes ``continuous_actions`` and ``device``, which
-        are unused.
+        ``seed`` is the seed of the worlds (None: 0). BenchMARL also passes ``device``, which is unused, and
+        ``continuous_actions``; raises ``InvalidInput`` if the task has the other kind of actions.
         """
-        config = self.config
-        settings = config["reward"], config["horizon_is_end"], config.get("shield")
+        config, actions = self.config, self.config.get("actions")
+        if continuous_actions != (actions is None):
+            raise InvalidInput(
+                f"task {self.name}: continuous_actions = {continuous_actions}, actions = {actions}: a whole number, at"
+                " least 2, makes actions discrete, None continuous"
+            )
+        settings = config["reward"], config["horizon_is_end"], config.get("shield"), actions
         return lambda: LineEnv(config["scenario"], num_envs, seed or 0, *settings)
 
     def supports_continuous_actions(self) -> bool:
-        """Return True: actions are continuous."""
-        return True
+        """Return whether actions are continuous: without ``actions``."""
+        return self.config.get("actions") is None
 
     def supports_discrete_actions(self) -> bool:
-        """Return False: there are no discrete actions."""
-        return False
+        """Return whether actions are discrete: with ``actions``."""
+        return self.config.get("actions") is not None
 
     def max_steps(self, env: Any) -> int:
         """Return the largest number of decisions in an episode; ``env`` is unused."""

@@ -34,7 +34,7 @@ class _Scenarios(Task):  # type: ignore[misc]  # untyped where the extra is miss
 
 
 def _settings(scenario: str) -> dict[str, Any]:
-    return {"scenario": scenario, "reward": "harm", "horizon_is_end": True, "shield": None}
+    return {"scenario": scenario, "reward": "harm", "horizon_is_end": True, "shield": None, "actions": None}
 
 
 def _task_name(scenario: str) -> str:
