@@ -19,6 +19,8 @@ _MOST_TICKS = 12
 
 _ROOM = 0.05  # least distance of two ticks, as a share of the axis
 
+_BESIDE = 0.008  # distance of whiskers at the same number, as a share of the axis; a mark's seeds are twice as far
+
 Json = dict[str, Any]
 
 
@@ -51,15 +53,15 @@ def _harm_curves(found: Json, caption: str) -> Figure:
             levels = _of(found, algorithm)
             style = series_style(number + 1 if number == 0 else number + 3)
             reached = [Estimate(**level[harm_count]["searched"]["harm"]) for level in levels]
-            _curve(axes, levels, reached, capsize=3, label=algorithm, **style)
-            for level in levels:
+            _curve(axes, levels, reached, 3 * number, capsize=3, label=algorithm, **style)
+            for at, level in zip(_places(levels, 3 * number + 2), levels, strict=True):
                 dots = level[harm_count]["searched"]["each_seed"]
                 if len(dots) > 1:
-                    axes.scatter([level["swept_number"]] * len(dots), dots, s=8, color=str(style["color"]), alpha=0.5)
+                    axes.scatter([at] * len(dots), dots, s=8, color=str(style["color"]), alpha=0.5, linewidths=0)
             if levels[0][harm_count]["shielded"] is not None:
                 behind = [Estimate(**level[harm_count]["shielded"]["searched"]["harm"]) for level in levels]
                 cross = {**style, "marker": "x", "linestyle": ":"}
-                _curve(axes, levels, behind, capsize=3, label=f"{algorithm}, shielded", **cross)
+                _curve(axes, levels, behind, -1 - number, capsize=3, label=f"{algorithm}, shielded", **cross)
         _number_axis(axes, found)
         name_axes(axes, TITLES[harm_count])
     worlds = found["levels"][0]["first"]["searched"]["worlds"]
@@ -70,14 +72,15 @@ def _harm_curves(found: Json, caption: str) -> Figure:
 def _who_bears(found: Json, caption: str) -> Figure:
     """Draw the harm of each vehicle, in all worlds; a further algorithm has other dashes."""
     figure, panels = new_panels((10.5, 4.8), columns=2)
+    several = len(algorithms(found))
     for axes, harm_count in zip(panels, HARM_COUNTS, strict=True):
         for number, algorithm in enumerate(algorithms(found)):
             levels = _of(found, algorithm)
             for i in range(len(levels[0][harm_count]["vehicles"])):
                 borne = [Estimate(**level[harm_count]["vehicles"][i]) for level in levels]
-                name = f"Vehicle {i + 1}" + (f", {algorithm}" if len(algorithms(found)) > 1 else "")
-                dashes = series_style(number)["linestyle"]
-                _curve(axes, levels, borne, capsize=3, label=name, **{**series_style(i), "linestyle": dashes})
+                name = f"Vehicle {i + 1}" + (f", {algorithm}" if several > 1 else "")
+                style = {**series_style(i), "linestyle": series_style(number)["linestyle"]}
+                _curve(axes, levels, borne, several * i + number, capsize=3, label=name, **style)
         _number_axis(axes, found)
         name_axes(axes, f"{TITLES[harm_count]} that each vehicle bears")
     return finish(figure, caption, panels[0], columns=4, fontsize=8.5)
@@ -105,10 +108,16 @@ def _of(found: Json, algorithm: str) -> list[Json]:
 
 
 def _curve(
-    axes: Axes, levels: Sequence[Json], estimates: Sequence[Estimate], *, shade: bool = False, **style: Any
+    axes: Axes,
+    levels: Sequence[Json],
+    estimates: Sequence[Estimate],
+    beside: int = 0,
+    *,
+    shade: bool = False,
+    **style: Any,
 ) -> None:
     """Draw estimates over the swept number, with their intervals as whiskers, or as a ``shade``."""
-    at = [level["swept_number"] for level in levels]
+    at = _places(levels, beside)
     if not shade:
         with_intervals(axes, at, estimates, **style)
         return
@@ -117,10 +126,22 @@ def _curve(
     band(axes, at, low, high, style)
 
 
+def _places(levels: Sequence[Json], beside: int) -> list[float]:
+    """Return the swept numbers, moved to the right ``beside`` times."""
+    low, high = _span(levels)
+    return [level["swept_number"] + beside * _BESIDE * (high - low) for level in levels]
+
+
+def _span(levels: Sequence[Json]) -> tuple[float, float]:
+    """Return the ends of the axis: the swept numbers and 0."""
+    numbers = [level["swept_number"] for level in levels]
+    return min(*numbers, 0.0), max(*numbers, 0.0)
+
+
 def _number_axis(axes: Axes, found: Json) -> None:
     """Make both axes linear from 0; ticks of the x axis are the swept numbers where there is room."""
     numbers = sorted({level["swept_number"] for level in found["levels"]})
-    low, high = min(numbers[0], 0.0), max(numbers[-1], 0.0)
+    low, high = _span(found["levels"])
     margin = 0.03 * (high - low)
     axes.set_xlim(low - margin, high + margin)
     if len(numbers) <= _MOST_TICKS and np.diff(numbers).min() >= _ROOM * (high - low):

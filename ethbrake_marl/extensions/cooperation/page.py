@@ -178,7 +178,7 @@ def _blocks(found: Json) -> list[tuple[str, list[Sheet]]]:
     changed: _Columns = [("From", "from"), ("To", "to"), (_ALGORITHM, "algorithm")]
     if swept is not None:
         about.insert(1, (swept, "number"))
-        changed[:2] = [(f"{swept}: from", "from"), ("To", "to")]
+        changed[:2] = [(f"{swept}, from", "from"), ("To", "to")]
     for count in HARM_COUNTS:
         changed += [
             (Column(f"Change of {HARM[count]}", sign="+"), f"{count} difference"),
@@ -282,12 +282,13 @@ def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> tu
     )
     worlds, first = f"{count_of(plan.episodes, 'world')} of seed {plan.list_seed}", plan.levels[0]
     same = f"the same {worlds}" if first.same_lines else f"{worlds}, drawn with the same random numbers"
+    swept = "" if plan.sweep is None else f"{first.scenario.name} with {plan.sweep}; "
     conditions = (
-        f"{recipes}; {plan.seeds} {'seeds' if plan.seeds > 1 else 'seed'}, {plan.steps_per_learner:,} decisions of each"
-        f" learner. Harms are means per world in m²/s² on {same}"
-        f" at every level; {interval_words(plan.seeds)}. Joint optimum: the least harm known that"
-        f" the level's learners can do, and everything beside it, in the first {plan.search_episodes:,} of these"
-        f" worlds, {plan.budget:,} candidates per world and count. {machine}."
+        f"{swept}{recipes}; {plan.seeds} {'seeds' if plan.seeds > 1 else 'seed'}, {plan.steps_per_learner:,} decisions"
+        f" of each learner. Harms are means per world in m²/s² on {same} at every level;"
+        f" {interval_words(plan.seeds)}. Joint optimum: the least harm known that the level's learners can do, and"
+        f" everything beside it, in the first {plan.search_episodes:,} of these worlds, {plan.budget:,} candidates per"
+        f" world and count. {machine}."
     )
     drawn = found["steps"] or found["channels"]
     titles = FIGURES if plan.sweep is None else SWEEP_FIGURES

@@ -47,17 +47,17 @@ class Swept(NamedTuple):
                 numbers.append(low)
                 continue
             steps = (high - low) / step if step > 0 else Decimal(0)
-            if not 0 < steps <= MOST or steps % 1:
+            if not 0 < steps < MOST or steps % 1:
                 raise InvalidInput(
-                    f"--sweep {key}: range {item.strip()}: must go up from LOW to HIGH in at most {MOST} whole steps,"
-                    " for instance 0..90:15"
+                    f"--sweep {key}: range {item.strip()}: must go up from LOW to HIGH in at most {MOST - 1} whole"
+                    " steps, for instance 0..90:15"
                 )
             numbers += [low + k * step for k in range(int(steps) + 1)]
+        if not 2 <= len(numbers) <= MOST:
+            raise InvalidInput(f"--sweep {key}: {len(numbers)} given; must be 2 to {MOST} numbers")
         for number in numbers:
             if numbers.count(number) > 1:
                 raise InvalidInput(f"--sweep {key}: {number} is given twice")
-        if not 2 <= len(numbers) <= MOST:
-            raise InvalidInput(f"--sweep {key}: {len(numbers)} given; must be 2 to {MOST} numbers")
         return [cls(key, word, f"{number.normalize():f}") for number in sorted(numbers)]
 
     @property
