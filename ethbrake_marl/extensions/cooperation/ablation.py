@@ -87,8 +87,9 @@ def ablation_cost(plan: Plan) -> Cost:
         if not steps:
             load_team(training.folder, level.scenario)
     lists = common_worlds(plan.levels, plan.episodes, plan.list_seed)
-    samples = {level.scenario.name: sample for level, sample in zip(plan.levels, lists, strict=True)}
-    kinds = {(level.scenario.name, algorithm): training for level, algorithm, training, _ in left}
+    pairs = zip(reversed(plan.levels), reversed(lists), strict=True)  # the first level of a sweep stays
+    samples = {level.scenario.name: sample for level, sample in pairs}
+    kinds = {(level.scenario.name, algorithm): training for level, algorithm, training, _ in reversed(left)}
     short = {kind: kinds[kind].time(samples[kind[0]]) for kind, steps in decisions.items() if steps}
     training_s = sum(each.seconds(decisions[kind]) for kind, each in short.items())
     level, _, first, _ = left[0]

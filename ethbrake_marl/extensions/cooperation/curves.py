@@ -21,6 +21,8 @@ _ROOM = 0.05  # least distance of two ticks, as a share of the axis
 
 _BESIDE = 0.008  # distance of whiskers at the same number, as a share of the axis; a mark's seeds are twice as far
 
+_MARGIN = 0.06  # at either end, as a share of the axis
+
 Json = dict[str, Any]
 
 
@@ -61,7 +63,7 @@ def _harm_curves(found: Json, caption: str) -> Figure:
             if levels[0][harm_count]["shielded"] is not None:
                 behind = [Estimate(**level[harm_count]["shielded"]["searched"]["harm"]) for level in levels]
                 cross = {**style, "marker": "x", "linestyle": ":"}
-                _curve(axes, levels, behind, -1 - number, capsize=3, label=f"{algorithm}, shielded", **cross)
+                _curve(axes, levels, behind, -2 - 2 * number, capsize=3, label=f"{algorithm}, shielded", **cross)
         _number_axis(axes, found)
         name_axes(axes, TITLES[harm_count])
     worlds = found["levels"][0]["first"]["searched"]["worlds"]
@@ -139,10 +141,10 @@ def _span(levels: Sequence[Json]) -> tuple[float, float]:
 
 
 def _number_axis(axes: Axes, found: Json) -> None:
-    """Make both axes linear from 0; ticks of the x axis are the swept numbers where there is room."""
-    numbers = sorted({level["swept_number"] for level in found["levels"]})
+    """Make both axes linear from 0; ticks of the x axis are the swept numbers and 0 where there is room."""
+    numbers = sorted({0.0, *(level["swept_number"] for level in found["levels"])})
     low, high = _span(found["levels"])
-    margin = 0.03 * (high - low)
+    margin = _MARGIN * (high - low)
     axes.set_xlim(low - margin, high + margin)
     if len(numbers) <= _MOST_TICKS and np.diff(numbers).min() >= _ROOM * (high - low):
         axes.set_xticks(numbers)

@@ -161,7 +161,7 @@ def test_figures__their_axis_is_the_number_linear_from_zero(measured: list[Measu
     for axes in (*harm.axes, *bears.axes):
         assert (axes.get_xscale(), axes.get_yscale(), axes.get_ylim()[0]) == ("linear", "linear", 0.0)
         assert axes.get_xlabel() == "objective = social:…" and list(axes.get_xticks()) == [0.0, 30.0, 90.0]
-        assert axes.get_xlim() == pytest.approx((-2.7, 92.7))
+        assert axes.get_xlim() == pytest.approx((-5.4, 95.4))
     first = harm.axes[0]
     lines = {each.get_label(): each for each in first.lines}
     assert list(lines["all brake fully"].get_ydata()) == [20.0] * 3
@@ -179,7 +179,7 @@ def test_figures__far_from_zero_the_axis_still_begins_there(measured: list[Measu
     values = Swept.parse("obstacle_gap_m=40,41,60")
     far = [replace(each, level=replace(each.level, swept=value)) for each, value in zip(measured, values, strict=True)]
     axes = ablation_figures(compare(far, SEARCHED), "Conditions.")[0].axes[0]
-    assert axes.get_xlim() == pytest.approx((-1.8, 61.8)) and axes.get_xlabel() == "obstacle_gap_m"
+    assert axes.get_xlim() == pytest.approx((-3.6, 63.6)) and axes.get_xlabel() == "obstacle_gap_m"
     assert 0.0 in axes.get_xticks() and 41.0 not in axes.get_xticks()  # 40 and 41 have no room beside each other
 
 
