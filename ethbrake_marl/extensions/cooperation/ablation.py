@@ -1,4 +1,4 @@
-"""Run an ablation over levels of cooperation, and estimate its cost."""
+"""Run an ablation, a comparison of trainings at several levels of cooperation, and estimate its cost."""
 
 from __future__ import annotations
 
@@ -23,10 +23,17 @@ from ethbrake_marl.training.team import load_team
 def run_ablation(
     plan: Plan, jobs: int = 1, machine: str = "", tell: OnProgress | None = None
 ) -> tuple[Json, list[Path]] | None:
-    """Run all trainings, ``jobs`` at a time, measure the results, and write all files. Existing files are replaced.
+    """Run all trainings of an ablation, measure the trained policies, and write all files, replacing existing ones.
+
+    Args:
+        plan: settings of the ablation.
+        jobs: number of trainings at once.
+        machine: description of this machine, which is recorded.
+        tell: called with the progress; None: silent.
 
     Returns the content of ``ablation.json``, and the paths of page, Markdown and figures. Returns None if Ctrl-C
     stopped the trainings. Raises the exceptions of ``StudyFolder.work``, ``train_all`` and ``measure``.
+
     """
     with plan.study_folder().work():
         if not train_all([training for _, _, training in plan.trainings()], jobs, tell):
@@ -74,11 +81,13 @@ HOW_MEASURED = (
 
 
 def ablation_cost(plan: Plan) -> Cost:
-    """Estimate the remaining work.
+    """Estimate the remaining work of an ablation in CPU time of one core.
 
-    A short training of each level and recipe, an evaluation and a search are timed, in a sweep of one of its levels,
-    because they are alike. Raises the exceptions of ``TrainingJob.steps_left``, and those of ``load_team`` for a
-    finished training whose policies cannot be loaded.
+    To estimate it, a short training of each level and recipe, an evaluation and a search are timed; in a sweep only
+    those of one level, because its levels are alike.
+
+    Raises the exceptions of ``TrainingJob.steps_left``, and those of ``load_team`` for a finished training whose
+    policies cannot be loaded.
     """
     left = [(level, algorithm, training, training.steps_left()) for level, algorithm, training in plan.trainings()]
     decisions: Counter[tuple[str, str]] = Counter()  # by scenario, which all levels of a sweep share, and algorithm
