@@ -120,9 +120,9 @@ def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmC
 def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
     """Return in which worlds, [n] bool, the learners of ``own`` can do whatever the learners of ``other`` do.
 
-    Conditions: ``own`` has the same learners or more, the other vehicles have the same scripts, the line is the same
-    (a sweep may change it), latencies are equal, and at every decision time of ``other`` the learners of ``own`` decide too. ``other`` may lack an obstacle, because
-    its result is driven again with the obstacle.
+    Conditions: ``own`` has the same learners or more, the other vehicles have the same scripts, the line is the same (a
+    sweep may change it), latencies are equal, and at every decision time of ``other`` the learners of ``own`` decide
+    too. ``other`` may lack an obstacle, because its result is driven again with the obstacle.
     """
     mine, theirs = own.level.scenario, other.level.scenario
     same_scripts = all(theirs.scripts.get(i) == script for i, script in mine.scripts.items())

@@ -145,9 +145,9 @@ def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: S
 def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Sample]:
     """Draw ``episodes`` worlds from ``seed`` for each level; world k is the same line of vehicles in all levels.
 
-    Latencies may differ where ``v2x`` differs, and an obstacle ahead may be present or not. In a sweep of any other key,
-    world k is drawn with the same random numbers, but the key changes it. Raises ``InvalidInput``
-    with the level and the quantity that differs, if another quantity differs.
+    Latencies may differ where ``v2x`` differs, and an obstacle ahead may be present or not. In a sweep of any other
+    key, world k is drawn with the same random numbers, but the key changes it. Raises ``InvalidInput`` with the level
+    and the quantity that differs, if another quantity differs.
     """
     samples = [level.scenario.sample(episodes, seed) for level in levels]
     if not levels[0].same_lines:
