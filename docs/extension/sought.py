@@ -21,6 +21,7 @@ SOUGHT = {
     "evaluation": "evaluate compare agents statistics confidence interval",
     "cooperation": "cooperation levels level v2x learners",
     "ablate-cooperation": "ablation study",
+    "sweep-cooperation": "sweep social value orientation angle svo",
     "training-schemes": "centralised independent ctde",
     "shield": "shield my own policy safety wrap guarantee",
     "harms": "what harm ethical count definition meaning",

@@ -170,6 +170,7 @@ TABLES: dict[str, How] = {
     "| `--draw` | full_brake": _by(SUITE, "tests/extensions/recorded/test_recorded.py"),
     "| agent in a host | here | SUMO": _by(SUITE, "tests/extensions/hosts/test_sumo.py"),
     "| work | has | lacks": _by(BY_HAND),
+    "| you write | values": _by(BY_HAND),
     "| for | recipe | scenario | differs": _by(BY_HAND),
 }
 

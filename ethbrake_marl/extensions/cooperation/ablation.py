@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.extensions.cooperation.joint_optimum import measure, questions
@@ -40,48 +41,86 @@ def run_ablation(
         return write_ablation(plan, measure(plan, jobs, tell), machine)
 
 
-def ablation_cost(plan: Plan) -> str:
-    """Return a text for users that estimates the remaining work of an ablation in time of one core.
+class Cost(NamedTuple):
+    """Remaining work of an ablation, in CPU seconds of one core."""
 
-    To estimate it, a short training of each level and recipe, an evaluation and a search are timed by the wall clock,
-    so other work on the machine makes the estimate larger. If results of earlier searches for the joint optimum are
-    damaged, the text has a line for each of them.
+    trainings: int  # unfinished ones
+    decisions: int  # of these trainings
+    training_s: float
+    search_s: float
+    driving_s: float
+    training_folders: int  # finished ones included
+    search_folders: int
+    damaged: tuple[Path, ...]  # parts of a search that are searched again
+
+    @property
+    def total_s(self) -> float:
+        """All work together."""
+        return self.training_s + self.search_s + self.driving_s
+
+    def to_json(self) -> Json:
+        """Return the estimate as plain data."""
+        return {**self._asdict(), "damaged": [str(file) for file in self.damaged], "total_s": self.total_s}
+
+    def __str__(self) -> str:
+        """Return the estimate in words, with a line for each damaged part of a search."""
+        speed = f" at {self.decisions / self.training_s:,.0f}/s" if self.training_s > 0.0 else ""
+        told = Timed.in_words
+        line = (
+            f"to do: {self.trainings} trainings, {self.decisions:,} decisions{speed}: {told(self.training_s)}; joint"
+            f" optima {told(self.search_s)}; driving the common worlds {told(self.driving_s)}; together about"
+            f" {told(self.total_s)} of one core"
+        )
+        return "\n".join([line, *(f"{file}: is damaged; its worlds are searched again" for file in self.damaged)])
+
+
+HOW_MEASURED = (
+    "CPU time of short samples, measured now and not kept: four updates of each recipe, 50 worlds driven, 4 searched;"
+    " in a sweep at one of its values"
+)
+
+
+def ablation_cost(plan: Plan) -> Cost:
+    """Estimate the remaining work of an ablation in CPU time of one core.
+
+    To estimate it, a short training of each level and recipe, an evaluation and a search are timed; in a sweep only
+    those of one level, because its levels are alike.
 
     Raises the exceptions of ``TrainingJob.steps_left``, and those of ``load_team`` for a finished training whose
     policies cannot be loaded.
     """
     left = [(level, algorithm, training, training.steps_left()) for level, algorithm, training in plan.trainings()]
-    decisions: Counter[tuple[str, str]] = Counter()
+    decisions: Counter[tuple[str, str]] = Counter()  # by scenario, which all levels of a sweep share, and algorithm
     for level, algorithm, training, steps in left:
-        decisions[level.name, algorithm] += steps
+        decisions[level.scenario.name, algorithm] += steps
         if not steps:
             load_team(training.folder, level.scenario)
     lists = common_worlds(plan.levels, plan.episodes, plan.list_seed)
-    samples = {level.name: sample for level, sample in zip(plan.levels, lists, strict=True)}
-    kinds = {(level.name, algorithm): training for level, algorithm, training, _ in left}
+    pairs = zip(reversed(plan.levels), reversed(lists), strict=True)  # the first level of a sweep stays
+    samples = {level.scenario.name: sample for level, sample in pairs}
+    kinds = {(level.scenario.name, algorithm): training for level, algorithm, training, _ in reversed(left)}
     short = {kind: kinds[kind].time(samples[kind[0]]) for kind, steps in decisions.items() if steps}
     training_s = sum(each.seconds(decisions[kind]) for kind, each in short.items())
     level, _, first, _ = left[0]
-    worlds_s = [each.world_s for each in short.values()] or [first.world_seconds(samples[level.name])]
+    worlds_s = [each.world_s for each in short.values()] or [first.world_seconds(samples[level.scenario.name])]
     driving_s = sum(worlds_s) / len(worlds_s) * plan.episodes * (len(left) + len(plan.levels))
+    shielded_s: dict[str, float] = {}
     for level in plan.levels if plan.shield else ():  # timed with full braking, which the shield replaces most often
         if level.scenario.learners:
             task, often = Task(level.scenario, level.scenario.learners), plan.seeds * len(plan.recipes)
-            shielded = partial(drive_shielded, make_agent("full_brake"), task=task)
-            world_s = Timed.each_s(samples[level.name].worlds, shielded)
-            driving_s += plan.episodes * often * len(HARM_COUNTS) * world_s
-    search_s, damaged = 0.0, []
-    for level, part, _ in questions(plan, lists):
+            name, shielded = level.scenario.name, partial(drive_shielded, make_agent("full_brake"), task=task)
+            if name not in shielded_s:
+                shielded_s[name] = Timed.each_s(samples[name].worlds, shielded)
+            driving_s += plan.episodes * often * len(HARM_COUNTS) * shielded_s[name]
+    search_s, damaged, searches = 0.0, [], questions(plan, lists)
+    searched_s: dict[str, float] = {}
+    for level, part, _ in searches:
         number, broken = chunks_left(level.scenario, part, budget=plan.budget, chunks=plan.optimum_folder(level))
         damaged += broken
-        if number:
+        name = level.scenario.name
+        if number and name not in searched_s:
             searching = partial(best_harm, level.scenario, budget=plan.budget, threads=1)
-            search_s += number * Timed.each_s(part.worlds, searching, most=4)
-    speed = f" at {decisions.total() / training_s:,.0f}/s" if training_s > 0.0 else ""
-    told = Timed.in_words
-    line = (
-        f"to do: {sum(steps > 0 for *_, steps in left)} trainings, {decisions.total():,} decisions{speed}:"
-        f" {told(training_s)}; joint optima {told(search_s)}; driving the common worlds {told(driving_s)};"
-        f" together about {told(training_s + driving_s + search_s)} of one core"
-    )
-    return "\n".join([line, *(f"{file}: is damaged; its worlds are searched again" for file in damaged)])
+            searched_s[name] = Timed.each_s(part.worlds, searching, most=4)
+        search_s += number * searched_s.get(name, 0.0)
+    begun = sum(steps > 0 for *_, steps in left)
+    return Cost(begun, decisions.total(), training_s, search_s, driving_s, len(left), len(searches), tuple(damaged))

@@ -8,6 +8,7 @@ import typer
 from rich.text import Text
 
 from ethbrake_marl.cli.command import JobsOption, JsonOption, Out, SettingsOption, example
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.studies.commands import KEPT, FolderOption
 from ethbrake_marl.registry import Part
 
@@ -16,7 +17,18 @@ def ablate_command(
     output: FolderOption,
     levels: Annotated[
         str | None,
-        typer.Option(metavar="A,B,...", help="Scenarios to compare, in this order.", show_default="the shipped ladder"),
+        typer.Option(
+            metavar="A,B,...",
+            help="Scenarios to compare, in this order.",
+            show_default="the shipped ladder; of a sweep cooperation-3-pair",
+        ),
+    ] = None,
+    sweep: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KEY=LOW..HIGH:STEP|A,B,...",
+            help="Instead compare one level with several numbers of a key: objective=social:0..90:15.",
+        ),
     ] = None,
     recipes: Annotated[str, typer.Option(metavar="A,B,...", help="Training recipes.")] = "cooperation",
     seeds: Annotated[
@@ -37,25 +49,39 @@ def ablate_command(
     ] = None,
     settings: SettingsOption = None,
     quick: Annotated[bool, typer.Option("--quick", help="A first look: few seeds, worlds and decisions.")] = False,
+    cost: Annotated[
+        bool, typer.Option("--cost", help="Estimate CPU time and folders by short samples, and end; keeps nothing.")
+    ] = False,
     jobs: JobsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Train levels of cooperation, compare them on common worlds.
 
     Prints first how long it will take. The same command goes on after an interruption: finished trainings are kept,
-    begun ones go on. Writes ablation.html, ablation.md, ablation.csv, ablation.json and three figures.
+    begun ones go on. Writes ablation.html, ablation.md, ablation.csv, ablation.json and three figures. With --sweep the
+    levels are one level with several numbers: axis of its two figures, and column of its tables.
     """
     with Out(as_json=as_json, kept=KEPT) as out:
-        from ethbrake_marl.extensions.cooperation.ablation import ablation_cost, run_ablation
+        from ethbrake_marl.extensions.cooperation.ablation import HOW_MEASURED, ablation_cost, run_ablation
         from ethbrake_marl.extensions.cooperation.levels import plan_ablation
         from ethbrake_marl.extensions.studies.machine import this_machine
 
+        if sweep is not None and len(sweep) > 1:
+            raise InvalidInput("--sweep is given twice; sweep one key, because a figure has one axis")
         plan = plan_ablation(
-            levels, recipes, settings, quick=quick, tell=out.note, seeds=seeds, steps_per_learner=steps,
-            episodes=episodes, search_episodes=search_episodes, shield=shield, folder=output,
+            levels, recipes, settings, sweep=sweep[0] if sweep else None, quick=quick, tell=out.note,
+            seeds=seeds, steps_per_learner=steps, episodes=episodes, search_episodes=search_episodes, shield=shield,
+            folder=output,
         )  # fmt: skip
         plan.study_folder().check()
-        out.note(ablation_cost(plan))
+        estimate = ablation_cost(plan)
+        if cost:
+            trainings, optimum = output / "trainings", output / "optimum"
+            folders = f"folders: {estimate.training_folders} in {trainings}, {estimate.search_folders} in {optimum}"
+            measured = f"measured: {HOW_MEASURED}"
+            out.result({**estimate.to_json(), "measured": HOW_MEASURED}, str(estimate), folders, measured)
+            return
+        out.note(str(estimate))
         written = run_ablation(plan, jobs or 1, str(this_machine()), out.show_progress)
         if written is None:
             out.interrupted(f"interrupted; {KEPT}")
@@ -66,4 +92,10 @@ def ablate_command(
         out.note(f"page: {page}; tables: {text}{drawn}")
 
 
-ABLATE = Part(ablate_command, epilog=example("study ablate --quick --output runs/ablation-quick"))
+ABLATE = Part(
+    ablate_command,
+    epilog=example(
+        "study ablate --quick --output runs/ablation-quick",
+        "study ablate --sweep objective=social:0..90:15 --output runs/angle --cost",
+    ),
+)

@@ -69,6 +69,7 @@ def _level(one: Measured, searched: int) -> Json:
         **one.identity,
         "policy_sha256": [dict(seed) for seed in one.reached.policies],
         "level": one.level.name,
+        **one.level.columns,
         "title": scenario.title,
         "algorithm": one.algorithm,
         "clear": one.level.clear,
@@ -137,6 +138,9 @@ def _change(before: Measured, after: Measured, algorithm: str) -> Json:
     the changes of the whole line and of each vehicle under each count of harm. ``algorithm`` is only recorded in it.
     """
     found: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
+    if before.level.swept is not None and after.level.swept is not None:
+        found |= {"swept_key": after.level.swept.key}
+        found |= {"from_number": before.level.swept.number, "to_number": after.level.swept.number}
     for harm_count in HARM_COUNTS:
         pairs = zip(_columns(after.reached, harm_count), _columns(before.reached, harm_count), strict=True)
         # compares seed k with seed k, or with the only seed

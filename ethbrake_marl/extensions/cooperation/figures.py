@@ -15,6 +15,7 @@ from matplotlib.ticker import FuncFormatter, NullLocator
 
 from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import count_of
+from ethbrake_marl.extensions.cooperation.curves import algorithms, sweep_figures, swept_axis, with_intervals
 from ethbrake_marl.extensions.report.style import (
     ALARM,
     GREY,
@@ -43,11 +44,16 @@ Json = dict[str, Any]
 def ablation_figures(found: Json, caption: str) -> list[Figure]:
     """Return three figures of an ablation: harm per level, change from level to level, and change for each vehicle.
 
+    Of a sweep, return its two figures (``sweep_figures``).
+
     ``found`` is the content of ``ablation.json``; ``caption`` is the text below each figure.
 
     Red text above a figure names the levels that are not trained enough.
     """
-    figures = [_harm_curve(found, caption), _change_figure(found, caption), _who_pays(found, caption)]
+    if swept_axis(found) is None:
+        figures = [_harm_curve(found, caption), _change_figure(found, caption), _who_pays(found, caption)]
+    else:
+        figures = sweep_figures(found, caption)
     for figure in figures if found["undertrained"] else ():
         text = "\n".join(textwrap.fill(line, int(figure.get_figwidth() * 13.0)) for line in found["undertrained"])
         for legend in figure.legends:  # the text goes into the legend, because a figure title would overlap it
@@ -77,7 +83,7 @@ def _harm_curve(found: Json, caption: str) -> Figure:
                 x, half = _place(level, ladder), 0.3 if level["clear"] is None else 0.07
                 value, name = level[harm_count]["searched"][key]["value"], "" if number else label
                 axes.hlines(value, x - half, x + half, color=colour, linewidth=2.0, label=name)
-        for number, algorithm in enumerate(_algorithms(found)):
+        for number, algorithm in enumerate(algorithms(found)):
             _reached(axes, found["levels"], ladder, harm_count, algorithm, number)
         axes.set_xticks(range(len(ladder)), [_short(name) for name in ladder], fontsize=8)
         axes.set_yscale("symlog", linthresh=LINEAR)
@@ -102,7 +108,7 @@ def _change_figure(found: Json, caption: str) -> Figure:
             estimate = Estimate(**change[harm_count]["difference"])
             low, high = estimate.ends
             colour = COLOURS[3] if high < 0.0 else COLOURS[1] if low > 0.0 else GREY
-            _with_intervals(axes, [row], [estimate], upright=False, fmt="o", color=colour, capsize=3, markersize=5)
+            with_intervals(axes, [row], [estimate], upright=False, fmt="o", color=colour, capsize=3, markersize=5)
             share = 100.0 * change[harm_count]["worse_off"]["value"]
             text = f"{estimate.value:+.2f} [{low:+.2f}, {high:+.2f}]\nsomebody worse off in {share:.0f} %"
             axes.text(
@@ -205,7 +211,7 @@ def _reached(
         x = [_place(level, ladder) + 0.06 * number + beside for level in some]
         if some:
             harms = [Estimate(**each[harm_count]["searched"]["harm"]) for each in told]
-            _with_intervals(axes, x, harms, capsize=3, **look)
+            with_intervals(axes, x, harms, capsize=3, **look)
     for level in [*steps, *worse]:
         place, found = _place(level, ladder) + 0.06 * number, level[harm_count]["searched"]
         if level["clear"] is not None:
@@ -216,31 +222,6 @@ def _reached(
             axes.scatter([place + 0.05] * len(dots), dots, s=6, color=str(style["color"]), alpha=0.5, linewidths=0)
 
 
-def _with_intervals(
-    axes: Axes, at: Sequence[float], estimates: Sequence[Estimate], *, upright: bool = True, **style: Any
-) -> None:
-    """Draw estimates as marks with whiskers for their intervals.
-
-    Args:
-        axes: axes to draw on.
-        at: position of each estimate on the other axis.
-        estimates: values and intervals.
-        upright: whether values are on the y axis; False: on the x axis.
-        style: keyword arguments of ``Axes.errorbar``.
-
-    """
-    values = np.array([each.value for each in estimates])
-    errors = np.abs(np.array([each.ends for each in estimates]).T - values)
-    if upright:
-        axes.errorbar(at, values, yerr=errors, **style)
-    else:
-        axes.errorbar(values, at, xerr=errors, **style)
-
-
-def _algorithms(found: Json) -> list[str]:
-    return list(dict.fromkeys(level["algorithm"] for level in found["levels"] if level["algorithm"] is not None))
-
-
 def _short(name: str) -> str:
     """Return the name of a level without ``cooperation-``, in two lines: ``2`` and ``paper``."""
     return name.removeprefix("cooperation-").replace("-", "\n", 1)
@@ -248,6 +229,6 @@ def _short(name: str) -> str:
 
 def _of_changes(found: Json) -> list[str]:
     """Return a label ``LEVEL → LEVEL`` for each change between levels, then for each worse V2X channel."""
-    changes, several = found["steps"] + found["channels"], len(_algorithms(found)) > 1
+    changes, several = found["steps"] + found["channels"], len(algorithms(found)) > 1
     words = [f"{_short(change['from'])} → {_short(change['to'])}".replace("\n", " ") for change in changes]
     return [f"{each} ({c['algorithm']})" if several else each for each, c in zip(words, changes, strict=True)]

@@ -17,7 +17,16 @@ import numpy as np
 from ethbrake_marl.agents.protocol import Driver, Team
 from ethbrake_marl.evaluation.identity import result_identity
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.extensions.cooperation.levels import HARM, TOLERANCE, Level, Plan, common_worlds
+from ethbrake_marl.extensions.cooperation.levels import (
+    HARM,
+    TOLERANCE,
+    VEHICLE,
+    WORLD,
+    Level,
+    Plan,
+    common_worlds,
+    quantity,
+)
 from ethbrake_marl.extensions.search.best_harm import search_list, task_problem
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount, Ledger
@@ -111,18 +120,20 @@ def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmC
 def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
     """Return in which worlds, [n] bool, the learners of ``own`` can do whatever the learners of ``other`` do.
 
-    Conditions: ``own`` has the same learners or more, the other vehicles have the same scripts, latencies are equal,
-    and at every decision time of ``other`` the learners of ``own`` decide too. ``other`` may lack an obstacle, because
-    its result is driven again with the obstacle.
+    Conditions: ``own`` has the same learners or more, the other vehicles have the same scripts, the line is the same (a
+    sweep may change it), latencies are equal, and at every decision time of ``other`` the learners of ``own`` decide
+    too. ``other`` may lack an obstacle, because its result is driven again with the obstacle.
     """
     mine, theirs = own.level.scenario, other.level.scenario
     same_scripts = all(theirs.scripts.get(i) == script for i, script in mine.scripts.items())
     if not (set(theirs.learners) <= set(mine.learners) and same_scripts):
         return np.zeros(own.worlds.n, np.bool_)
-    latency_s, obstacle_m = own.worlds.vehicles.latency_s, other.worlds.obstacle_gap_m
+    obstacle_m = other.worlds.obstacle_gap_m
     later_s = own.worlds.first_decision_s(theirs.learners) - own.worlds.first_decision_s(mine.learners)
     steps = later_s / mine.time_step_s
-    same = (latency_s == other.worlds.vehicles.latency_s).all(axis=1)
+    same = np.ones(own.worlds.n, np.bool_)
+    for name in (*WORLD, *VEHICLE, "latency_s", "time_s", "command_mps2"):
+        same &= (quantity(name, own.worlds) == quantity(name, other.worlds)).reshape(len(same), -1).all(axis=1)
     on_grid = np.abs(steps - np.rint(steps)) < 1e-9
     return np.asarray(same & on_grid & ((obstacle_m == own.worlds.obstacle_gap_m) | np.isinf(obstacle_m)), np.bool_)
 

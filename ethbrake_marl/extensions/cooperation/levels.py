@@ -1,6 +1,7 @@
 """The levels and the plan of an ablation.
 
 All levels have the same lines of vehicles. They differ in who learns, who has which information, and whose harm counts.
+The levels of a sweep are one level with several numbers of one key, of whatever the key is.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ from ethbrake_marl.agents.spec import split_names
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.evaluation.identity import LIST_SEED
 from ethbrake_marl.evaluation.trial import load_runnable
+from ethbrake_marl.extensions.cooperation.sweep import Swept
 from ethbrake_marl.extensions.studies.folder import StudyFolder
 from ethbrake_marl.extensions.studies.trainings import TrainingJob
 from ethbrake_marl.files.overrides import Override
-from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.physics.state import Floats, Worlds
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.recipe import WORDS, TrainingRecipe, load_recipe
@@ -37,13 +39,15 @@ LADDER = (
 
 STANDARD = (*LADDER, "cooperation-2-blocked")
 
+SWEPT = "cooperation-3-pair"  # the level that is swept if none is named
+
 Json = dict[str, Any]
 
 _LINE = ("vehicles", "time_step_s", "horizon_s")
 
-_WORLD = ("gaps_m", "speeds_mps")
+WORLD = ("gaps_m", "speeds_mps")
 
-_VEHICLE = (
+VEHICLE = (
     "braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps", "restitution", "brake_rate_mps3",
     "release_rate_mps3",
 )  # fmt: skip
@@ -57,14 +61,24 @@ _BUT_CHANNEL = {"name", "title", "description", "source", "v2x"}
 class Level:
     """One level of cooperation in an ablation: a scenario, compared with others on the same lines of vehicles."""
 
-    scenario: Scenario  # who learns, who has which information, and whose harm counts
-    # Name of an earlier level from which this one differs only in its V2X channel (``v2x``); None: there is none.
-    clear: str | None = None
+    scenario: Scenario
+    clear: str | None = None  # name of the level that differs only in ``v2x``; None: this level is on the ladder
+    swept: Swept | None = None  # the swept key at this level's value; None: no sweep
 
     @property
     def name(self) -> str:
-        """The scenario's name."""
-        return self.scenario.name
+        """The scenario's name; in a sweep with the value: ``cooperation-3-pair-social-15``."""
+        return self.scenario.name if self.swept is None else f"{self.scenario.name}-{self.swept.label}"
+
+    @property
+    def same_lines(self) -> bool:
+        """Whether world k is the same line as in the levels beside it; False in a sweep that changes the lines."""
+        return self.swept is None or self.swept.same_lines
+
+    @property
+    def columns(self) -> Json:
+        """Columns of tables that only a sweep has."""
+        return {} if self.swept is None else self.swept.columns
 
 
 def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list[Level]:
@@ -99,20 +113,52 @@ def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list
     return levels
 
 
+def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: Sequence[TrainingRecipe]) -> list[Level]:
+    """Return one level for each value of a sweep, in ascending order: the level ``name`` with ``settings``.
+
+    Raises ``InvalidInput`` for a key that ``settings`` set too, that no scenario has, that a recipe replaces, or with
+    which levels could not be compared; and the exceptions of ``Swept.parse`` and ``load_runnable``.
+    """
+    values = Swept.parse(sweep)
+    found = read_settings([values[0].setting], recipes).scenario
+    if not found:
+        key = values[0].key
+        raise InvalidInput(f"--sweep {key}: is a recipe's; a sweep varies a scenario (recipes: ethbrake study sweep)")
+    key, path = found[0].key, found[0].path
+    if path[0] in _LINE:
+        raise InvalidInput(
+            f"--sweep {key}: levels with different {path[0]} cannot be compared, vehicle by vehicle and time by time;"
+            f" give each a folder of its own (--set {path[0]}=..., --output)"
+        )
+    if any(each.path[: len(path)] == path for each in settings):
+        raise InvalidInput(f"--sweep {key}: --set {key} has no place beside it; leave one of them out")
+    for recipe in recipes if path[0] == "objective" else ():
+        if recipe.reward.objective is not None:
+            raise InvalidInput(
+                f"--sweep {key}: recipe {recipe.name!r} has an objective of its own (reward.objective), so that the"
+                " scenario's changes nothing; give a recipe without"
+            )
+    each_value = [value._replace(key=key) for value in values]
+    return [Level(load_runnable(name, [*settings, value.override]), swept=value) for value in each_value]
+
+
 def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Sample]:
     """Draw ``episodes`` worlds from ``seed`` for each level; world k is the same line of vehicles in all levels.
 
-    Latencies may differ where ``v2x`` differs, and an obstacle ahead may be present or not. Raises ``InvalidInput``
-    with the level and the quantity that differs, if another quantity differs.
+    Latencies may differ where ``v2x`` differs, and an obstacle ahead may be present or not. In a sweep of any other
+    key, world k is drawn with the same random numbers, but the key changes it. Raises ``InvalidInput`` with the level
+    and the quantity that differs, if another quantity differs.
     """
     samples = [level.scenario.sample(episodes, seed) for level in levels]
+    if not levels[0].same_lines:
+        return samples
     for k, level in enumerate(levels):
         if level.scenario.observation != levels[0].scenario.observation:
             raise InvalidInput(
                 f"level {level.name!r}: its observation differs from that of {levels[0].name!r}, so that what it gains"
                 f" would not be cooperation's; levels may differ in {_MAY_DIFFER}"
             )
-        _check_same(levels[0], samples[0], level, samples[k], (*_LINE, *_WORLD, *_VEHICLE))
+        _check_same(levels[0], samples[0], level, samples[k], (*_LINE, *WORLD, *VEHICLE))
         clear = next(j for j in range(k + 1) if levels[j].scenario.v2x == level.scenario.v2x)
         _check_same(levels[clear], samples[clear], level, samples[k], ("latency_s",))
     return samples
@@ -137,7 +183,12 @@ def _values(name: str, level: Level, sample: Sample) -> Floats:
     """
     if name in _LINE:
         return np.array([getattr(level.scenario, name)], np.float64)
-    values: Floats = getattr(sample.worlds if name in _WORLD else sample.worlds.vehicles, name)
+    return quantity(name, sample.worlds)
+
+
+def quantity(name: str, worlds: Worlds) -> Floats:
+    """Return a field of the worlds or of their vehicles, [n, ...]."""
+    values: Floats = getattr(worlds if hasattr(worlds, name) else worlds.vehicles, name)
     return values
 
 
@@ -162,7 +213,8 @@ class Plan:
     budget: int  # candidate profiles that the search tries per world and count of harm
     folder: Path  # folder of all results
     noted: tuple[str, ...] = ()  # overrides of scenarios and recipes, for ``config.json``
-    shield: str | None = None  # "step": the trained policies also drive behind a shield in step mode; None: no shield
+    shield: str | None = None  # "step": everything also drives behind the step shield
+    sweep: str | None = None  # as given: objective=social:0..90:15; None: the levels are scenarios of their own
 
     @property
     def algorithms(self) -> tuple[str, ...]:
@@ -191,7 +243,8 @@ class Plan:
             changes |= dict.fromkeys({"scheme", "turns"} & type(recipe).model_fields.keys())
         name = recipe.name if learners == 1 else algorithm(recipe)
         folder = self.folder / "trainings" / f"{level.name}-{name}-seed{seed}"
-        return TrainingJob(Training.of(recipe.replace(**changes), level.scenario), folder, self.noted)
+        noted = self.noted if level.swept is None else (*self.noted, level.swept.setting)
+        return TrainingJob(Training.of(recipe.replace(**changes), level.scenario), folder, noted)
 
     def settings(self) -> dict[str, Any]:
         """Return all settings that affect the results as plain data: levels, recipes, numbers and the shield."""
@@ -209,7 +262,7 @@ class Plan:
         It refuses a folder with the results of an ablation with other settings.
         """
         advice = f"give another folder (--output), or, to use its trainings, a copy of it without {SETTINGS}"
-        written = (*FIGURES, *(f"ablation.{ending}" for ending in ("html", "md", "csv", "json")))
+        written = (*FIGURES, *SWEEP_FIGURES, *(f"ablation.{ending}" for ending in ("html", "md", "csv", "json")))
         return StudyFolder(self.folder, "an ablation", self.settings(), record=SETTINGS, advice=advice, writes=written)
 
     def optimum_folder(self, level: Level) -> Path:
@@ -234,16 +287,18 @@ def plan_ablation(
     recipes: str,
     settings: Sequence[str] | None,
     *,
+    sweep: str | None = None,
     quick: bool = False,
     tell: Callable[[str], None] | None = None,
     **given: Any,
 ) -> Plan:
-    """Return the plan of an ablation from the options of its command.
+    """Return the plan of an ablation, or of a sweep of one level, from the options of its command.
 
     Args:
         levels: names or paths of scenarios with commas between them; None: the shipped levels.
         recipes: names or paths of recipes with commas between them.
         settings: settings ``KEY=VALUE`` of scenarios and recipes; None: none.
+        sweep: key of a scenario and its numbers, ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; None: no sweep.
         quick: use few seeds, worlds and decisions by default.
         tell: called with notes about settings that do not fit together.
         given: other fields of ``Plan``; None means the default.
@@ -252,14 +307,23 @@ def plan_ablation(
     learner, and levels that cannot be trained or compared.
 
     """
-    names = [*(LADDER if quick else STANDARD)] if levels is None else split_names(levels, os.path.isfile)
+    usual_names: tuple[str, ...] = (LADDER if quick else STANDARD) if sweep is None else (SWEPT,)
+    names = usual_names if levels is None else [each.strip() for each in split_names(levels, os.path.isfile)]
     loaded = [load_recipe(each.strip()) for each in split_names(recipes, os.path.isfile)]
     changed = read_settings(settings, loaded)
     usual = {"list_seed": LIST_SEED, **(_QUICK if quick else _FULL)}
+    changed_recipes = tuple(with_scheme(changed.change(recipe, tell)) for recipe in loaded)
+    if sweep is None:
+        compared = read_levels(names, changed.scenario)
+    elif len(names) == 1:
+        compared = sweep_levels(names[0], sweep, changed.scenario, changed_recipes)
+    else:
+        raise InvalidInput(f"levels: {len(names)} given; a sweep makes its levels out of one")
     plan = Plan(
-        levels=tuple(read_levels([each.strip() for each in names], changed.scenario)),
-        recipes=tuple(with_scheme(changed.change(recipe, tell)) for recipe in loaded),
+        levels=tuple(compared),
+        recipes=changed_recipes,
         noted=changed.texts,
+        sweep=sweep,
         **{**usual, **{name: value for name, value in given.items() if value is not None}},
     )
     for name in ("seeds", "steps_per_learner", "episodes", "search_episodes", "budget"):
@@ -292,4 +356,12 @@ FIGURES = {  # file of each figure of ``ablation_figures``: its title and its de
     ),
     "ablation-changes.png": ("What each step is worth", "Change of both harms from one level to the next."),
     "ablation-who-pays.png": ("Who pays", "Change of the harm of each vehicle, under both counts."),
+}
+
+SWEEP_FIGURES = {  # the same of the figures of a sweep
+    "ablation.png": (
+        "Harm against the number",
+        "Both harms at each value, between full braking and the joint optimum.",
+    ),
+    "ablation-who-bears.png": ("Who bears it", "Harm of each vehicle at each value, under both counts."),
 }

@@ -14,9 +14,10 @@ from matplotlib.figure import Figure
 from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.extensions.cooperation.comparison import compare
+from ethbrake_marl.extensions.cooperation.curves import swept_axis
 from ethbrake_marl.extensions.cooperation.figures import ablation_figures
 from ethbrake_marl.extensions.cooperation.joint_optimum import Measured
-from ethbrake_marl.extensions.cooperation.levels import FIGURES, HARM, Json, Plan, algorithm
+from ethbrake_marl.extensions.cooperation.levels import FIGURES, HARM, SWEEP_FIGURES, Json, Plan, algorithm
 from ethbrake_marl.extensions.report.page import Page, Part, Section
 from ethbrake_marl.extensions.report.player import Played
 from ethbrake_marl.extensions.report.style import write_picture
@@ -72,9 +73,12 @@ def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
         for name, team in drivers.items():
             Played.drive(played, worlds, name, team, level.scenario)
             driven[name] = level.scenario.learners
+    first = plan.levels[0]
+    same = "the same line" if first.same_lines else "drawn with the same random numbers"
+    other = "" if first.swept is None or first.same_lines else f" {first.swept.key},"
     told = (
-        f"{count_of(len(played), 'world')}, the same line at every level; of several seeds the first drives."
-        f" The conditions are those of {plan.levels[0].name}: delays of messages and an obstacle ahead are each"
+        f"{count_of(len(played), 'world')}, {same} at every level; of several seeds the first drives."
+        f" The conditions are those of {first.name}:{other} delays of messages and an obstacle ahead are each"
         " level's own."
     )
     return Section("Episodes", [told, Part.player(played, driven)])
@@ -93,6 +97,7 @@ def _seed_row(one: Measured, seed: int, searched: int) -> Json:
     collided = one.reached.collided[seed]
     about: Json = {
         "level": one.level.name,
+        **one.level.columns,
         "algorithm": one.algorithm,
         "seed": seed if one.algorithm else None,
         "worlds": len(collided),
@@ -145,8 +150,9 @@ def ablation_page(found: Json, conditions: str, figures: Mapping[str, Figure], e
         episodes: sections with episodes to watch.
 
     """
+    titles = FIGURES if swept_axis(found) is None else SWEEP_FIGURES
     drawn = [
-        Part.drawing(figure, *FIGURES[name], alone=name == "ablation-who-pays.png", known=conditions)
+        Part.drawing(figure, *titles[name], alone=name == "ablation-who-pays.png", known=conditions)
         for name, figure in figures.items()
     ]
     sections = [Section("Conditions", [conditions]), *([Section("Figures", drawn)] if drawn else []), *episodes]
@@ -160,16 +166,23 @@ def ablation_page(found: Json, conditions: str, figures: Mapping[str, Figure], e
         sections.append(Section(title, parts))
     settings = {name: value for name, value in found["settings"].items() if name != "recipes"}
     sections.append(Section("Settings", [Part.facts(settings)]))
-    lead = "Who learns, who knows, whose harm counts: step by step."
+    lead, swept = "Who learns, who knows, whose harm counts: step by step.", swept_axis(found)
+    if swept is not None:
+        lead = f"One level with several numbers of {swept}."
     alarms = [Part.paragraph(line, "alarm") for line in found["undertrained"]]
     return Page("What cooperation is worth", sections, lead, opening=alarms).html
 
 
 def _blocks(found: Json) -> list[tuple[str, list[Sheet]]]:
     """Return the tables of an ablation in groups, each as (title, tables); ``found`` is from ``ablation.json``."""
-    levels = [{**level, "level": f"`{level['level']}`"} for level in found["levels"]]
+    swept = swept_axis(found)
+    shown = {
+        level["level"]: f"`{level['level']}`" if swept is None else f"{level['swept_number']:g}"
+        for level in found["levels"]
+    }
+    levels = [{**level, "level": f"`{level['level']}`", "number": shown[level["level"]]} for level in found["levels"]]
     steps, channels = (
-        [{**change, "from": f"`{change['from']}`", "to": f"`{change['to']}`"} for change in found[key]]
+        [{**change, "from": shown[change["from"]], "to": shown[change["to"]]} for change in found[key]]
         for key in ("steps", "channels")
     )
     both = [{**change, "change": f"{change['from']} to {change['to']}"} for change in steps + channels]
@@ -178,6 +191,9 @@ def _blocks(found: Json) -> list[tuple[str, list[Sheet]]]:
     braking = Column("All brake fully")
     about: _Columns = [("Level", "level"), (_ALGORITHM, "algorithm")]
     changed: _Columns = [("From", "from"), ("To", "to"), (_ALGORITHM, "algorithm")]
+    if swept is not None:
+        about.insert(1, (swept, "number"))
+        changed[:2] = [(f"{swept}, from", "from"), ("To", "to")]
     for count in HARM_COUNTS:
         changed += [
             (Column(f"Change of {HARM[count]}", sign="+"), f"{count} difference"),
@@ -282,6 +298,7 @@ def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> tu
     settings = {
         **plan.settings(),
         "levels": [level.name for level in plan.levels],
+        **({} if plan.sweep is None else {"sweep": plan.sweep}),
         "recipes": {name: r.model_dump(mode="json") for name, r in zip(plan.algorithms, plan.recipes, strict=True)},
         "machine": machine,
         "date": datetime.now(UTC).date().isoformat(),
@@ -291,15 +308,19 @@ def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> tu
         f"{name} (rewarded for {'first-impact' if recipe.reward.harm_count == 'first' else 'total'} harm)"
         for name, recipe in zip(plan.algorithms, plan.recipes, strict=True)
     )
+    worlds, first = f"{count_of(plan.episodes, 'world')} of seed {plan.list_seed}", plan.levels[0]
+    same = f"the same {worlds}" if first.same_lines else f"{worlds}, drawn with the same random numbers"
+    swept = "" if plan.sweep is None else f"{first.scenario.name} with {plan.sweep}; "
     conditions = (
-        f"{recipes}; {plan.seeds} {'seeds' if plan.seeds > 1 else 'seed'}, {plan.steps_per_learner:,} decisions of each"
-        f" learner. Harms are means per world in m²/s² on the same {count_of(plan.episodes, 'world')} of seed"
-        f" {plan.list_seed} at every level; {interval_words(plan.seeds)}. Joint optimum: the least harm known that"
-        f" the level's learners can do, and everything beside it, in the first {plan.search_episodes:,} of these"
-        f" worlds, {plan.budget:,} candidates per world and count. {machine}."
+        f"{swept}{recipes}; {plan.seeds} {'seeds' if plan.seeds > 1 else 'seed'}, {plan.steps_per_learner:,} decisions"
+        f" of each learner. Harms are means per world in m²/s² on {same} at every level;"
+        f" {interval_words(plan.seeds)}. Joint optimum: the least harm known that the level's learners can do, and"
+        f" everything beside it, in the first {plan.search_episodes:,} of these worlds, {plan.budget:,} candidates per"
+        f" world and count. {machine}."
     )
     drawn = found["steps"] or found["channels"]
-    figures = dict(zip(FIGURES, ablation_figures(found, conditions), strict=True)) if drawn else {}
+    titles = FIGURES if plan.sweep is None else SWEEP_FIGURES
+    figures = dict(zip(titles, ablation_figures(found, conditions), strict=True)) if drawn else {}
     for name, figure in figures.items():
         write_picture(plan.folder / name, figure, force=True)
     texts = {

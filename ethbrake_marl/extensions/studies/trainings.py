@@ -119,17 +119,22 @@ class TrainingJob:
         """
         from ethbrake_marl.training.session import train
 
-        told: list[Progress] = []
+        told: list[tuple[Progress, float]] = []  # with the CPU time
+
+        def note(progress: Progress) -> None:
+            told.append((progress, time.process_time()))
+
         recipe, scenario = self.training.recipe, self.training.scenario
         short = recipe.replace(evaluation={**recipe.evaluation.model_dump(), "worlds": 10, "every_updates": 1000})
         with tempfile.TemporaryDirectory(prefix="ethbrake-") as folder:
             path = Path(folder) / "timed"
-            train(short, scenario, path, steps=1)  # to compile and warm up
-            train(short, scenario, path, steps=4 * self.per_update, force=True, on_progress=told.append)
-            updates = [one for one in told if one.updates >= 1]
-            last = updates[-1]
-            first = updates[0] if updates[0].done < last.done else Progress("begun", 0, 0)
-            decision_s = (last.wall_s - first.wall_s) / (last.done - first.done)
+            train(short, scenario, path, steps=1, on_progress=lambda _: None)  # to compile and warm up
+            begun = Progress("begun", 0, 0), time.process_time()
+            train(short, scenario, path, steps=4 * self.per_update, force=True, on_progress=note)
+            updates = [one for one in told if one[0].updates >= 1]
+            last, last_s = updates[-1]
+            first, first_s = updates[0] if updates[0][0].done < last.done else begun
+            decision_s = (last_s - first_s) / (last.done - first.done)
             worlds = scenario.sample(50, recipe.evaluation.seed) if sample is None else sample
             return Timed(self, decision_s, replace(self, folder=path).world_seconds(worlds))
 
@@ -141,7 +146,7 @@ class TrainingJob:
 
 
 class Timed(NamedTuple):
-    """Measured speed of a training on one core, by the wall clock."""
+    """Measured speed of a training on one core, in CPU time, which other work on the machine does not change."""
 
     job: TrainingJob  # the measured training
     decision_s: float  # seconds per decision of a learner, including its share of the learning
@@ -163,9 +168,9 @@ class Timed(NamedTuple):
         One world runs first, so that compilation is not timed.
         """
         work(worlds.take([0]))
-        some, started = worlds.take(range(min(worlds.n, most))), time.monotonic()
+        some, started = worlds.take(range(min(worlds.n, most))), time.process_time()
         work(some)
-        return (time.monotonic() - started) / some.n
+        return (time.process_time() - started) / some.n
 
     @staticmethod
     def in_words(seconds: float) -> str:

@@ -271,5 +271,5 @@ def test_cost__is_told_and_nothing_is_made(
         LEVELS, recipe, ["scheme=shared"], seeds=seeds, steps_per_learner=128, episodes=20, search_episodes=4,
         folder=folder,
     )  # fmt: skip
-    said = ablation_cost(plan)
+    said = str(ablation_cost(plan))
     assert [each for each in patterns if not re.search(each, said)] == [] and folder.exists() == copied

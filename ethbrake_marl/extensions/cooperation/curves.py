@@ -1,0 +1,152 @@
+"""Figures of a sweep: harm against the swept number, and which vehicle bears it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ethbrake_marl.envs.rendering import COLOURS
+from ethbrake_marl.errors import count_of
+from ethbrake_marl.extensions.report.style import GREY, TITLES, band, finish, name_axes, new_panels, series_style
+from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.game.harm import HARM_COUNTS
+
+_MOST_TICKS = 12
+
+_ROOM = 0.05  # least distance of two ticks, as a share of the axis
+
+_BESIDE = 0.008  # distance of whiskers at the same number, as a share of the axis; a mark's seeds are twice as far
+
+_MARGIN = 0.06  # at either end, as a share of the axis
+
+Json = dict[str, Any]
+
+
+def swept_axis(found: Json) -> str | None:
+    """Return the label of the swept key: ``v2x.lost``, ``objective = social:…``; None if nothing is swept."""
+    first = found["levels"][0]
+    if "swept_key" not in first:
+        return None
+    word, colon, _ = first["swept_value"].rpartition(":")
+    return f"{first['swept_key']} = {word}:…" if colon else str(first["swept_key"])
+
+
+def sweep_figures(found: Json, caption: str) -> list[Figure]:
+    """Return the figures of a sweep, drawn over its number on linear axes from 0, with 95 % intervals."""
+    return [_harm_curves(found, caption), _who_bears(found, caption)]
+
+
+def _harm_curves(found: Json, caption: str) -> Figure:
+    """Draw both harms between full braking and the joint optimum, in the worlds in which the optimum was searched."""
+    figure, panels = new_panels((10.5, 4.8), columns=2)
+    for axes, harm_count in zip(panels, HARM_COUNTS, strict=True):
+        first = _of(found, algorithms(found)[0])
+        for key, label, colour in (
+            ("full_brake", "all brake fully", GREY),
+            ("best_known", "joint optimum", COLOURS[3]),
+        ):
+            ends = [Estimate(**level[harm_count]["searched"][key]) for level in first]
+            _curve(axes, first, ends, shade=True, color=colour, label=label, linewidth=2.0)
+        for number, algorithm in enumerate(algorithms(found)):
+            levels = _of(found, algorithm)
+            style = series_style(number + 1 if number == 0 else number + 3)
+            reached = [Estimate(**level[harm_count]["searched"]["harm"]) for level in levels]
+            _curve(axes, levels, reached, 3 * number, capsize=3, label=algorithm, **style)
+            for at, level in zip(_places(levels, 3 * number + 2), levels, strict=True):
+                dots = level[harm_count]["searched"]["each_seed"]
+                if len(dots) > 1:
+                    axes.scatter([at] * len(dots), dots, s=8, color=str(style["color"]), alpha=0.5, linewidths=0)
+            if levels[0][harm_count]["shielded"] is not None:
+                behind = [Estimate(**level[harm_count]["shielded"]["searched"]["harm"]) for level in levels]
+                cross = {**style, "marker": "x", "linestyle": ":"}
+                _curve(axes, levels, behind, -2 - 2 * number, capsize=3, label=f"{algorithm}, shielded", **cross)
+        _number_axis(axes, found)
+        name_axes(axes, TITLES[harm_count])
+    worlds = found["levels"][0]["first"]["searched"]["worlds"]
+    told = f"{caption} All of this figure: the first {count_of(worlds, 'world')}."
+    return finish(figure, told, panels[0], columns=4, fontsize=8.5)
+
+
+def _who_bears(found: Json, caption: str) -> Figure:
+    """Draw the harm of each vehicle, in all worlds; a further algorithm has other dashes."""
+    figure, panels = new_panels((10.5, 4.8), columns=2)
+    several = len(algorithms(found))
+    for axes, harm_count in zip(panels, HARM_COUNTS, strict=True):
+        for number, algorithm in enumerate(algorithms(found)):
+            levels = _of(found, algorithm)
+            for i in range(len(levels[0][harm_count]["vehicles"])):
+                borne = [Estimate(**level[harm_count]["vehicles"][i]) for level in levels]
+                name = f"Vehicle {i + 1}" + (f", {algorithm}" if several > 1 else "")
+                style = {**series_style(i), "linestyle": series_style(number)["linestyle"]}
+                _curve(axes, levels, borne, several * i + number, capsize=3, label=name, **style)
+        _number_axis(axes, found)
+        name_axes(axes, f"{TITLES[harm_count]} that each vehicle bears")
+    return finish(figure, caption, panels[0], columns=4, fontsize=8.5)
+
+
+def algorithms(found: Json) -> list[str]:
+    """Return the algorithms that were trained, each once."""
+    return list(dict.fromkeys(level["algorithm"] for level in found["levels"] if level["algorithm"] is not None))
+
+
+def with_intervals(
+    axes: Axes, at: Sequence[float], estimates: Sequence[Estimate], *, upright: bool = True, **style: Any
+) -> None:
+    """Draw marks with whiskers at the positions ``at``; ``upright``: values are on the y axis."""
+    values = np.array([each.value for each in estimates])
+    errors = np.abs(np.array([each.ends for each in estimates]).T - values)
+    if upright:
+        axes.errorbar(at, values, yerr=errors, **style)
+    else:
+        axes.errorbar(values, at, xerr=errors, **style)
+
+
+def _of(found: Json, algorithm: str) -> list[Json]:
+    return [level for level in found["levels"] if level["algorithm"] == algorithm]
+
+
+def _curve(
+    axes: Axes,
+    levels: Sequence[Json],
+    estimates: Sequence[Estimate],
+    beside: int = 0,
+    *,
+    shade: bool = False,
+    **style: Any,
+) -> None:
+    """Draw estimates over the swept number, with their intervals as whiskers, or as a ``shade``."""
+    at = _places(levels, beside)
+    if not shade:
+        with_intervals(axes, at, estimates, **style)
+        return
+    low, high = np.array([each.ends for each in estimates]).T
+    axes.plot(at, [each.value for each in estimates], **style)
+    band(axes, at, low, high, style)
+
+
+def _places(levels: Sequence[Json], beside: int) -> list[float]:
+    """Return the swept numbers, moved to the right ``beside`` times."""
+    low, high = _span(levels)
+    return [level["swept_number"] + beside * _BESIDE * (high - low) for level in levels]
+
+
+def _span(levels: Sequence[Json]) -> tuple[float, float]:
+    """Return the ends of the axis: the swept numbers and 0."""
+    numbers = [level["swept_number"] for level in levels]
+    return min(*numbers, 0.0), max(*numbers, 0.0)
+
+
+def _number_axis(axes: Axes, found: Json) -> None:
+    """Make both axes linear from 0; ticks of the x axis are the swept numbers and 0 where there is room."""
+    numbers = sorted({0.0, *(level["swept_number"] for level in found["levels"])})
+    low, high = _span(found["levels"])
+    margin = _MARGIN * (high - low)
+    axes.set_xlim(low - margin, high + margin)
+    if len(numbers) <= _MOST_TICKS and np.diff(numbers).min() >= _ROOM * (high - low):
+        axes.set_xticks(numbers)
+    axes.set_xlabel(swept_axis(found) or "", fontsize=9)
+    axes.set_ylim(0.0, 1.02 * axes.get_ylim()[1])

@@ -1,0 +1,234 @@
+"""``study ablate --sweep``: one level with several numbers of one key."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.extensions.cooperation.comparison import compare
+from ethbrake_marl.extensions.cooperation.figures import ablation_figures
+from ethbrake_marl.extensions.cooperation.joint_optimum import Harms, LevelOptimum, Measured, best_known
+from ethbrake_marl.extensions.cooperation.levels import Level, Plan, common_worlds, plan_ablation
+from ethbrake_marl.extensions.cooperation.page import levels_csv, markdown
+from ethbrake_marl.extensions.cooperation.sweep import Swept
+from ethbrake_marl.extensions.search.best_harm import best_harm
+from tests.fixtures.commands import Command, Refuse
+from tests.fixtures.pictures import draw_nothing
+
+
+@pytest.mark.parametrize(
+    ("text", "settings"),
+    [
+        ("objective=social:0..90:45", ["objective=social:0", "objective=social:45", "objective=social:90"]),
+        ("v2x.lost=0,0.1,0.3", ["v2x.lost=0", "v2x.lost=0.1", "v2x.lost=0.3"]),
+        ("v2x.lost=0..0.3:0.1", ["v2x.lost=0", "v2x.lost=0.1", "v2x.lost=0.2", "v2x.lost=0.3"]),
+        ("friction = 0.9, 0.2..0.4:0.1, 10", [f"friction={each}" for each in ("0.2", "0.3", "0.4", "0.9", "10")]),
+        ("k=-0.5..0.5:0.5", ["k=-0.5", "k=0", "k=0.5"]),
+        ("objective=social:45,social:0,social:5", ["objective=social:0", "objective=social:5", "objective=social:45"]),
+        ("objective=social:45,0", ["objective=social:0", "objective=social:45"]),
+    ],
+)
+def test_parse__ranges_and_lists_in_ascending_order(text: str, settings: list[str]) -> None:
+    values = Swept.parse(text)
+    assert [each.setting for each in values] == settings
+    assert [each.number for each in values] == [float(each.replace(":", "=").split("=")[-1]) for each in settings]
+
+
+MUST = "must be KEY=LOW..HIGH:STEP or KEY=A,B,... with numbers, for instance objective=social:0..90:15"
+RANGE = "must go up from LOW to HIGH in at most 99 whole steps, for instance 0..90:15"
+REFUSED = {
+    "friction": MUST,
+    "=1,2": MUST,
+    "objective=own,total": f"{MUST} or v2x.lost=0,0.1,0.3; compare other values as --levels",
+    "gaps_m='{uniform: [5, 10]}'": MUST,
+    "friction=0.5,nan": MUST,
+    "friction=0.5,,0.6": MUST,
+    "objective=social:0..100:15": f"--sweep objective: range social:0..100:15: {RANGE}",
+    "friction=1..0.5:0.1": RANGE,
+    "friction=0.5..1:0": RANGE,
+    "friction=0.5..1:-0.1": RANGE,
+    "friction=0..100:1": RANGE,
+    "friction=0.5": "--sweep friction: 1 given; must be 2 to 100 numbers",
+    "friction=0..60:1,100..160:1": "122 given; must be 2 to 100 numbers",
+    "friction=0.5,0.50": "--sweep friction: 0.5 is given twice",
+    "objective=social:0..120:30": "objective 'social:120': social needs an angle from 0 to 90 degrees",
+    "mass_t.2=-1,2": "mass_t[2] (vehicle_3) = -1: must be finite and in (0, 1000] t",
+    "frictoin=0.5,0.6": "unknown setting 'frictoin'; did you mean 'friction'?",
+    "averaging=0.9,0.99": "--sweep averaging: is a recipe's; a sweep varies a scenario (recipes: ethbrake study sweep)",
+    "vehicles=2,3": "--sweep vehicles: levels with different vehicles cannot be compared, vehicle by vehicle",
+    "horizon_s=4,8": "give each a folder of its own (--set horizon_s=..., --output)",
+    "friction=0.5,0.6 --sweep v2x.lost=0,0.1": "--sweep is given twice; sweep one key, because a figure has one axis",
+    "friction=0.5,0.6 --set friction=1": "--sweep friction: --set friction has no place beside it",
+    "friction=0.5,0.6 --levels cooperation-3-pair,cooperation-4-all": "levels: 2 given; a sweep makes its levels",
+    "friction=0.5,0.6 --levels cooperation-0-sensors": "levels: nobody learns in any of them",
+    "objective=social:0,90 --set reward.objective=own": "recipe 'cooperation' has an objective of its own",
+}
+
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_sweep__is_refused(words: str, refuse: Refuse) -> None:
+    refuse(f"study ablate --output new --cost --sweep {words}", REFUSED[words])
+
+
+def plan(sweep: str, folder: Path = Path("any"), **given: object) -> Plan:
+    return plan_ablation("cooperation-3-pair", "cooperation", None, sweep=sweep, folder=folder, **given)
+
+
+def test_levels__are_one_level_with_the_numbers() -> None:
+    levels = plan("scenario.v2x.lost=0.3,0").levels
+    assert [level.name for level in levels] == ["cooperation-3-pair-v2x.lost-0", "cooperation-3-pair-v2x.lost-0.3"]
+    assert [level.scenario.v2x.channel.lost for level in levels] == [0.0, 0.3]
+    assert [level.clear for level in levels] == [None, None]
+    (*_, (level, _, job)) = plan("objective=social:0,90", seeds=2).trainings()
+    assert (level.scenario.objective, job.noted) == ("social:90", ("objective=social:90",))
+    assert job.folder.name == "cooperation-3-pair-social-90-cooperation-shared-seed1"
+
+
+def test_worlds__differ_in_the_swept_key_alone() -> None:
+    light, heavy = (sample.worlds for sample in common_worlds(plan("mass_t.2=5,40").levels, 20, 7))
+    assert set(light.vehicles.mass_t[:, 2]) == {5.0} and set(heavy.vehicles.mass_t[:, 2]) == {40.0}
+    np.testing.assert_array_equal(light.gaps_m, heavy.gaps_m)
+    np.testing.assert_array_equal(light.speeds_mps, heavy.speeds_mps)
+
+
+def test_best_known__counts_for_other_numbers_only_on_the_same_lines() -> None:
+    """A long search of the second level helps the first if they differ in the objective, not if in a mass."""
+    for sweep, helps in (("objective=social:0,90", True), ("mass_t.2=5,40", False)):
+        own, other = (
+            LevelOptimum(level, worlds, best_harm(level.scenario, worlds, budget=budget, threads=1), ())
+            for level, budget in zip(plan(sweep).levels, (1, 500), strict=True)
+            for worlds in (level.scenario.sample(20, 7).worlds,)
+        )
+        alone, both = best_known(own, [own])["total"], best_known(own, [own, other])["total"]
+        assert (both.mean() < alone.mean() - 0.1) == helps and (helps or (both == alone).all())
+
+
+WORLDS, SEARCHED = 40, 10
+
+
+def harms(*seeds: tuple[float, float, float]) -> Harms:
+    """The same harm of each vehicle in every world, one triple per seed; total harm is twice the first."""
+    first = np.repeat(np.array(seeds)[:, np.newaxis, :], WORLDS, axis=1)
+    vehicle = {"first": first, "total": 2.0 * first}
+    world = {count: each.sum(axis=2) for count, each in vehicle.items()}
+    return Harms(world, vehicle, first.sum(axis=2) > 0.0)
+
+
+@pytest.fixture(scope="module")
+def measured() -> list[Measured]:
+    """Two seeds at 0, 30 and 90 degrees; line harms are 12 and 10, 9 and 9, 8 and 6."""
+    reached = (
+        harms((5.0, 4.0, 3.0), (5.0, 2.0, 3.0)),
+        harms((4.0, 4.0, 1.0), (4.0, 4.0, 1.0)),
+        harms((3.0, 4.0, 1.0), (1.0, 4.0, 1.0)),
+    )
+    best = {"first": np.full((1, SEARCHED), 5.0), "total": np.full((1, SEARCHED), 10.0)}
+    values = Swept.parse("objective=social:0,30,90")
+    scenario = eb.load_scenario("cooperation-3-pair")
+    return [
+        Measured(Level(scenario, swept=value), "ppo", each, harms((4.0, 8.0, 8.0)), best)
+        for value, each in zip(values, reached, strict=True)
+    ]
+
+
+def test_tables__have_the_key_and_the_number_as_columns(measured: list[Measured]) -> None:
+    found = compare(measured, SEARCHED)
+    keys = ("swept_key", "swept_value", "swept_number")
+    rows = [("objective", "social:0", 0.0), ("objective", "social:30", 30.0), ("objective", "social:90", 90.0)]
+    assert [tuple(level[key] for key in keys) for level in found["levels"]] == rows
+    assert [level["first"]["harm"]["value"] for level in found["levels"]] == [11.0, 9.0, 7.0]
+    assert [(s["from_number"], s["to_number"], s["first"]["difference"]["value"]) for s in found["steps"]] == [
+        (0.0, 30.0, -2.0),
+        (30.0, 90.0, -2.0),
+    ]
+    table = list(csv.DictReader(levels_csv(measured, SEARCHED).splitlines()))
+    told = [(row["swept_key"], row["swept_number"], row["seed"], row["first_impact_harm"]) for row in table]
+    shown = [("objective", "0.0", "0", "12.0"), ("objective", "0.0", "1", "10.0"), ("objective", "30.0", "0", "9.0")]
+    assert told[:3] == shown
+    text = markdown(found, "Conditions.")
+    assert "| Level | objective = social:… | Collisions |" in text
+    assert "| `cooperation-3-pair-social-90` | 90 | 100.0 % [" in text
+    assert "| objective = social:…, from | To |" in text and "\n| 30 | 90 | -2.00 [" in text
+
+
+def test_figures__their_axis_is_the_number_linear_from_zero(measured: list[Measured]) -> None:
+    found = compare([*measured, *(replace(each, algorithm="sac") for each in measured)], SEARCHED)
+    harm, bears = ablation_figures(found, "Conditions.")
+    for axes in (*harm.axes, *bears.axes):
+        assert (axes.get_xscale(), axes.get_yscale(), axes.get_ylim()[0]) == ("linear", "linear", 0.0)
+        assert axes.get_xlabel() == "objective = social:…" and list(axes.get_xticks()) == [0.0, 30.0, 90.0]
+        assert axes.get_xlim() == pytest.approx((-5.4, 95.4))
+    first = harm.axes[0]
+    lines = {each.get_label(): each for each in first.lines}
+    assert list(lines["all brake fully"].get_ydata()) == [20.0] * 3
+    assert list(lines["joint optimum"].get_ydata()) == [5.0] * 3
+    curve = next(each for each in first.containers if each.get_label() == "ppo")
+    assert [list(part) for part in curve.lines[0].get_data()] == [[0.0, 30.0, 90.0], [11.0, 9.0, 7.0]]
+    low, high = np.array([path.vertices[:, 1] for path in curve.lines[2][0].get_paths()]).T
+    assert [*low, *high] == pytest.approx([10.0, 9.0, 6.0, 12.0, 9.0, 8.0])  # over seeds: worlds are alike
+    names = [each.get_label() for each in bears.axes[0].containers]
+    assert names == [f"Vehicle {i}, {algorithm}" for algorithm in ("ppo", "sac") for i in (1, 2, 3)]
+    assert list(bears.axes[0].containers[0].lines[0].get_ydata()) == [5.0, 4.0, 2.0]
+
+
+def test_figures__far_from_zero_the_axis_still_begins_there(measured: list[Measured]) -> None:
+    values = Swept.parse("obstacle_gap_m=40,41,60")
+    far = [replace(each, level=replace(each.level, swept=value)) for each, value in zip(measured, values, strict=True)]
+    axes = ablation_figures(compare(far, SEARCHED), "Conditions.")[0].axes[0]
+    assert axes.get_xlim() == pytest.approx((-3.6, 63.6)) and axes.get_xlabel() == "obstacle_gap_m"
+    assert 0.0 in axes.get_xticks() and 41.0 not in axes.get_xticks()  # 40 and 41 have no room beside each other
+
+
+SMALL = "--seeds 1 --steps 128 --episodes 20 --search-episodes 4"
+
+
+def test_sweep__costs_runs_and_goes_on(
+    ethbrake: Command, empty_folder: Path, tiny_recipe: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    draw_nothing(monkeypatch)
+    line = f"study ablate --sweep objective=social:0,90 --recipes {tiny_recipe} {SMALL} --output out --json"
+    cost = ethbrake(*line.split(), "--cost")
+    assert cost.status == 0 and list(Path().iterdir()) == []
+    told = json.loads(cost.out)
+    assert (told["trainings"], told["training_folders"], told["search_folders"], told["decisions"]) == (2, 2, 1, 512)
+    parts = [told[name] for name in ("training_s", "search_s", "driving_s")]
+    assert min(parts) > 0.0 and told["total_s"] == pytest.approx(sum(parts)) and "CPU time" in told["measured"]
+
+    assert ethbrake(*line.split()).status == 0
+    out = Path("out")
+    names = [f"cooperation-3-pair-social-{number}" for number in (0, 90)]
+    folders = sorted(each.name for each in out.glob("trainings/*"))
+    assert folders == [f"{name}-tiny-shared-seed0" for name in names]
+    assert [each.name for each in out.glob("optimum/*")] == names[:1]  # one search: the objective changes no worlds
+    assert {"ablation.png", "ablation-who-bears.png"} == {each.name for each in out.glob("*.png")}
+    found = json.loads((out / "ablation.json").read_text())
+    assert found["settings"]["sweep"] == "objective=social:0,90" and found["channels"] == []
+    assert "cooperation-3-pair with objective=social:0,90; tiny-shared" in (out / "ablation.md").read_text()
+    assert "with several numbers of objective = social:…" in (out / "ablation.html").read_text()
+
+    again = ethbrake(*line.split())
+    assert again.status == 0 and "to do: 0 trainings, 0 decisions" in again.err
+    assert json.loads(again.out)["levels"] == found["levels"]
+    other = ethbrake(*line.replace("0,90", "0,45,90").split())
+    assert other.status == 2 and "holds an ablation with other settings (levels)" in other.err
+    (out / "settings.json").unlink()
+    more = ethbrake(*line.replace("0,90", "0,45,90").split(), "--cost")
+    told = json.loads(more.out)
+    assert (told["trainings"], told["training_folders"], told["search_s"]) == (1, 3, 0.0)
+
+
+def test_sweep__of_the_lines_is_said(
+    ethbrake: Command, empty_folder: Path, tiny_recipe: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    draw_nothing(monkeypatch)
+    line = f"study ablate --sweep mass_t.2=5,40 --recipes {tiny_recipe} {SMALL} --output out"
+    assert ethbrake(*line.split()).status == 0
+    out = Path("out")
+    assert len([*out.glob("optimum/*")]) == 2  # other masses, other searches
+    text = (out / "ablation.md").read_text()
+    assert "20 worlds of seed 7, drawn with the same random numbers at every level" in text
+    assert "are those of cooperation-3-pair-mass_t.2-5: mass_t.2, delays of" in (out / "ablation.html").read_text()
