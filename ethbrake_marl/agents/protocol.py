@@ -16,6 +16,7 @@ from ethbrake_marl.engine.engine import Engine, Guard
 from ethbrake_marl.engine.memory import Memory, ask_script, begin_script, is_state_free
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics.messages import refuse_untold
 from ethbrake_marl.physics.state import Floats, Worlds
 
 
@@ -124,8 +125,10 @@ def fixed_commands(
 
     ``worlds`` are at the alert. ``who`` names the agent that looks ahead; it drives ``vehicle``, whose script is
     ignored. Raises ``InvalidInput``, beginning with ``who`` and ending with ``advice``, for a script whose command is
-    not fixed at the alert according to ``is_fixed``.
+    not fixed at the alert according to ``is_fixed``; and where messages lack a piece that looking ahead needs.
     """
+    if vehicle is not None:
+        refuse_untold(worlds, [vehicle], who)
     command = -worlds.vehicles.braking_capacity_mps2
     for i, script in scripts.items():
         if i == vehicle:

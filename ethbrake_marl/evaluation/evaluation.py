@@ -121,7 +121,8 @@ class Evaluation:
     @property
     def hidden(self) -> Bools:
         """Worlds in which the channel hides something about the line from a controlled vehicle, [n]; see ``v2x``."""
-        from_each = [self.worlds.vehicles.hide_from(i) | Messages.of(self.worlds).periodic for i in self.vehicles]
+        messages, hides = Messages.of(self.worlds), self.worlds.vehicles.hide_from
+        from_each = [hides(i) | messages.periodic | messages.withhold_from(i) for i in self.vehicles]
         hidden: Bools = np.logical_or.reduce([np.zeros(self.worlds.n, np.bool_), *from_each])
         return hidden
 

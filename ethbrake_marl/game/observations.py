@@ -28,6 +28,19 @@ from ethbrake_marl.game.features import (
 from ethbrake_marl.physics.columns import Packed, columns
 from ethbrake_marl.physics.estimates import estimate_rows
 from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.messages import (
+    ACCELERATION,
+    BRAKING_CAPACITY,
+    INTENT,
+    LATENCY,
+    MASS,
+    PIECES,
+    PLACE,
+    SPEED,
+    Messages,
+    has_contents,
+    knows_piece,
+)
 from ethbrake_marl.physics.motion import stopping_distance
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 
@@ -184,6 +197,22 @@ class Extra(NamedTuple):
     offset: int  # offset of the neighbour in the line; 0: the vehicle itself
     known: int  # column of the neighbour's ``known`` in the whole groups
 
+    def known_in(self, worlds: Worlds, vehicle: int, neighbour: int) -> NDArray[np.bool_]:
+        """Return the worlds [n] in which ``vehicle`` knows every piece of the neighbour that the feature reads.
+
+        Raises ``InvalidInput`` for a feature that does not say what it reads, where messages do not contain everything.
+        """
+        messages, reads = Messages.of(worlds), self.entry.reads
+        if reads is None:
+            for piece in messages.lacks(neighbour):
+                raise InvalidInput(
+                    f"feature {self.entry.feature.name!r}: vehicle_{neighbour + 1} does not tell its {piece} (v2x:"
+                    " tells), and the feature does not say what it reads: register_feature(..., reads=['place'])"
+                )
+            return np.ones(worlds.n, np.bool_)
+        known = messages.known_pieces(vehicle, worlds.time_s)[:, neighbour]
+        return np.asarray(known[:, [PIECES.index(piece) for piece in reads]].all(axis=1), np.bool_)
+
 
 class Plan(NamedTuple):
     """How to compute an observation: kernels fill whole groups, functions compute registered features."""
@@ -230,6 +259,8 @@ class Plan(NamedTuple):
         for extra, (o, vehicle) in product(self.extras, enumerate(vehicles.tolist())):
             neighbour = vehicle + extra.offset if extra.offset else None
             counts = np.ones(worlds.n, np.bool_) if neighbour is None else whole[:, o, extra.known] == 1.0
+            if neighbour is not None and counts.any():
+                counts &= extra.known_in(worlds, vehicle, neighbour)
             if counts.any():  # a neighbour's feature counts where the neighbour is known
                 values = extra.entry.checked(worlds, vehicle, neighbour, counts, steps)
             else:  # no such neighbour, or no news of it
@@ -285,6 +316,7 @@ def _observe_rows(
     N, speed, command, gap_column, hit, obstacle = of.vehicles, of.speed, of.command, of.gap, of.hit, of.obstacle
     braking, driving, latency, mass, news = of.braking, of.driving, of.latency, of.mass, of.news
     by_link, some_obstacle = params.shape[1] > of.own_latency, state.shape[1] > obstacle
+    has_messages = params.shape[1] > of.messages
     own_part = of.own_latency if by_link else latency  # column own_part + j has vehicle j's own latency
     value = np.zeros(out.shape[2])
     for k in range(out.shape[0]):
@@ -326,6 +358,8 @@ def _observe_rows(
                 value[c + 7] = state[k, hit + (i - 1 if in_front else i)]
                 value[c + 8] = gap + other_stop - own_stop if in_front else gap + own_stop - other_stop
                 value[c + 9] = _fitting_deceleration(own_speed, own_latency, room)
+                if has_messages:
+                    _hide_untold(value[c : c + _NEIGHBOUR], params[k, of.messages :], N, i, j, time)
                 c += _NEIGHBOUR
             if role:
                 value[c] = i
@@ -333,6 +367,8 @@ def _observe_rows(
                 c += _ROLE
             if with_obstacle:
                 told = i == 0 or time >= params[k, news + i * N if by_link else latency + i]
+                if has_messages and i > 0:
+                    told = told and knows_piece(params[k, of.messages :], N, i, 0, PLACE, time)
                 for absent in range(c, c + _OBSTACLE):
                     value[absent] = 0.0
                 if told and some_obstacle and state[k, obstacle] < math.inf:
@@ -346,6 +382,28 @@ def _observe_rows(
                     value[c + 4] = _fitting_deceleration(own_speed, own_latency, gap)
             for c in range(out.shape[2]):
                 out[k, o, c] = min(max(value[c] * features[0, c], features[1, c]), features[2, c])
+
+
+@compiled
+def _hide_untold(block: Floats, told: Floats, N: int, observer: int, neighbour: int, time: float) -> None:
+    """Set to 0 what needs a piece of the neighbour that the observer does not know; all, if it knows no piece."""
+    if not has_contents(told, N):
+        return
+    place, speed, acceleration, braking, latency, mass, intent = (
+        knows_piece(told, N, observer, neighbour, PLACE, time),
+        knows_piece(told, N, observer, neighbour, SPEED, time),
+        knows_piece(told, N, observer, neighbour, ACCELERATION, time),
+        knows_piece(told, N, observer, neighbour, BRAKING_CAPACITY, time),
+        knows_piece(told, N, observer, neighbour, LATENCY, time),
+        knows_piece(told, N, observer, neighbour, MASS, time),
+        knows_piece(told, N, observer, neighbour, INTENT, time),
+    )
+    some = place or speed or acceleration or braking or latency or mass or intent
+    stops = place and speed and braking and latency  # what the margins need
+    kept = (some, place, speed, acceleration, braking, mass, latency, some, stops, stops)
+    for f in range(_NEIGHBOUR):
+        if not kept[f]:
+            block[f] = 0.0
 
 
 @compiled

@@ -5,6 +5,7 @@ Each check raises pydantic's error for the first defect, with the path inside th
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from difflib import get_close_matches
 
 import numpy as np
@@ -68,6 +69,12 @@ def _check_reactions(scenario: ScenarioFields) -> None:
     for name in scenario.v2x.vehicles or ():
         right = f"unknown vehicle; this scenario has vehicle_1 ... vehicle_{scenario.vehicles}"
         require(name in scenario.vehicle_names, ("v2x", "vehicles", name), UNSHOWN, right)
+    tells = scenario.v2x.channel.tells
+    for name in tells if isinstance(tells, Mapping) else ():
+        right = f"unknown vehicle; this scenario has vehicle_1 ... vehicle_{scenario.vehicles}"
+        require(name in scenario.vehicle_names, ("v2x", "tells", name), UNSHOWN, right)
+        equipped = (scenario.v2x.vehicles or {}).get(name)
+        require(equipped is None or equipped.sends, ("v2x", "tells", name), UNSHOWN, "sends no messages (v2x.vehicles)")
     kinds = {name: kind.v2x for name, kind in (scenario.vehicle_types or {}).items() if kind.v2x is not None}
     right = f"v2x {scenario.v2x.preset} has no messages that a type could lack; give a v2x that has, such as nominal"
     for name, equipage in kinds.items():
