@@ -181,7 +181,7 @@ class _TellsSchema:
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         listed = {"type": "array", "items": {"enum": list(PIECES)}, "uniqueItems": True}
         by_name = {"type": "object", "minProperties": 1, "additionalProperties": listed}
-        return {"anyOf": [listed, by_name, {"type": "null"}], "default": None}
+        return {"anyOf": [listed, by_name]}
 
 
 class V2X(FileModel):
@@ -226,7 +226,8 @@ class V2X(FileModel):
     tells: Annotated[Any, BeforeValidator(_pieces), _TellsSchema] = Field(
         default=None,
         exclude_if=lambda tells: tells is None,
-        description="what a message contains: a list for all vehicles, or by name {vehicle_3: [place, speed, intent]}",
+        description="what a message contains, for all vehicles or by name: place, speed, acceleration,"
+        " braking_capacity, latency, mass, intent; by default all but intent",
     )
     vehicles: dict[str, Equipage] | None = Field(
         default=None,

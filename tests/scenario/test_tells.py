@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from ethbrake_marl.game.features import FEATURES, register_feature
 from ethbrake_marl.game.observations import choose_observation, observe
 from ethbrake_marl.physics.messages import PIECES, USUAL_PIECES, Messages
 from ethbrake_marl.scenario.channel import CHANNELS, register_preset
+from ethbrake_marl.training.experiment import run_experiment
 from tests.fixtures.knowledge import alter_unreceived
 
 PAPER = eb.load_scenario("paper-random")
@@ -308,3 +310,10 @@ def test_own_features__say_what_they_read_or_are_refused() -> None:
     finally:
         for name in ("double_mass", "double_mass_read"):
             del FEATURES.loaded[name]
+
+
+def test_run__refuses_before_it_trains_because_its_baseline_and_its_shield_would(tmp_path: Path) -> None:
+    where = r"run, with the baseline e_v2x_bm and a shield: vehicle_3 does not tell its mass \(v2x: tells\)"
+    with pytest.raises(InvalidInput, match=where):
+        run_experiment(LIGHT, tmp_path / "run", recipe=eb.load_recipe("ppo"), episodes=5)
+    assert not (tmp_path / "run").exists()
