@@ -38,7 +38,6 @@ from ethbrake_marl.physics.messages import (
     PLACE,
     SPEED,
     Messages,
-    has_contents,
     knows_piece,
 )
 from ethbrake_marl.physics.motion import stopping_distance
@@ -203,6 +202,8 @@ class Extra(NamedTuple):
         Raises ``InvalidInput`` for a feature that does not say what it reads, where messages do not contain everything.
         """
         messages, reads = Messages.of(worlds), self.entry.reads
+        if not messages.says_contents:
+            return np.full(worlds.n, PIECES[INTENT] not in (reads or ()))
         if reads is None:
             for piece in messages.lacks(neighbour):
                 raise InvalidInput(
@@ -229,19 +230,28 @@ class Plan(NamedTuple):
         as it estimates them (``physics.estimates``). Contact features of commands that are not needed are 0. Raises
         ``PhysicsError`` with the worlds in which a forecast of contacts failed.
         """
-        if not Packed(state, params).has_messages:
+        packed = Packed(state, params)
+        if not packed.has_messages:
             return self._observe_present(state, params, vehicles, steps)
+        says = Messages(params[:, packed.column.messages :], packed.column.vehicles).says_contents
         estimate, seen = np.empty(state.shape), []
         for vehicle in vehicles.tolist():
             estimate_rows(state, params, vehicle, estimate)
-            seen.append(self._observe_present(estimate, params, np.array([vehicle]), steps))
+            seen.append(self._observe_present(estimate, params, np.array([vehicle]), steps, says=says))
         return np.concatenate(seen, axis=1)
 
-    def _observe_present(self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None) -> Observations:
-        """``observe`` without estimation: the state of every known vehicle is its present state."""
+    def _observe_present(
+        self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None, *, says: bool = False
+    ) -> Observations:
+        """``observe`` without estimation: the state of every known vehicle is its present state.
+
+        ``says``: whether the worlds say what messages contain.
+        """
         shape = len(state), len(vehicles)
         whole = np.empty((*shape, self.scaling.features.shape[1]), np.float32)
         _observe_rows(state, params, vehicles, *self.scaling, whole)
+        if says:
+            _hide_untold(state, params, vehicles, *self.scaling[:3], whole)
         if self.contacts is not None:
             found = np.zeros((*shape, self.contacts.features.shape[1]), np.float32)
             failed = np.zeros(len(state), np.bool_)
@@ -316,7 +326,6 @@ def _observe_rows(
     N, speed, command, gap_column, hit, obstacle = of.vehicles, of.speed, of.command, of.gap, of.hit, of.obstacle
     braking, driving, latency, mass, news = of.braking, of.driving, of.latency, of.mass, of.news
     by_link, some_obstacle = params.shape[1] > of.own_latency, state.shape[1] > obstacle
-    has_messages = params.shape[1] > of.messages
     own_part = of.own_latency if by_link else latency  # column own_part + j has vehicle j's own latency
     value = np.zeros(out.shape[2])
     for k in range(out.shape[0]):
@@ -358,8 +367,6 @@ def _observe_rows(
                 value[c + 7] = state[k, hit + (i - 1 if in_front else i)]
                 value[c + 8] = gap + other_stop - own_stop if in_front else gap + own_stop - other_stop
                 value[c + 9] = _fitting_deceleration(own_speed, own_latency, room)
-                if has_messages:
-                    _hide_untold(value[c : c + _NEIGHBOUR], params[k, of.messages :], N, i, j, time)
                 c += _NEIGHBOUR
             if role:
                 value[c] = i
@@ -367,8 +374,6 @@ def _observe_rows(
                 c += _ROLE
             if with_obstacle:
                 told = i == 0 or time >= params[k, news + i * N if by_link else latency + i]
-                if has_messages and i > 0:
-                    told = told and knows_piece(params[k, of.messages :], N, i, 0, PLACE, time)
                 for absent in range(c, c + _OBSTACLE):
                     value[absent] = 0.0
                 if told and some_obstacle and state[k, obstacle] < math.inf:
@@ -385,25 +390,34 @@ def _observe_rows(
 
 
 @compiled
-def _hide_untold(block: Floats, told: Floats, N: int, observer: int, neighbour: int, time: float) -> None:
-    """Set to 0 what needs a piece of the neighbour that the observer does not know; all, if it knows no piece."""
-    if not has_contents(told, N):
-        return
-    place, speed, acceleration, braking, latency, mass, intent = (
-        knows_piece(told, N, observer, neighbour, PLACE, time),
-        knows_piece(told, N, observer, neighbour, SPEED, time),
-        knows_piece(told, N, observer, neighbour, ACCELERATION, time),
-        knows_piece(told, N, observer, neighbour, BRAKING_CAPACITY, time),
-        knows_piece(told, N, observer, neighbour, LATENCY, time),
-        knows_piece(told, N, observer, neighbour, MASS, time),
-        knows_piece(told, N, observer, neighbour, INTENT, time),
-    )
-    some = place or speed or acceleration or braking or latency or mass or intent
-    stops = place and speed and braking and latency  # what the margins need
-    kept = (some, place, speed, acceleration, braking, mass, latency, some, stops, stops)
-    for f in range(_NEIGHBOUR):
-        if not kept[f]:
-            block[f] = 0.0
+def _hide_untold(
+    state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, with_obstacle: bool, out: Observations
+) -> None:
+    """Set features in ``out`` to 0 that need a piece of a neighbour which the observer does not know.
+
+    Where no piece of it is known, all of its features are 0. The obstacle is known with the place of Vehicle 1.
+    """
+    of = columns(state)
+    N, knows = of.vehicles, np.zeros(len(PIECES), np.bool_)
+    for k in range(out.shape[0]):
+        told, time = params[k, of.messages :], state[k, of.time]
+        for o in range(observers.shape[0]):
+            i, c = observers[o], _OWN
+            for offset in offsets:
+                if out[k, o, c] == 1.0:
+                    for piece in range(len(PIECES)):
+                        knows[piece] = knows_piece(told, N, i, i + offset, piece, time)
+                    stops = knows[PLACE] and knows[SPEED] and knows[BRAKING_CAPACITY] and knows[LATENCY]
+                    kept = (
+                        knows.any(), knows[PLACE], knows[SPEED], knows[ACCELERATION], knows[BRAKING_CAPACITY],
+                        knows[MASS], knows[LATENCY], knows.any(), stops, stops,
+                    )  # fmt: skip
+                    for f in range(_NEIGHBOUR):
+                        out[k, o, c + f] = out[k, o, c + f] if kept[f] else 0.0
+                c += _NEIGHBOUR
+            c += _ROLE if role else 0
+            if with_obstacle and i > 0 and not knows_piece(told, N, i, 0, PLACE, time):
+                out[k, o, c : c + _OBSTACLE] = 0.0
 
 
 @compiled

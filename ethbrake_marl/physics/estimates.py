@@ -6,7 +6,17 @@ import numpy as np
 
 from ethbrake_marl.physics.columns import columns
 from ethbrake_marl.physics.jit import compiled
-from ethbrake_marl.physics.messages import ACCELERATION, CHANNEL, LINK, PLACE, SPEED, knows_piece, link_at, place_at
+from ethbrake_marl.physics.messages import (
+    ACCELERATION,
+    CHANNEL,
+    LINK,
+    PLACE,
+    SPEED,
+    has_contents,
+    knows_piece,
+    link_at,
+    place_at,
+)
 from ethbrake_marl.physics.motion import solo_motion
 from ethbrake_marl.physics.state import Floats
 
@@ -31,6 +41,7 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
         if params[k, head + CHANNEL.PERIOD] == 0.0:
             continue
         told, time = params[k, head:], state[k, column.time]
+        says = has_contents(told, N)
         place[observer], fresh[observer] = told[place_at(N) + observer], True
         for way in (-1, 1):
             last = place[observer]
@@ -43,18 +54,18 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
                 if known:
                     limit, age = params[k, column.limit + j], time - told[link + LINK.TOLD_S]
                     then, force = told[link + LINK.TOLD_SPEED], told[link + LINK.TOLD_COMMAND]
-                    force = force if knows_piece(told, N, observer, j, ACCELERATION, time) else 0.0
+                    if says and not knows_piece(told, N, observer, j, ACCELERATION, time):
+                        force = 0.0
                     after, passed = moved_on(then, force, limit, age)
                     out[k, command + j] = force
-                    if knows_piece(told, N, observer, j, SPEED, time):
-                        out[k, speed + j] = after
+                    if says and not knows_piece(told, N, observer, j, SPEED, time):
+                        after = passed = 0.0
+                    out[k, speed + j] = after
+                    if says and not knows_piece(told, N, observer, j, PLACE, time):
+                        fresh[j] = False
                     else:
-                        passed = 0.0
-                    if knows_piece(told, N, observer, j, PLACE, time):
                         place[j] = told[link + LINK.TOLD_PLACE] + passed
                         last = place[j]
-                    else:
-                        fresh[j] = False
                 j += way
         for p in range(N - 1):
             if not (fresh[p] and fresh[p + 1]):

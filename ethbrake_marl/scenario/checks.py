@@ -81,7 +81,7 @@ def _check_reactions(scenario: ScenarioFields) -> None:
         sent = scenario.v2x.channel.timing != "latency" and scenario.v2x.channel.hears != "none"
         require(sent, ("vehicle_types", name, "v2x"), equipage, right)
     right = "only without messages one by one (v2x: paper): what was heard before the alert is not modelled"
-    require(scenario.alert_s is None or not scenario.v2x.by_link, ("alert_s",), scenario.alert_s, right)
+    require(scenario.alert_s is None or not scenario.v2x.delays, ("alert_s",), scenario.alert_s, right)
     own = np.array([latest for _, latest in scenario.bounds("latency_s")])
     right = (
         f"with latency_s a vehicle may act as late as {own.max():g} s; it must be below horizon_s, which may be raised"
