@@ -233,7 +233,10 @@ class Plan(NamedTuple):
         packed = Packed(state, params)
         if not packed.has_messages:
             return self._observe_present(state, params, vehicles, steps)
-        says = Messages(params[:, packed.column.messages :], packed.column.vehicles).says_contents
+        messages = Messages(params[:, packed.column.messages :], packed.column.vehicles)
+        says = messages.says_contents
+        if not messages.periodic.any():
+            return self._observe_present(state, params, vehicles, steps, says=says)
         estimate, seen = np.empty(state.shape), []
         for vehicle in vehicles.tolist():
             estimate_rows(state, params, vehicle, estimate)
