@@ -123,15 +123,16 @@ def test_in_sight__sensors_measure_place_speed_and_acceleration_and_no_more() ->
 
 
 def test_intent__who_waits_for_news_has_chosen_nothing() -> None:
-    # Vehicle 3 hears of the emergency after 1.5 s, later than its own latency: until then it tells no choice.
-    v2x = {"preset": "paper", "link_latency_s": 1.5, "senses": "both", "sensing_s": [0.1, 0.1], "tells": [*PIECES]}
+    # Vehicle 2 hears Vehicle 3 from the alert on. Vehicle 3 hears nobody: it sees Vehicle 2 brake after 1 s, and has
+    # chosen nothing before, though its script is full braking and its own latency is 0.
+    v2x = {"link_latency_s": 0.0, "sensing_s": [1.0, 1.0], "senses": "both", "tells": [*PIECES]}
     scenario = LINE.replace(v2x={**v2x, "vehicles": {"vehicle_3": {"hears": "none"}}}, latency_s=[0, 0, 0])
-    assert scenario.sample(1, 7).worlds.vehicles.latency_s.tolist() == [[0.0, 0.1, 0.2]]
-    engine = engine_of(scenario, SEEN)
-    assert seen_by(engine, 1)["rear_1.intent"] == 0.0
-    for _ in range(15):
+    assert scenario.sample(1, 7).worlds.vehicles.latency_s.tolist() == [[0.0, 0.0, 1.0]]
+    engine, seen = engine_of(scenario, SEEN), []
+    for _ in range(11):
         engine.step(np.array([[0.0]]))
-    assert seen_by(engine, 1)["rear_1.intent"] == pytest.approx(-0.5)
+        seen.append(seen_by(engine, 1)["rear_1.intent"])
+    assert seen[:9] == 9 * [0.0] and seen[10] == pytest.approx(-0.5)
 
 
 CHANNELS_HERE = [
